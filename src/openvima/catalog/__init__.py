@@ -1,0 +1,1 @@
+"""Objects, textures, partitions, and the asset packs that give them shape."""

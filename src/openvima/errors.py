@@ -1,0 +1,119 @@
+"""Every exception of the package. A message says what was given, what is allowed and what to do."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class OpenVimaError(Exception):
+    """Base of all errors that the package raises on purpose."""
+
+
+class UnknownNameError(OpenVimaError, KeyError):
+    """A name that no catalogue, registry or preset holds."""
+
+    def __str__(self) -> str:  # KeyError would print the repr of the message
+        return str(self.args[0]) if self.args else ""
+
+
+class UnknownTaskError(UnknownNameError):
+    """There is no task of that name."""
+
+
+class UnknownObjectError(UnknownNameError):
+    """There is no object of that name in the catalogue."""
+
+
+class UnknownTextureError(UnknownNameError):
+    """There is no texture of that name in the catalogue."""
+
+
+class UnknownPolicyError(UnknownNameError):
+    """There is no policy, preset or run folder of that name."""
+
+
+class LevelError(OpenVimaError, ValueError):
+    """A level that does not exist, or at which a task is not defined."""
+
+
+class SamplingError(OpenVimaError, ValueError):
+    """A task could not place its objects in the tries it allows; another draw usually can."""
+
+
+class ShapeError(OpenVimaError, ValueError):
+    """An array of the wrong shape or dtype."""
+
+
+class CameraError(OpenVimaError, ValueError):
+    """Something lies where the camera cannot see it, such as behind it."""
+
+
+class AssetError(OpenVimaError, ValueError):
+    """A mesh, texture or asset folder is missing, damaged or unfit."""
+
+
+class SceneError(OpenVimaError, ValueError):
+    """A scene, placement or pose that cannot exist."""
+
+
+class ReachError(OpenVimaError, ValueError):
+    """The arm cannot reach the asked tool pose."""
+
+
+class ActionError(OpenVimaError, ValueError):
+    """An action out of bounds, of wrong shape or dtype, or not finite. Nothing was moved."""
+
+
+class EpisodeError(OpenVimaError, RuntimeError):
+    """The environment was used in the wrong order, such as a step before a reset."""
+
+
+class OracleError(OpenVimaError, RuntimeError):
+    """The scripted oracle has no action for the present scene."""
+
+
+class ShardError(OpenVimaError, ValueError):
+    """A file of demonstrations is damaged, truncated or of another format."""
+
+
+class DatasetError(OpenVimaError, ValueError):
+    """A data folder is incomplete, of another version or does not fit the command."""
+
+
+class PromptError(OpenVimaError, ValueError):
+    """A prompt whose placeholders and images do not match, or that a policy cannot read."""
+
+
+class PolicyError(OpenVimaError, ValueError):
+    """A policy was given inputs that it cannot take."""
+
+
+class CheckpointError(OpenVimaError, ValueError):
+    """A checkpoint is damaged or does not fit the model."""
+
+
+class ConfigError(OpenVimaError, ValueError):
+    """A setting outside its allowed range, or settings that contradict each other."""
+
+
+class MissingExtraError(OpenVimaError, ImportError):
+    """An optional dependency is not installed; the message names the extra."""
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") -> str:
+    """Compose the message for a name that is not known, with the nearest known one as a suggestion.
+
+    Args:
+        kind: What the name should have named, such as "task".
+        name: The name as given.
+        known: All names that are allowed.
+        hint: A sentence to end with; by default the known names, if they are few.
+
+    Returns:
+        One line for an `UnknownNameError`.
+    """
+    known = list(known)
+    near = difflib.get_close_matches(str(name), known, n=1)
+    suggestion = f" Did you mean {near[0]!r}?" if near else ""
+    if not hint and len(known) <= 20:
+        hint = f"Allowed: {', '.join(known)}."
+    return f"there is no {kind} {name!r}.{suggestion} {hint}".rstrip()

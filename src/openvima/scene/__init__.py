@@ -1,0 +1,77 @@
+"""Frozen records shared by all packages: poses, scenes, prompts, goals, episodes, actions."""
+
+from openvima.scene.action import ACTION_SHAPES, Action
+from openvima.scene.episode import Episode, Outcome, Problem
+from openvima.scene.goal import (
+    AtPose,
+    Constraint,
+    DistractorsApart,
+    Goal,
+    InZone,
+    NeverTouches,
+    Tolerance,
+    Zone,
+    ZoneKeptClear,
+    block_points,
+)
+from openvima.scene.pose import Pose, angle_difference
+from openvima.scene.prompt import (
+    ObjectImage,
+    ObjectRecord,
+    Prompt,
+    PromptFill,
+    PromptImage,
+    RenderedPrompt,
+    SceneImage,
+)
+from openvima.scene.scene import (
+    BACKGROUND_ID,
+    END_EFFECTORS,
+    FIRST_OBJECT_ID,
+    FLOOR_ID,
+    SHEET_ID,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    EndEffector,
+    Placement,
+    Scene,
+    in_workspace,
+)
+
+__all__ = [
+    "ACTION_SHAPES",
+    "BACKGROUND_ID",
+    "END_EFFECTORS",
+    "FIRST_OBJECT_ID",
+    "FLOOR_ID",
+    "SHEET_ID",
+    "WORKSPACE_HIGH",
+    "WORKSPACE_LOW",
+    "Action",
+    "AtPose",
+    "Constraint",
+    "DistractorsApart",
+    "EndEffector",
+    "Episode",
+    "Goal",
+    "InZone",
+    "NeverTouches",
+    "ObjectImage",
+    "ObjectRecord",
+    "Outcome",
+    "Placement",
+    "Pose",
+    "Problem",
+    "Prompt",
+    "PromptFill",
+    "PromptImage",
+    "RenderedPrompt",
+    "Scene",
+    "SceneImage",
+    "Tolerance",
+    "Zone",
+    "ZoneKeptClear",
+    "angle_difference",
+    "block_points",
+    "in_workspace",
+]

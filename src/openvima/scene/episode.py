@@ -1,0 +1,76 @@
+"""One sampled problem, and how it stands."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from openvima.scene.goal import Constraint, Goal
+from openvima.scene.prompt import Prompt
+from openvima.scene.scene import Scene
+
+GoalOrder = Literal["any", "sequential"]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What a task samples: pure data, no physics and no images.
+
+    Args:
+        scene: All objects at their start, at rest.
+        prompt: What the robot is told.
+        goals: The conditions to fulfil, in the order in which the oracle works on them unless it may choose.
+        constraints: What must not happen.
+        goal_order: "any": every open goal is tested after each step; "sequential": only the first open one.
+        num_required: Exact number of goals to fulfil (more at once is a failure); None means all.
+    """
+
+    scene: Scene
+    prompt: Prompt
+    goals: tuple[Goal, ...]
+    constraints: tuple[Constraint, ...] = ()
+    goal_order: GoalOrder = "any"
+    num_required: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A problem together with where it came from.
+
+    Args:
+        task: Name of the task, such as "rotate".
+        level: "train", "L1", "L2", "L3" or "L4".
+        domain: Domain of the seed: "train", "eval" or "user"; equal seeds of two domains are unrelated.
+        seed: The episode's number.
+        problem: The sampled problem.
+        oracle_max_steps: Steps within which the oracle must be done.
+        max_steps: Steps that a policy is given (`oracle_max_steps` + 2).
+        num_redraws: Unlucky draws that were thrown away before this one.
+    """
+
+    task: str
+    level: str
+    domain: str
+    seed: int
+    problem: Problem
+    oracle_max_steps: int
+    max_steps: int
+    num_redraws: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How an episode stands after a step: success, failure, or neither yet.
+
+    Args:
+        success: The task is done.
+        failure: It can no longer be done.
+        reason: Empty while open; else one sentence, such as "object 6 (letter A) left the workspace".
+    """
+
+    success: bool = False
+    failure: bool = False
+    reason: str = ""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.success or self.failure

@@ -1,0 +1,154 @@
+"""Goals and constraints: named conditions on the poses of a scene, as data with a pure test."""
+
+import math
+from dataclasses import dataclass
+
+from openvima.scene.pose import Pose, angle_difference, rotate
+from openvima.scene.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far from a target still counts; both comparisons are strict.
+
+    Args:
+        position_m: Planar distance in metres.
+        yaw_rad: Angle in radians, or None if any heading is fine.
+    """
+
+    position_m: float
+    yaw_rad: float | None = None
+
+    def accepts(self, pose: Pose, target: Pose, symmetry_rad: float = 2 * math.pi) -> bool:
+        """Whether `pose` matches `target`; headings `symmetry_rad` apart look the same."""
+        if not pose.planar_distance(target) < self.position_m:
+            return False
+        if self.yaw_rad is None:
+            return True
+        return angle_difference(pose.yaw_rad, target.yaw_rad, symmetry_rad) < self.yaw_rad
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A flat rectangle on the table.
+
+    Args:
+        x, y: Centre in metres.
+        size_x, size_y: Full extents in metres along the world's x and y axes.
+    """
+
+    x: float
+    y: float
+    size_x: float
+    size_y: float
+
+    def contains(self, point: tuple[float, float, float]) -> bool:
+        """Whether a point lies strictly inside the rectangle and less than 0.3 m above the table."""
+        px, py, pz = point
+        return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
+
+
+# The benchmark represents a small block by a grid of step 0.02 m that starts at its lower corner and so misses
+# the upper one: local coordinates −0.015 and +0.005 on each axis. Published results depend on that asymmetry.
+_BLOCK_GRID = (-0.015, 0.005)
+BLOCK_POINTS = tuple((x, y, z) for x in _BLOCK_GRID for y in _BLOCK_GRID for z in _BLOCK_GRID)
+
+
+def block_points(pose: Pose) -> list[tuple[float, float, float]]:
+    """The eight points that stand for a small block at `pose`, in the world, metres."""
+    points = []
+    for local in BLOCK_POINTS:
+        dx, dy, dz = rotate(pose.quaternion, local)
+        points.append((pose.x + dx, pose.y + dy, pose.z + dz))
+    return points
+
+
+@dataclass(frozen=True, slots=True)
+class AtPose:
+    """The object's link frame is at a target pose.
+
+    Args:
+        object_id: The object to move.
+        target: Where it has to be.
+        tolerance: How near is near enough.
+        symmetry_rad: Angle of rotational symmetry of the object's shape.
+        relative_to: Id of the object that the target is tied to (the base it lies in, or the object itself
+            when it only turns); demonstrations record the place relative to it. None: tied to the table.
+    """
+
+    object_id: int
+    target: Pose
+    tolerance: Tolerance
+    symmetry_rad: float = 2 * math.pi
+    relative_to: int | None = None
+
+    def is_met(self, scene: Scene) -> bool:
+        """Whether the object is there now."""
+        return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class InZone:
+    """All eight points of a small block lie in a zone.
+
+    Args:
+        object_id: The block.
+        zone: Where it has to be.
+        relative_to: Id of the object that marks the zone, as for `AtPose`.
+    """
+
+    object_id: int
+    zone: Zone
+    relative_to: int | None = None
+
+    def is_met(self, scene: Scene) -> bool:
+        """Whether the block is in the zone now."""
+        return all(self.zone.contains(point) for point in block_points(scene[self.object_id].pose))
+
+
+Goal = AtPose | InZone
+
+
+@dataclass(frozen=True, slots=True)
+class DistractorsApart:
+    """No distractor comes near a goal's target, and no goal's object near a distractor.
+
+    Tested after every step, against all goals of the episode, met or not: a distractor within the goal's
+    `tolerance.position_m` of its target, or the goal's object matching the distractor's pose within the
+    goal's whole tolerance, is a violation.
+    """
+
+    object_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ZoneKeptClear:
+    """No point of these blocks lies in the zone; tested after every step."""
+
+    object_ids: tuple[int, ...]
+    zone: Zone
+
+
+@dataclass(frozen=True, slots=True)
+class NeverTouches:
+    """No point of these blocks ever lies in the zone; watched while things move, broken for good at once.
+
+    Args:
+        object_ids: The blocks that must keep off.
+        zone: The forbidden rectangle.
+        name: What the zone is called in the reason of a failure, such as "line".
+    """
+
+    object_ids: tuple[int, ...]
+    zone: Zone
+    name: str
+
+    def touching(self, scene: Scene) -> int | None:
+        """Id of the first object that touches the zone now, or None."""
+        for object_id in self.object_ids:
+            if any(self.zone.contains(point) for point in block_points(scene[object_id].pose)):
+                return object_id
+        return None
+
+
+Constraint = DistractorsApart | ZoneKeptClear | NeverTouches

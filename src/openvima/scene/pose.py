@@ -1,0 +1,157 @@
+"""Rigid poses: a position in metres and a unit quaternion xyzw."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from openvima.catalog.geometry import Vector3
+from openvima.errors import SceneError
+
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A rigid transform, world frame unless the name says otherwise.
+
+    `a @ b` chains transforms as matrices do: `world_from_tool = world_from_base @ base_from_tool`.
+
+    Args:
+        position: x (away from the robot), y (to its left), z (up), in metres.
+        quaternion: Unit quaternion, order x, y, z, w.
+    """
+
+    position: Vector3
+    quaternion: Quaternion = IDENTITY
+
+    @staticmethod
+    def planar(x: float, y: float, yaw_rad: float = 0.0, *, z: float = 0.0) -> "Pose":
+        """Build the pose of an object that lies flat: turned by `yaw_rad` about the world's z axis."""
+        return Pose((float(x), float(y), float(z)), yaw_quaternion(yaw_rad))
+
+    @property
+    def x(self) -> float:
+        """Metres away from the robot."""
+        return self.position[0]
+
+    @property
+    def y(self) -> float:
+        """Metres to the robot's left."""
+        return self.position[1]
+
+    @property
+    def z(self) -> float:
+        """Metres above the table."""
+        return self.position[2]
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading: the angle about z of the z-x-y static Euler decomposition, in (−π, π]."""
+        return quaternion_yaw(self.quaternion)
+
+    def rotated(self, yaw_rad: float) -> "Pose":
+        """Return this pose turned on the spot by `yaw_rad` about the world's z axis."""
+        return Pose(self.position, multiply(yaw_quaternion(yaw_rad), self.quaternion))
+
+    def moved(self, dx: float = 0.0, dy: float = 0.0, dz: float = 0.0) -> "Pose":
+        """Return this pose shifted by metres along the world's axes."""
+        return Pose((self.x + dx, self.y + dy, self.z + dz), self.quaternion)
+
+    def planar_distance(self, other: "Pose") -> float:
+        """Distance of the two positions in the table's plane, in metres."""
+        return math.hypot(self.x - other.x, self.y - other.y)
+
+    def __matmul__(self, other: "Pose") -> "Pose":
+        ox, oy, oz = rotate(self.quaternion, other.position)
+        position = (self.x + ox, self.y + oy, self.z + oz)
+        return Pose(position, multiply(self.quaternion, other.quaternion))
+
+    def inverse(self) -> "Pose":
+        """Return the pose that undoes this one: `pose @ pose.inverse()` is the identity."""
+        x, y, z, w = self.quaternion
+        conjugate = (-x, -y, -z, w)
+        px, py, pz = rotate(conjugate, self.position)
+        return Pose((-px, -py, -pz), conjugate)
+
+    def matrix(self) -> np.ndarray:
+        """Rotation matrix, shape (3, 3), float64; columns are the body's axes in the world."""
+        x, y, z, w = self.quaternion
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    def transform(self, points: np.ndarray) -> np.ndarray:
+        """Map points from this frame to the frame that it is given in; shape (..., 3) to (..., 3), metres."""
+        return np.asarray(points, dtype=np.float64) @ self.matrix().T + np.asarray(self.position)
+
+
+def yaw_quaternion(yaw_rad: float) -> Quaternion:
+    """Quaternion xyzw of a turn by `yaw_rad` about z."""
+    return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+def quaternion_yaw(quaternion: Quaternion) -> float:
+    """Heading of a quaternion xyzw in (−π, π].
+
+    Source: angle about z of the z-x-y static Euler angles, R = Ry Rx Rz; the usual yaw for flat bodies.
+    """
+    x, y, z, w = quaternion
+    return math.atan2(2 * (x * y + w * z), 1 - 2 * (x * x + z * z))
+
+
+def normalised(quaternion: Quaternion) -> Quaternion:
+    """Scale a quaternion to unit length.
+
+    Raises:
+        SceneError: The quaternion has length 0 or is not finite.
+    """
+    length = math.sqrt(sum(c * c for c in quaternion))
+    if not length > 0 or not math.isfinite(length):
+        raise SceneError(f"quaternion {quaternion} has no direction; give one of finite length above 0.")
+    x, y, z, w = quaternion
+    return (x / length, y / length, z / length, w / length)
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product of two quaternions xyzw: first turn by `b`, then by `a`."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotate(quaternion: Quaternion, vector: Vector3) -> Vector3:
+    """Turn a vector by a unit quaternion xyzw."""
+    qx, qy, qz, qw = quaternion
+    vx, vy, vz = vector
+    tx, ty, tz = 2 * (qy * vz - qz * vy), 2 * (qz * vx - qx * vz), 2 * (qx * vy - qy * vx)
+    return (
+        vx + qw * tx + qy * tz - qz * ty,
+        vy + qw * ty + qz * tx - qx * tz,
+        vz + qw * tz + qx * ty - qy * tx,
+    )
+
+
+def angle_difference(a_rad: float, b_rad: float, period_rad: float = 2 * math.pi) -> float:
+    """Smallest absolute difference of two angles that count as equal when `period_rad` apart, in radians.
+
+    Args:
+        a_rad: One angle.
+        b_rad: The other angle.
+        period_rad: Angle of rotational symmetry; 0 means every angle looks the same, so the difference is 0.
+    """
+    if period_rad == 0:
+        return 0.0
+    difference = abs(a_rad - b_rad) % period_rad
+    return min(difference, period_rad - difference)

@@ -1,0 +1,1 @@
+"""The tabletop world: physics, arm and tools."""

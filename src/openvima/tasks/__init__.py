@@ -1,0 +1,1 @@
+"""The tasks and the machinery that they share."""
