@@ -48,7 +48,7 @@ class Zone:
         return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
 
 
-# The benchmark represents a small block by a grid of step 0.02 m that starts at its lower corner and so misses
+# The benchmark represents a small block by a grid of step 0.02 m that starts at the lower corner and misses
 # the upper one: local coordinates −0.015 and +0.005 on each axis. Published results depend on that asymmetry.
 _BLOCK_GRID = (-0.015, 0.005)
 BLOCK_POINTS = tuple((x, y, z) for x in _BLOCK_GRID for y in _BLOCK_GRID for z in _BLOCK_GRID)
