@@ -16,7 +16,6 @@ ACTION_SHAPES = {
     "pose1_position": 2,
     "pose1_rotation": 4,
 }
-_BOUNDS = {2: (WORKSPACE_LOW, WORKSPACE_HIGH), 4: ((-1.0,) * 4, (1.0,) * 4)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +40,9 @@ class Action:
 
         Positions are clipped to the workspace and rounded to float32, the precision in which actions travel.
         """
-        low, high = np.float32(WORKSPACE_LOW), np.float32(WORKSPACE_HIGH)
-        pose0 = np.clip(np.float32(pick), low, high)
-        pose1 = np.clip(np.float32(place), low, high)
+        low, high = _workspace()
+        pose0 = np.clip(np.array(pick, dtype=np.float32), low, high)
+        pose1 = np.clip(np.array(place, dtype=np.float32), low, high)
         x, y, z, w = (float(np.float32(c)) for c in yaw_quaternion(yaw_rad))
         return Action(
             (float(pose0[0]), float(pose0[1])),
@@ -104,6 +103,10 @@ def _tool_yaw(quaternion: Quaternion) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def _workspace() -> tuple[np.ndarray, np.ndarray]:
+    return np.array(WORKSPACE_LOW, dtype=np.float32), np.array(WORKSPACE_HIGH, dtype=np.float32)
+
+
 def _key_problems(action: Mapping[str, object]) -> list[str]:
     if not isinstance(action, Mapping):
         return [f"an action is a mapping with keys {', '.join(ACTION_SHAPES)}, not {type(action).__name__}."]
@@ -125,7 +128,7 @@ def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], l
     given = tuple(float(v) for v in array)
     if not np.isfinite(array).all():
         return (), [f"{key} is {given}; all values must be finite."]
-    low, high = (np.float32(bound) for bound in _BOUNDS[length])
+    low, high = _workspace() if length == 2 else (np.full(4, -1.0), np.full(4, 1.0))
     if (array < low).any() or (array > high).any():
         shown = ", ".join(f"{v:.4g}" for v in given)
         allowed = (

@@ -69,11 +69,14 @@ class Prompt:
         if slots != set(fills):
             raise PromptError(f"template {template!r} has slots {sorted(slots)}, but got {sorted(fills)}.")
         text = template
+        shown: dict[str, PromptFill] = {}
         for name, fill in fills.items():
             if isinstance(fill, str | int):
                 text = text.replace("{" + name + "}", str(fill))
-        order = list(dict.fromkeys(_PLACEHOLDER.findall(text)))
-        images = tuple((name, fill) for name in order if isinstance(fill := fills[name], PromptFill))
+            else:
+                shown[name] = fill
+        order = dict.fromkeys(_PLACEHOLDER.findall(text))
+        images = tuple((name, shown[name]) for name in order)
         return Prompt(text, images)
 
 
