@@ -1,0 +1,82 @@
+"""The `openvima` program: finds the verb, imports only what it needs, runs it, reports errors in one line."""
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+
+from openvima import __version__
+from openvima.errors import OpenVimaError, unknown_name
+
+# Verb → what it does, in the order in which a newcomer meets them. Each is a module of this package.
+VERBS = {
+    "quickstart": "the whole way in ten minutes: demonstrations, training, scores, report",
+    "tasks": "list the tasks: prompt, tool, levels, steps",
+    "demo": "film the oracle or a policy at work on one task",
+    "generate": "write demonstrations with the oracle",
+    "data": "look into a folder of demonstrations",
+    "train": "train a policy on demonstrations",
+    "evaluate": "score policies on levels L1 to L4",
+    "report": "make the HTML report of evaluation results",
+}
+
+OVERVIEW = """openvima {version}: multimodal-prompt robot manipulation
+
+Usage: openvima VERB [OPTIONS]      openvima VERB --help explains one verb
+
+{verbs}
+
+Begin with:  openvima quickstart --out quickstart
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: The words after the program's name; by default those of the process.
+
+    Returns:
+        Exit status: 0 done, 1 the work failed, 2 wrong usage or input, 130 interrupted.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        verbs = "\n".join(f"  {verb:<11} {summary}" for verb, summary in VERBS.items())
+        print(OVERVIEW.format(version=__version__, verbs=verbs), end="")
+        return 0 if words else 2
+    if words[0] in ("-V", "--version"):
+        print(__version__)
+        return 0
+    if words[0] not in VERBS:
+        return _fail(unknown_name("verb", words[0], VERBS), 2)
+    return _run(words[0], words[1:])
+
+
+def _run(verb: str, rest: list[str]) -> int:
+    import tyro
+
+    module = importlib.import_module(f"openvima.cli.{verb}")
+    commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
+    try:
+        if commands is not None:
+            return tyro.extras.subcommand_cli_from_dict(
+                commands, prog=f"openvima {verb}", description=module.__doc__, args=rest
+            )
+        return tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
+    except OpenVimaError as error:
+        # Errors about input are also ValueError, KeyError or ImportError; others are failures of the work.
+        usage = isinstance(error, ValueError | KeyError | ImportError)
+        return _fail(f"{type(error).__name__}: {error}", 2 if usage else 1)
+    except KeyboardInterrupt:
+        return _fail("interrupted; whole files were kept, and the same command continues.", 130)
+    except BrokenPipeError:  # the reader of our output, such as `head`, has gone
+        sys.stderr.close()
+        return 1
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"openvima: {message}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

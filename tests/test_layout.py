@@ -1,0 +1,88 @@
+"""The rules of the source tree: who may import whom, and what stays light."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "openvima"
+
+# Lowest first; a package imports only from those before it (and from its own files).
+ORDER = (
+    "catalog",
+    "scene",
+    "render",
+    "sim",
+    "tasks",
+    "env",
+    "data",
+    "policies",
+    "training",
+    "evaluation",
+    "cli",
+)
+FORBIDDEN = {
+    "catalog": {"mujoco", "torch"},
+    "scene": {"mujoco", "torch"},
+    "render": {"mujoco", "torch"},
+    "sim": {"torch", "openvima.tasks"},
+    "tasks": {"mujoco", "torch", "openvima.sim"},
+    "env": {"torch"},
+    "policies": {"mujoco", "openvima.sim", "openvima.env"},
+    "training": {"mujoco", "openvima.sim", "openvima.env"},
+}
+
+
+def imported_modules(file: Path) -> set[str]:
+    modules = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            modules |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file} has a relative import"
+            modules.add(node.module or "")
+    return modules
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_a_package_imports_only_from_lower_ones(package: str) -> None:
+    above = {f"openvima.{name}" for name in ORDER[ORDER.index(package) + 1 :]}
+    for file in sorted((SOURCE / package).rglob("*.py")):
+        for module in imported_modules(file):
+            for banned in above | FORBIDDEN.get(package, set()):
+                inside = module == banned or module.startswith(banned + ".")
+                assert not inside, f"{file.relative_to(SOURCE)} imports {module}"
+
+
+def test_data_imports_torch_in_its_dataset_adapter_only() -> None:
+    for file in (SOURCE / "data").rglob("*.py"):
+        assert file.name == "torch_dataset.py" or "torch" not in imported_modules(file)
+
+
+def test_import_openvima_loads_nothing_heavy() -> None:
+    code = (
+        "import openvima, sys; heavy = {'torch', 'mujoco', 'numba', 'matplotlib', 'av', 'pyarrow'}; "
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "module", ["openvima.env", "openvima.data", "openvima.tasks", "openvima.sim", "openvima.render"]
+)
+def test_the_simulation_half_works_without_torch(module: str) -> None:
+    code = f"import sys; sys.modules['torch'] = None; import {module}"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_no_module_prints_outside_the_command_line() -> None:
+    for file in SOURCE.rglob("*.py"):
+        if file.parent.name == "cli":
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            is_print = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print"
+            assert not is_print, f"{file.relative_to(SOURCE)} prints"
