@@ -1,0 +1,86 @@
+"""Object and texture sets, levels and pools, and their equality with the catalogue."""
+
+import pytest
+
+from openvima.catalog.objects import OBJECTS
+from openvima.catalog.partitions import (
+    LEVEL_TITLES,
+    LEVELS,
+    OBJECT_SETS,
+    TEXTURE_SETS,
+    levels_of,
+    pool,
+    tasks_at,
+)
+from openvima.catalog.textures import TEXTURES
+from openvima.errors import LevelError, UnknownTaskError
+
+
+def test_levels_hold_13_13_13_12_and_4_tasks():
+    assert [len(tasks_at(level)) for level in LEVELS] == [13, 13, 13, 12, 4]
+    assert len({task for level in LEVELS for task in tasks_at(level)}) == 17
+
+
+def test_sets_hold_known_names_once():
+    for names in OBJECT_SETS.values():
+        assert len(set(names)) == len(names) and set(names) <= set(OBJECTS)
+    for names in TEXTURE_SETS.values():
+        assert len(set(names)) == len(names) and set(names) <= set(TEXTURES)
+
+
+def test_objects_of_the_third_level_were_never_trained_with_except_the_shorter_block():
+    train = {name for task in tasks_at("train") for name in pool(task, "train").dragged_objects}
+    novel = {name for task in tasks_at("L3") for name in pool(task, "L3").dragged_objects}
+    assert train & novel == {"shorter block"}
+    train_bases = {name for task in tasks_at("train") for name in pool(task, "train").base_objects}
+    assert train_bases.isdisjoint(OBJECT_SETS["B_novel"])
+
+
+def test_training_textures_of_the_two_roles_are_disjoint():
+    assert set(TEXTURE_SETS["C1"]).isdisjoint(TEXTURE_SETS["C2"])
+
+
+def test_the_second_level_exchanges_the_textures_of_the_roles():
+    train, swapped = pool("visual_manipulation", "train"), pool("visual_manipulation", "L2")
+    assert swapped.dragged_textures == train.base_textures
+    assert swapped.base_textures == train.dragged_textures
+    assert swapped.dragged_objects == train.dragged_objects
+
+
+def test_a_task_absent_from_a_level_is_refused_with_its_levels():
+    with pytest.raises(
+        LevelError, match=r"sweep_without_exceeding is not defined at level L3; .* train, L1, L2"
+    ):
+        pool("sweep_without_exceeding", "L3")
+    assert levels_of("same_texture") == ("L4",)
+
+
+def test_unknown_tasks_and_levels_are_refused():
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        pool("rotat", "train")
+    with pytest.raises(LevelError, match="Allowed: train, L1, L2, L3, L4"):
+        tasks_at("L5")
+
+
+def test_sets_and_levels_equal_the_machine_readable_catalogue(catalogue):
+    assert catalogue["levels"] == LEVEL_TITLES
+    for name, members in catalogue["object_sets"].items():
+        assert list(OBJECT_SETS[name]) == members, name
+    for name, members in catalogue["texture_sets"].items():
+        assert list(TEXTURE_SETS[name]) == members, name
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_pools_equal_the_machine_readable_catalogue(catalogue, level):
+    assert list(tasks_at(level)) == list(catalogue["partitions"][level])
+    for task, record in catalogue["partitions"][level].items():
+        ours = pool(task, level)
+        for field, sets in (
+            ("dragged_objects", OBJECT_SETS),
+            ("base_objects", OBJECT_SETS),
+            ("dragged_textures", TEXTURE_SETS),
+            ("base_textures", TEXTURE_SETS),
+        ):
+            members = record.get(field, [])
+            expected = sets[members] if isinstance(members, str) else tuple(members)
+            assert getattr(ours, field) == expected, (task, field)
