@@ -1,1 +1,25 @@
-"""Cameras and the triangle rasteriser."""
+"""Images of scenes: fixed cameras, a triangle rasteriser, and the map of the table from above."""
+
+from openvima.render.camera import CAMERAS, FRONT, TOP, VIEWS, Camera, View, project, unproject
+from openvima.render.labels import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
+from openvima.render.rasteriser import Drawable, Image, Rasteriser
+
+__all__ = [
+    "CAMERAS",
+    "CELL_M",
+    "FRONT",
+    "LABEL_SHAPE",
+    "TOP",
+    "VIEWS",
+    "Camera",
+    "Drawable",
+    "Image",
+    "Rasteriser",
+    "View",
+    "cell_centres",
+    "empty_labels",
+    "label_raster",
+    "project",
+    "stamp",
+    "unproject",
+]

@@ -1,0 +1,169 @@
+"""The two fixed cameras, and the way between points in the world and pixels."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from openvima.errors import CameraError, ConfigError, ShapeError
+
+View = Literal["front", "top"]
+VIEWS: tuple[View, View] = ("front", "top")
+
+Row = tuple[float, float, float, float]
+
+MIN_DOUBLED_AREA_PX2 = 0.01  # triangles up to this doubled area are left out, as the benchmark's renderer does
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera about 1000 m away, so that its images are orthographic but for a trace of perspective.
+
+    A row (a, b, c, d) stands for the length a·x + b·y + c·z + d in metres, of a point (x, y, z) in the world.
+
+    Args:
+        view: Name of the view.
+        width: Pixels across.
+        height: Pixels down.
+        focal_px: Focal length in pixels, equal for both axes.
+        right: Row of the distance to the right of the optical axis.
+        up: Row of the distance above the optical axis.
+        away: Row of the distance in front of the camera plane.
+        min_doubled_area_px2: Smaller triangles are not drawn.
+    """
+
+    view: View
+    width: int
+    height: int
+    focal_px: float
+    right: Row
+    up: Row
+    away: Row
+    min_doubled_area_px2: float = MIN_DOUBLED_AREA_PX2
+
+    def enlarged(self, factor: int) -> "Camera":
+        """Return the same view in `factor` times the resolution.
+
+        Of every `factor` × `factor` pixels, the lower left one sees the point that the plain image samples there:
+        `large[factor - 1 :: factor, ::factor]` is the plain image.
+
+        Args:
+            factor: A whole number from 1.
+
+        Raises:
+            ConfigError: `factor` is below 1.
+        """
+        if factor < 1:
+            raise ConfigError(f"enlarge is {factor}; it must be a whole number from 1.")
+        return replace(
+            self,
+            width=self.width * factor,
+            height=self.height * factor,
+            focal_px=self.focal_px * factor,
+            min_doubled_area_px2=self.min_doubled_area_px2 * factor**2,
+        )
+
+    def matrix(self) -> np.ndarray:
+        """Return the camera for the kernels.
+
+        Returns:
+            Shape (4, 4), float64: rows right, up, away, then (focal length, half width, half height, smallest
+            doubled area) in pixels.
+        """
+        numbers = (self.focal_px, self.width / 2, self.height / 2, self.min_doubled_area_px2)
+        return np.array([self.right, self.up, self.away, numbers], dtype=np.float64)
+
+
+# The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of the front
+# camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move whole pixel rows.
+_COS_45 = 0.70710677
+TOP = Camera(
+    view="top",
+    width=256,
+    height=128,
+    focal_px=250980.0,
+    right=(0.0, 1.0, 0.0, 0.0),
+    up=(-1.0, 0.0, 0.0, 0.5),
+    away=(0.0, 0.0, -1.0, 1000.0),
+)
+FRONT = Camera(
+    view="front",
+    width=256,
+    height=128,
+    focal_px=355555.0,
+    right=(0.0, 1.0, 0.0, 0.0),
+    up=(-_COS_45, 0.0, _COS_45, 0.2899170),
+    away=(-_COS_45, 0.0, -_COS_45, 1414.503418),
+)
+CAMERAS: dict[View, Camera] = {"front": FRONT, "top": TOP}
+
+
+def project(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Map points in the world to pixel coordinates of one view.
+
+    Args:
+        points: Positions in metres, shape (..., 3); x away from the robot, y to its left, z up.
+        camera: The view; its image is `camera.height` × `camera.width` pixels.
+
+    Returns:
+        Shape (..., 2), float64: column, then row, row 0 on top. Whole numbers are the points that pixels sample.
+        Points outside the image keep their coordinates; nothing is clipped.
+
+    Raises:
+        ShapeError: The last axis of `points` does not have length 3.
+        CameraError: A point lies in or behind the camera plane (the message names the first one).
+
+    Example:
+        >>> project(np.array([0.5, 0.0, 0.0]), TOP)
+        array([128.,  63.])
+
+    Source: pinhole model with the constants of VIMA-Bench.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    _check_last_axis("points", points, 3)
+    right, up, away = (points @ row[:3] + row[3] for row in np.array([camera.right, camera.up, camera.away]))
+    behind = away <= 0
+    if behind.any():
+        first = tuple(float(v) for v in points[behind].reshape(-1, 3)[0])
+        raise CameraError(f"point {first} lies behind the {camera.view} camera; give points near the table.")
+    columns = camera.width / 2 + camera.focal_px * right / away
+    heights = camera.height / 2 + camera.focal_px * up / away
+    return np.stack([columns, camera.height - 1 - heights], axis=-1)
+
+
+def unproject(pixels: np.ndarray, camera: Camera, z: float | np.ndarray = 0.0) -> np.ndarray:
+    """Map pixel coordinates of one view to the points at a known height that they show.
+
+    Args:
+        pixels: Column, then row, shape (..., 2); see `project`.
+        camera: The view.
+        z: Height above the table in metres, one number or shape (...).
+
+    Returns:
+        x, y in metres, shape (..., 2), float64; `project` undoes it.
+
+    Raises:
+        ShapeError: The last axis of `pixels` does not have length 2.
+
+    Example:
+        >>> unproject(np.array([128.0, 63.0]), TOP)
+        array([0.5, 0. ])
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    _check_last_axis("pixels", pixels, 2)
+    tangent_right = (pixels[..., 0] - camera.width / 2) / camera.focal_px
+    tangent_up = (camera.height - 1 - pixels[..., 1] - camera.height / 2) / camera.focal_px
+    # right = tangent_right · away and up = tangent_up · away: two linear equations for x and y.
+    equations = []
+    for row, tangent in ((camera.right, tangent_right), (camera.up, tangent_up)):
+        a, b, c, d = (own - tangent * far for own, far in zip(row, camera.away, strict=True))
+        equations.append((a, b, -(c * z + d)))
+    (a0, b0, c0), (a1, b1, c1) = equations
+    determinant = a0 * b1 - a1 * b0
+    x, y = (c0 * b1 - c1 * b0) / determinant, (a0 * c1 - a1 * c0) / determinant
+    return np.stack([x, y], axis=-1)
+
+
+def _check_last_axis(name: str, array: np.ndarray, length: int) -> None:
+    if array.shape[-1:] != (length,):
+        raise ShapeError(f"{name} has shape {array.shape}; its last axis must have length {length}.")

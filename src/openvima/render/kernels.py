@@ -1,0 +1,194 @@
+"""Numba kernels: filling and shading triangles, seen by a camera or straight from above.
+
+Nothing here is checked; the modules beside it own the arguments. Each kernel has a slow twin in `tests/naive.py`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+# Direction towards the light, the same in every image: (−50, 30, 100) as a unit vector.
+_LIGHT_X = -50.0 / math.sqrt(13400.0)
+_LIGHT_Y = 30.0 / math.sqrt(13400.0)
+_LIGHT_Z = 100.0 / math.sqrt(13400.0)
+AMBIENT, DIFFUSE, SPECULAR = 0.6, 0.35, 0.05
+
+
+@njit(cache=True)
+def light_intensity(nx: float, ny: float, nz: float) -> float:
+    """Brightness factor of a surface with the unit normal (nx, ny, nz) in the world.
+
+    The highlight depends on the height to which light is reflected, not on the viewer: all views agree on it.
+    """
+    facing = nx * _LIGHT_X + ny * _LIGHT_Y + nz * _LIGHT_Z
+    # Reflected direction 2(n·l)n − l.
+    rx = 2.0 * facing * nx - _LIGHT_X
+    ry = 2.0 * facing * ny - _LIGHT_Y
+    rz = 2.0 * facing * nz - _LIGHT_Z
+    length = math.sqrt(rx * rx + ry * ry + rz * rz)
+    highlight = max(0.0, rz / length) if length > 0.0 else 0.0
+    return AMBIENT + DIFFUSE * max(0.0, facing) + SPECULAR * highlight * highlight
+
+
+@njit(cache=True)
+def texel_index(u: float, v: float, height: int, width: int) -> tuple[int, int]:
+    """Row and column of the texel nearest to (u, v); v = 0 is the bottom row, both coordinates wrap at 1."""
+    column = int((u - math.floor(u)) * width)
+    row = height - 1 - int((v - math.floor(v)) * height)
+    # u − floor(u) of a tiny negative u rounds to 1.
+    return max(row, 0), min(column, width - 1)
+
+
+@njit(cache=True)
+def draw_triangles(
+    vertices: np.ndarray,  # (V, 3) float64, body frame
+    corners: np.ndarray,  # (F, 3) int32, indices into vertices
+    normals: np.ndarray,  # (F, 3, 3) float64, body frame
+    uvs: np.ndarray,  # (F, 3, 2) float64
+    is_flat: np.ndarray,  # (F,) bool: the corners' normals are equal
+    pose: np.ndarray,  # (3, 4) float64, world from body
+    camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
+    texture: np.ndarray,  # (h, w, 3) uint8
+    object_id: int,
+    screen: np.ndarray,  # (≥ V, 4) float64, scratch: X, Y up, distance without its constant, world z
+    depth: np.ndarray,  # (H, W) float32, smaller is nearer
+    rgb: np.ndarray,  # (3, H, W) uint8
+    segm: np.ndarray,  # (H, W) uint8
+    heights: np.ndarray,  # (H, W) float32, or (0, 0) if not wanted
+) -> None:
+    """Draw one body into one image, over what is there already.
+
+    A pixel belongs to a triangle if its sampling point lies inside or on the border; among triangles of equal
+    depth the later one shows. Back faces and triangles of next to no area are left out.
+    """
+    image_height, image_width = segm.shape
+    texture_height, texture_width = texture.shape[0], texture.shape[1]
+    focal, half_width, half_height, min_area = camera[3, 0], camera[3, 1], camera[3, 2], camera[3, 3]
+    for i in range(vertices.shape[0]):
+        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        x = pose[0, 0] * vx + pose[0, 1] * vy + pose[0, 2] * vz + pose[0, 3]
+        y = pose[1, 0] * vx + pose[1, 1] * vy + pose[1, 2] * vz + pose[1, 3]
+        z = pose[2, 0] * vx + pose[2, 1] * vy + pose[2, 2] * vz + pose[2, 3]
+        right = camera[0, 0] * x + camera[0, 1] * y + camera[0, 2] * z + camera[0, 3]
+        up = camera[1, 0] * x + camera[1, 1] * y + camera[1, 2] * z + camera[1, 3]
+        # The constant of about 1000 m would cost the depth its precision; only differences count there.
+        away = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z
+        distance = away + camera[2, 3]
+        scale = focal / distance if distance > 0.0 else math.nan  # NaN fails every comparison: not drawn
+        screen[i, 0] = half_width + scale * right
+        screen[i, 1] = half_height + scale * up
+        screen[i, 2] = away
+        screen[i, 3] = z
+
+    for f in range(corners.shape[0]):
+        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        ax, ay = screen[a, 0], screen[a, 1]
+        bx, by = screen[b, 0], screen[b, 1]
+        cx, cy = screen[c, 0], screen[c, 1]
+        # Positive exactly when the front faces the camera: perspective keeps the turning sense.
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if not area > min_area:
+            continue
+        low_x = max(math.ceil(min(ax, bx, cx)), 0.0)
+        high_x = min(math.floor(max(ax, bx, cx)), image_width - 1.0)
+        low_y = max(math.ceil(min(ay, by, cy)), 0.0)
+        high_y = min(math.floor(max(ay, by, cy)), image_height - 1.0)
+        if low_x > high_x or low_y > high_y:
+            continue
+        intensity = -1.0
+        for j in range(int(low_y), int(high_y) + 1):
+            row = image_height - 1 - j
+            for column in range(int(low_x), int(high_x) + 1):
+                weight_a = (bx - column) * (cy - j) - (cx - column) * (by - j)
+                weight_b = (cx - column) * (ay - j) - (ax - column) * (cy - j)
+                weight_c = (ax - column) * (by - j) - (bx - column) * (ay - j)
+                if weight_a < 0.0 or weight_b < 0.0 or weight_c < 0.0:
+                    continue
+                weight_a /= area
+                weight_b /= area
+                weight_c /= area
+                pixel_depth = np.float32(
+                    weight_a * screen[a, 2] + weight_b * screen[b, 2] + weight_c * screen[c, 2]
+                )
+                if pixel_depth > depth[row, column]:
+                    continue
+                if intensity < 0.0 or not is_flat[f]:
+                    nx = weight_a * normals[f, 0, 0] + weight_b * normals[f, 1, 0] + weight_c * normals[f, 2, 0]
+                    ny = weight_a * normals[f, 0, 1] + weight_b * normals[f, 1, 1] + weight_c * normals[f, 2, 1]
+                    nz = weight_a * normals[f, 0, 2] + weight_b * normals[f, 1, 2] + weight_c * normals[f, 2, 2]
+                    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    if length > 0.0:
+                        nx, ny, nz = nx / length, ny / length, nz / length
+                    intensity = light_intensity(
+                        pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz,
+                        pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz,
+                        pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz,
+                    )
+                u = weight_a * uvs[f, 0, 0] + weight_b * uvs[f, 1, 0] + weight_c * uvs[f, 2, 0]
+                v = weight_a * uvs[f, 0, 1] + weight_b * uvs[f, 1, 1] + weight_c * uvs[f, 2, 1]
+                texel_row, texel_column = texel_index(u, v, texture_height, texture_width)
+                for channel in range(3):
+                    lit = intensity * texture[texel_row, texel_column, channel]
+                    rgb[channel, row, column] = np.uint8(min(255.0, lit))
+                depth[row, column] = pixel_depth
+                segm[row, column] = object_id
+                if heights.shape[0] > 0:
+                    heights[row, column] = (
+                        weight_a * screen[a, 3] + weight_b * screen[b, 3] + weight_c * screen[c, 3]
+                    )
+
+
+@njit(cache=True)
+def stamp_triangles(
+    vertices: np.ndarray,  # (V, 3) float64, body frame
+    corners: np.ndarray,  # (F, 3) int32, indices into vertices
+    pose: np.ndarray,  # (3, 4) float64, world from body
+    object_id: int,
+    origin_x: float,  # x of the centre of column 0, m
+    origin_y: float,  # y of the centre of row 0, m
+    cell: float,  # m
+    ceiling: float,  # surfaces at this height or above are left out, m
+    points: np.ndarray,  # (≥ V, 3) float64, scratch: column, row, height
+    labels: np.ndarray,  # (rows, columns) int16
+    heights: np.ndarray,  # (rows, columns) float32
+) -> None:
+    """Enter one body into a map seen from above: the highest surface over each cell's centre gets its id.
+
+    Of equal heights the later one counts. Rows run along y, columns along x.
+    """
+    num_rows, num_columns = labels.shape
+    for i in range(vertices.shape[0]):
+        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        x = pose[0, 0] * vx + pose[0, 1] * vy + pose[0, 2] * vz + pose[0, 3]
+        y = pose[1, 0] * vx + pose[1, 1] * vy + pose[1, 2] * vz + pose[1, 3]
+        points[i, 0] = (x - origin_x) / cell
+        points[i, 1] = (y - origin_y) / cell
+        points[i, 2] = pose[2, 0] * vx + pose[2, 1] * vy + pose[2, 2] * vz + pose[2, 3]
+
+    for f in range(corners.shape[0]):
+        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        ax, ay = points[a, 0], points[a, 1]
+        bx, by = points[b, 0], points[b, 1]
+        cx, cy = points[c, 0], points[c, 1]
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        if not area > 0.0:  # columns and rows run along x and y, so what turns left faces up
+            continue
+        low_x = max(math.ceil(min(ax, bx, cx)), 0.0)
+        high_x = min(math.floor(max(ax, bx, cx)), num_columns - 1.0)
+        low_y = max(math.ceil(min(ay, by, cy)), 0.0)
+        high_y = min(math.floor(max(ay, by, cy)), num_rows - 1.0)
+        if low_x > high_x or low_y > high_y:
+            continue
+        for row in range(int(low_y), int(high_y) + 1):
+            for column in range(int(low_x), int(high_x) + 1):
+                weight_a = (bx - column) * (cy - row) - (cx - column) * (by - row)
+                weight_b = (cx - column) * (ay - row) - (ax - column) * (cy - row)
+                weight_c = (ax - column) * (by - row) - (bx - column) * (ay - row)
+                if weight_a < 0.0 or weight_b < 0.0 or weight_c < 0.0:
+                    continue
+                z = (weight_a * points[a, 2] + weight_b * points[b, 2] + weight_c * points[c, 2]) / area
+                height = np.float32(z)
+                if z < ceiling and height >= heights[row, column]:
+                    heights[row, column] = height
+                    labels[row, column] = object_id

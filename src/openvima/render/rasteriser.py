@@ -1,0 +1,279 @@
+"""Images of scenes and prompts: colours, object ids and heights, the same bytes on every machine."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from openvima.catalog.geometry import Assets, TriangleMesh
+from openvima.errors import ShapeError
+from openvima.render.camera import CAMERAS, VIEWS, Camera, View
+from openvima.render.indexed import indexed, magnified, matrix_3x4
+from openvima.render.kernels import draw_triangles
+from openvima.scene import (
+    BACKGROUND_ID,
+    FLOOR_ID,
+    SHEET_ID,
+    ObjectImage,
+    ObjectRecord,
+    Placement,
+    Pose,
+    Prompt,
+    PromptImage,
+    RenderedPrompt,
+    Scene,
+    SceneImage,
+)
+
+FLOOR_Z = -0.001  # m; the sheet lies 1 mm above the floor on which the bodies rest
+FLOOR_RGB = (255, 255, 255)
+SHEET_RGB = (51, 51, 51)
+SHEET_SIZE = (0.501, 0.999)  # m, x and y, about (0.5, 0)
+PROMPT_POSE = Pose.planar(0.5, 0.0, math.pi / 2)  # where prompt images show a lone object
+FIRST_PROMPT_SCENE_ID = 2  # after floor and sheet; prompt scenes have no arm
+LARGEST_ID = 254  # 255 means nothing
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawable:
+    """A mesh to draw that is no object of the catalogue, such as a link of the arm.
+
+    Args:
+        mesh: The triangles.
+        pose: World from mesh frame.
+        id: Value of its pixels in segmentation images.
+        texture: Image, shape (H, W, 3), uint8, row 0 on top; or one colour, 0 to 255.
+    """
+
+    mesh: TriangleMesh
+    pose: Pose
+    id: int
+    texture: np.ndarray | Rgb
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Image:
+    """What one camera sees.
+
+    Args:
+        rgb: Colours, shape (3, H, W), uint8, row 0 on top.
+        segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 nothing.
+        height: Height above the table in metres, shape (H, W), float32; NaN where nothing is. None unless asked.
+    """
+
+    rgb: np.ndarray
+    segm: np.ndarray
+    height: np.ndarray | None = None
+
+
+class Rasteriser:
+    """Draws scenes and prompts with one asset pack.
+
+    Flat light, no shadows, no smoothing: the look of VIMA-Bench, pixel for pixel where the pack is the original.
+    One instance must not be used by two threads at once.
+
+    Args:
+        assets: Where shapes and textures come from.
+    """
+
+    def __init__(self, assets: Assets) -> None:
+        self.assets = assets
+        self._screen = np.empty((4096, 4))  # scratch of the kernel, one row a vertex; grows as needed
+        self._depth: dict[tuple[int, int], np.ndarray] = {}
+
+    def scene(
+        self,
+        scene: Scene,
+        *,
+        views: Sequence[View] = VIEWS,
+        height: bool = False,
+        extra: Sequence[Drawable] = (),
+        enlarge: int = 1,
+    ) -> dict[View, Image]:
+        """Draw a scene on its table.
+
+        Args:
+            scene: The objects; where surfaces coincide, the larger id shows.
+            views: Which cameras, in the order of the result.
+            height: Whether to return height maps too.
+            extra: Further bodies, drawn before the objects.
+            enlarge: Factor on the resolution, for videos; 1 gives the benchmark's images of 128 × 256 pixels.
+
+        Returns:
+            View name to image.
+
+        Raises:
+            UnknownObjectError, UnknownTextureError, AssetError: The pack has no shape or texture for an object.
+            ShapeError: An id or texture that images cannot hold.
+            ConfigError: `enlarge` is below 1.
+        """
+        bodies = [*extra, *(self._drawable(placement) for placement in scene.placements)]
+        return self._draw(bodies, views, height=height, enlarge=enlarge, table=True)
+
+    def prompt(self, prompt: Prompt) -> RenderedPrompt:
+        """Draw all images of a prompt, both views each.
+
+        Raises:
+            UnknownObjectError, UnknownTextureError, AssetError: The pack has no shape or texture for an object.
+        """
+        images = {}
+        for name, fill in prompt.images:
+            images[name] = (
+                self._object_image(name, fill) if isinstance(fill, ObjectImage) else self._scene_image(name, fill)
+            )
+        return RenderedPrompt(prompt.text, images)
+
+    def _object_image(self, name: str, fill: ObjectImage) -> PromptImage:
+        shown = fill.placement
+        body = self._drawable(shown, pose=PROMPT_POSE, object_id=0, magnification=fill.magnification)
+        drawn = self._draw([body], VIEWS, table=False)
+        records = (ObjectRecord(0, shown.object, shown.texture),)
+        return PromptImage(name, "object", _rgb_of(drawn), _segm_of(drawn), records)
+
+    def _scene_image(self, name: str, fill: SceneImage) -> PromptImage:
+        bodies, records = [], []
+        for object_id, shown in enumerate(fill.scene.placements, start=FIRST_PROMPT_SCENE_ID):
+            bodies.append(self._drawable(shown, object_id=object_id))
+            records.append(ObjectRecord(object_id, shown.object, shown.texture))
+        drawn = self._draw(bodies, VIEWS, table=True)
+        return PromptImage(name, "scene", _rgb_of(drawn), _segm_of(drawn), tuple(records))
+
+    def _drawable(
+        self,
+        placement: Placement,
+        *,
+        pose: Pose | None = None,
+        object_id: int | None = None,
+        magnification: float = 1.0,
+    ) -> Drawable:
+        mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
+        return Drawable(
+            mesh if magnification == 1 else magnified(mesh, magnification),
+            placement.pose if pose is None else pose,
+            placement.id if object_id is None else object_id,
+            self.assets.texture(placement.texture),
+        )
+
+    def _draw(
+        self,
+        bodies: Sequence[Drawable],
+        views: Sequence[View],
+        *,
+        table: bool,
+        height: bool = False,
+        enlarge: int = 1,
+    ) -> dict[View, Image]:
+        prepared = [
+            (indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id))
+            for body in bodies
+        ]
+        most_vertices = max((len(mesh.vertices) for mesh, *_ in prepared), default=0)
+        if most_vertices > len(self._screen):
+            self._screen = np.empty((most_vertices, 4))
+        images: dict[View, Image] = {}
+        for view in views:
+            ground = _ground(CAMERAS[view].enlarged(enlarge), table)
+            rgb, segm = ground.rgb.copy(), ground.segm.copy()
+            heights = ground.height.copy() if height else _NO_HEIGHTS
+            depth = self._depth.setdefault(segm.shape, np.empty(segm.shape, dtype=np.float32))
+            np.copyto(depth, ground.depth)
+            for mesh, pose, texture, object_id in prepared:
+                draw_triangles(
+                    mesh.vertices,
+                    mesh.corners,
+                    mesh.normals,
+                    mesh.uvs,
+                    mesh.is_flat,
+                    pose,
+                    ground.camera,
+                    texture,
+                    object_id,
+                    self._screen,
+                    depth,
+                    rgb,
+                    segm,
+                    heights,
+                )
+            images[view] = Image(rgb, segm, heights if height else None)
+        return images
+
+
+_NO_HEIGHTS = np.empty((0, 0), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ground:
+    """An image before any body is drawn into it, with its depths and the camera in the kernels' form."""
+
+    camera: np.ndarray
+    rgb: np.ndarray
+    segm: np.ndarray
+    height: np.ndarray
+    depth: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def _ground(camera: Camera, table: bool) -> _Ground:
+    shape = (camera.height, camera.width)
+    ground = _Ground(
+        camera.matrix(),
+        np.full((3, *shape), 255, dtype=np.uint8),
+        np.full(shape, BACKGROUND_ID, dtype=np.uint8),
+        np.full(shape, np.nan, dtype=np.float32),
+        np.full(shape, np.inf, dtype=np.float32),
+    )
+    if table:
+        floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)
+        sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
+        for body in (floor, sheet):
+            mesh = indexed(body.mesh)
+            draw_triangles(
+                mesh.vertices,
+                mesh.corners,
+                mesh.normals,
+                mesh.uvs,
+                mesh.is_flat,
+                matrix_3x4(body.pose),
+                ground.camera,
+                _texture_array(body.texture),
+                body.id,
+                np.empty((len(mesh.vertices), 4)),
+                ground.depth,
+                ground.rgb,
+                ground.segm,
+                ground.height,
+            )
+    return ground
+
+
+def _rectangle(length_x: float, length_y: float) -> TriangleMesh:
+    x, y = length_x / 2, length_y / 2
+    a, b, c, d = (-x, -y, 0.0), (x, -y, 0.0), (x, y, 0.0), (-x, y, 0.0)
+    vertices = np.array([[a, b, c], [a, c, d]])
+    return TriangleMesh(vertices, np.broadcast_to([0.0, 0.0, 1.0], (2, 3, 3)), np.zeros((2, 3, 2)))
+
+
+def _texture_array(texture: np.ndarray | Rgb) -> np.ndarray:
+    if isinstance(texture, tuple):
+        return np.array(texture, dtype=np.uint8).reshape(1, 1, 3)
+    if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
+        raise ShapeError(f"texture is {texture.dtype} of shape {texture.shape}; it must be uint8 (H, W, 3).")
+    return np.ascontiguousarray(texture)
+
+
+def _checked_id(object_id: int) -> int:
+    if not 0 <= object_id <= LARGEST_ID:
+        raise ShapeError(f"object id {object_id} does not fit a segmentation image; use 0 to {LARGEST_ID}.")
+    return object_id
+
+
+def _rgb_of(images: dict[View, Image]) -> dict[str, np.ndarray]:
+    return {view: image.rgb for view, image in images.items()}
+
+
+def _segm_of(images: dict[View, Image]) -> dict[str, np.ndarray]:
+    return {view: image.segm for view, image in images.items()}
