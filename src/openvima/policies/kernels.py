@@ -1,0 +1,168 @@
+"""Numba kernels of perception: extents of objects, area-resized crops, most interior points.
+
+Only loops over arrays that the caller prepared; `perception.py` checks shapes and owns the documentation.
+"""
+
+import numpy as np
+from numba import njit
+
+CROP_SIZE = 32
+_FAR = np.int32(1 << 20)
+
+
+@njit(cache=True)
+def object_extents(segm, slot_of_id, extents, num_pixels):
+    """Fill `extents` (N, 4) int64 with xmin, xmax, ymin, ymax and `num_pixels` (N,) from one image."""
+    for k in range(num_pixels.shape[0]):
+        num_pixels[k] = 0
+        extents[k, 0] = segm.shape[1]
+        extents[k, 1] = -1
+        extents[k, 2] = segm.shape[0]
+        extents[k, 3] = -1
+    for row in range(segm.shape[0]):
+        for column in range(segm.shape[1]):
+            k = slot_of_id[segm[row, column]]
+            if k < 0:
+                continue
+            num_pixels[k] += 1
+            extents[k, 0] = min(extents[k, 0], column)
+            extents[k, 1] = max(extents[k, 1], column)
+            extents[k, 2] = min(extents[k, 2], row)
+            extents[k, 3] = max(extents[k, 3], row)
+
+
+@njit(cache=True)
+def square_crop(rgb, xmin, xmax, ymin, ymax, square):
+    """Copy the inclusive box into `square` (3, S, S), which is zero, with the shorter side centred."""
+    width = xmax - xmin + 1
+    height = ymax - ymin + 1
+    size = max(width, height)
+    left = (size - width) // 2
+    top = (size - height) // 2
+    for channel in range(3):
+        for row in range(height):
+            for column in range(width):
+                square[channel, top + row, left + column] = rgb[channel, ymin + row, xmin + column]
+
+
+@njit(cache=True)
+def resize_square(square, size, scratch, crop):
+    """Resize `square[:, :size, :size]` to `crop` (3, 32, 32) uint8 as OpenCV's area interpolation does.
+
+    `scratch` is float64 of shape (32, 256) at least.
+    """
+    if size == CROP_SIZE:
+        for channel in range(3):
+            for row in range(CROP_SIZE):
+                for column in range(CROP_SIZE):
+                    crop[channel, row, column] = square[channel, row, column]
+    elif size == 2 * CROP_SIZE:
+        _halve(square, crop)
+    elif size > CROP_SIZE:
+        _shrink(square, size, scratch, crop)
+    else:
+        _enlarge(square, size, crop)
+
+
+@njit(cache=True)
+def _halve(square, crop):
+    """Average 2 × 2 pixels in integers, halves rounded up."""
+    for channel in range(3):
+        for row in range(CROP_SIZE):
+            for column in range(CROP_SIZE):
+                total = np.int64(2)
+                for i in range(2):
+                    for j in range(2):
+                        total += square[channel, 2 * row + i, 2 * column + j]
+                crop[channel, row, column] = total >> 2
+
+
+@njit(cache=True)
+def _shrink(square, size, scratch, crop):
+    """Weigh every source pixel by the area that it shares with the target pixel."""
+    scale = size / CROP_SIZE
+    for channel in range(3):
+        for row in range(CROP_SIZE):
+            low = row * scale
+            high = low + scale
+            for column in range(size):
+                total = 0.0
+                for i in range(int(low), min(int(np.ceil(high)), size)):
+                    total += (min(i + 1.0, high) - max(np.float64(i), low)) * square[channel, i, column]
+                scratch[row, column] = total
+        for row in range(CROP_SIZE):
+            for column in range(CROP_SIZE):
+                low = column * scale
+                high = low + scale
+                total = 0.0
+                for j in range(int(low), min(int(np.ceil(high)), size)):
+                    total += (min(j + 1.0, high) - max(np.float64(j), low)) * scratch[row, j]
+                crop[channel, row, column] = np.uint8(np.rint(total / (scale * scale)))
+
+
+@njit(cache=True)
+def _source(index, size):
+    """Source pixel, its neighbour's index and their weights of 2048 for one target index."""
+    inverse = np.float64(CROP_SIZE) / size
+    j = int(np.floor(index * (size / CROP_SIZE)))
+    fraction = np.float32((index + 1) - (j + 1) * inverse)
+    fraction = np.float32(0.0) if fraction <= 0 else np.float32(fraction - np.floor(fraction))
+    if j >= size - 1:
+        j = size - 1
+        fraction = np.float32(0.0)
+    w1 = np.int64(np.rint(fraction * np.float32(2048)))
+    w0 = np.int64(np.rint((np.float32(1.0) - fraction) * np.float32(2048)))
+    return j, min(j + 1, size - 1), w0, w1
+
+
+@njit(cache=True)
+def _enlarge(square, size, crop):
+    """Fixed-point linear interpolation, which OpenCV uses for "area" when it has to enlarge."""
+    for channel in range(3):
+        for row in range(CROP_SIZE):
+            i0, i1, v0, v1 = _source(row, size)
+            for column in range(CROP_SIZE):
+                j0, j1, w0, w1 = _source(column, size)
+                upper = w0 * square[channel, i0, j0] + w1 * square[channel, i0, j1]
+                lower = w0 * square[channel, i1, j0] + w1 * square[channel, i1, j1]
+                value = ((v0 * (upper >> 4)) >> 16) + ((v1 * (lower >> 4)) >> 16) + 2
+                crop[channel, row, column] = value >> 2
+
+
+@njit(cache=True)
+def most_interior_pixel(segm, object_id, extents, distance, pixel):
+    """Write column and row of the object's pixel that is farthest from its outline into `pixel` (2,).
+
+    Distances are those of the 3-4 chamfer metric; among equals the one nearest the centroid wins, then the
+    first in reading order. `distance` is int32 of shape (H + 2, W + 2) at least; its border stands for "outside".
+    """
+    xmin, xmax, ymin, ymax = extents[0], extents[1], extents[2], extents[3]
+    width = xmax - xmin + 1
+    height = ymax - ymin + 1
+    count = 0
+    sum_x = 0
+    sum_y = 0
+    for i in range(height + 2):
+        for j in range(width + 2):
+            inside = 1 <= i <= height and 1 <= j <= width and segm[ymin + i - 1, xmin + j - 1] == object_id
+            distance[i, j] = _FAR if inside else 0
+            if inside:
+                count += 1
+                sum_x += j
+                sum_y += i
+    for i in range(1, height + 1):
+        for j in range(1, width + 1):
+            d = min(distance[i, j], distance[i, j - 1] + 3, distance[i - 1, j] + 3)
+            distance[i, j] = min(d, distance[i - 1, j - 1] + 4, distance[i - 1, j + 1] + 4)
+    best = -1
+    best_off = 0
+    for i in range(height, 0, -1):
+        for j in range(width, 0, -1):
+            d = min(distance[i, j], distance[i, j + 1] + 3, distance[i + 1, j] + 3)
+            distance[i, j] = min(d, distance[i + 1, j + 1] + 4, distance[i + 1, j - 1] + 4)
+            off = (count * j - sum_x) ** 2 + (count * i - sum_y) ** 2
+            if distance[i, j] > best or (distance[i, j] == best and off <= best_off):
+                best = distance[i, j]
+                best_off = off
+                pixel[0] = xmin + j - 1
+                pixel[1] = ymin + i - 1
