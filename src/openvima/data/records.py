@@ -1,0 +1,178 @@
+"""A demonstration: everything that one run of the oracle showed, did and led to."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+
+from openvima import __version__
+from openvima.env import TabletopEnv
+from openvima.scene import ACTION_SHAPES, Action, EndEffector, Outcome, RenderedPrompt, Scene
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Demonstration:
+    """One rollout of the oracle over T steps, as stored.
+
+    Args:
+        task: Name of the task.
+        level: "train", "L1", "L2", "L3" or "L4".
+        domain: Domain of the seed.
+        seed: The episode's number.
+        num_redraws: Unlucky draws that the sampler threw away before this episode.
+        max_steps: Steps that a policy is given for this episode.
+        prompt: Text and images.
+        rgb: View name to images, shape (T + 1, 3, 128, 256), uint8: before the first step and after each.
+        segm: View name to object ids, shape (T + 1, 128, 256), uint8.
+        end_effector: "suction" or "spatula".
+        actions: The T actions.
+        pick_ids: Id of the object that each action picks or sweeps.
+        place_ids: Id of the object relative to which it is placed; 0 where the table itself is meant.
+        joint_paths: Waypoints of the arm for each action, shape (W, 6), float32, radians.
+        scenes: Where all objects were, T + 1 scenes.
+        outcome: How the episode ended.
+        assets: Name of the asset pack.
+        versions: Package name to version, of all packages that decide bytes.
+    """
+
+    task: str
+    level: str
+    domain: str
+    seed: int
+    num_redraws: int
+    max_steps: int
+    prompt: RenderedPrompt
+    rgb: dict[str, np.ndarray]
+    segm: dict[str, np.ndarray]
+    end_effector: EndEffector
+    actions: tuple[Action, ...]
+    pick_ids: tuple[int, ...]
+    place_ids: tuple[int, ...]
+    joint_paths: tuple[np.ndarray, ...]
+    scenes: tuple[Scene, ...]
+    outcome: Outcome
+    assets: str
+    versions: dict[str, str]
+
+    @property
+    def num_steps(self) -> int:
+        """Number of actions, T."""
+        return len(self.actions)
+
+    def observation(self, step: int) -> dict[str, object]:
+        """Return what the environment showed before action `step` (or at the end, for `step` = T)."""
+        return {
+            "rgb": {view: images[step] for view, images in self.rgb.items()},
+            "segm": {view: images[step] for view, images in self.segm.items()},
+            "ee": ("suction", "spatula").index(self.end_effector),
+        }
+
+    def content_hash(self) -> str:
+        """Return 32 hexadecimal digits that are equal for equal content.
+
+        Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
+        versions of the packages do not count.
+        """
+        digest = hashlib.blake2b(digest_size=16)
+        for part in _content(self):
+            digest.update(len(part).to_bytes(8, "little"))
+            digest.update(part)
+        return digest.hexdigest()
+
+
+def rollout_oracle(env: TabletopEnv, seed: int) -> Demonstration:
+    """Let the oracle play one episode.
+
+    Args:
+        env: The environment; it is reset.
+        seed: The episode's number.
+
+    Returns:
+        The run, successful or not: it ends with success, failure, or after the oracle's number of steps.
+
+    Raises:
+        SamplingError: The task finds no start for this seed.
+        OracleError: The oracle finds no action.
+    """
+    observation, _ = env.reset(seed=seed)
+    episode, observations, scenes = env.episode, [observation], [env.scene]
+    decisions, paths = [], []
+    while not env.outcome.is_over and len(decisions) < episode.oracle_max_steps:
+        decision = env.oracle_decision()
+        observation, *_ = env.step(decision.action)
+        decisions.append(decision)
+        paths.append(env.joint_path)
+        observations.append(observation)
+        scenes.append(env.scene)
+    return Demonstration(
+        task=episode.task,
+        level=episode.level,
+        domain=episode.domain,
+        seed=episode.seed,
+        num_redraws=episode.num_redraws,
+        max_steps=episode.max_steps,
+        prompt=env.prompt,
+        rgb=_stacked(observations, "rgb"),
+        segm=_stacked(observations, "segm"),
+        end_effector=scenes[0].end_effector,
+        actions=tuple(decision.action for decision in decisions),
+        pick_ids=tuple(decision.pick_id for decision in decisions),
+        place_ids=tuple(decision.place_id for decision in decisions),
+        joint_paths=tuple(paths),
+        scenes=tuple(scenes),
+        outcome=env.outcome,
+        assets=env.assets.name,
+        versions=package_versions(),
+    )
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of all packages that decide the bytes of a demonstration."""
+    others = {name: version(name) for name in ("mujoco", "numba", "numpy", "pyarrow")}
+    return {"openvima": __version__, **others}
+
+
+def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:
+    return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
+
+
+def _content(demo: Demonstration) -> Iterator[bytes]:
+    """All content in a fixed order: texts and small numbers as JSON, arrays as little-endian bytes."""
+    yield json.dumps(_summary(demo), sort_keys=True).encode()
+    for view in sorted(demo.rgb):
+        yield from (_array_bytes(demo.rgb[view], "u1"), _array_bytes(demo.segm[view], "u1"))
+    for image in demo.prompt.images.values():
+        for view in sorted(image.rgb):
+            yield from (_array_bytes(image.rgb[view], "u1"), _array_bytes(image.segm[view], "u1"))
+    for action in demo.actions:
+        for key in ACTION_SHAPES:
+            yield _array_bytes(np.array(getattr(action, key)), "<f4")
+    yield from (_array_bytes(path, "<f4") for path in demo.joint_paths)
+    for scene in demo.scenes:
+        poses = [[*p.pose.position, *p.pose.quaternion] for p in scene.placements]
+        yield _array_bytes(np.array(poses), "<f8")
+
+
+def _summary(demo: Demonstration) -> dict:
+    return {
+        "task": [demo.task, demo.level, demo.domain, demo.seed, demo.num_redraws, demo.max_steps],
+        "prompt": demo.prompt.text,
+        "images": [
+            [image.name, image.kind, [[o.object_id, o.object, o.texture] for o in image.objects]]
+            for image in demo.prompt.images.values()
+        ],
+        "end_effector": demo.end_effector,
+        "ids": [demo.pick_ids, demo.place_ids],
+        "objects": [
+            [p.id, p.object, p.texture, p.size, p.fixed, p.scale] for p in demo.scenes[0].placements
+        ],
+        "outcome": [demo.outcome.success, demo.outcome.failure, demo.outcome.reason],
+        "assets": demo.assets,
+    }
+
+
+def _array_bytes(array: np.ndarray, dtype: str) -> bytes:
+    return np.ascontiguousarray(array, dtype=dtype).tobytes()

@@ -1,0 +1,364 @@
+"""The Gymnasium environment: one task, one arm, one table."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from openvima.catalog.geometry import Assets
+from openvima.catalog.packs import load_assets
+from openvima.errors import ConfigError, EpisodeError, LevelError
+from openvima.render.camera import VIEWS
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import (
+    ACTION_SHAPES,
+    END_EFFECTORS,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    Action,
+    Episode,
+    Outcome,
+    RenderedPrompt,
+    Scene,
+)
+from openvima.sim.world import World
+from openvima.tasks import goals, sample_episode, task_spec
+from openvima.tasks.goals import Progress
+from openvima.tasks.oracle import OracleDecision, oracle_action
+from openvima.tasks.seeding import stream
+
+IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
+FRAMES_PER_SECOND = 30
+_LARGEST_SEED = 2**31  # of the seeds that a reset without one draws
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture of a film, not rendered yet.
+
+    Args:
+        scene: Where everything is.
+        joints: Angles of the arm, shape (6,), radians.
+    """
+
+    scene: Scene
+    joints: np.ndarray
+
+
+@dataclass(slots=True, eq=False)
+class _Run:
+    """What belongs to the episode that is being played."""
+
+    episode: Episode
+    world: World
+    progress: Progress
+    oracle_rng: np.random.Generator
+    outcome: Outcome = field(default_factory=Outcome)
+    num_steps: int = 0
+    grasped: int | None = None
+    joint_path: np.ndarray = field(default_factory=lambda: np.zeros((0, 6), np.float32))
+    frames: list[Frame] = field(default_factory=list)
+    prompt: RenderedPrompt | None = None
+
+    def watch(self, scene: Scene) -> None:
+        self.progress = goals.watch(self.episode.problem, self.progress, scene)
+
+    def record(self, scene: Scene, joints: np.ndarray) -> None:
+        self.frames.append(Frame(scene, np.array(joints)))
+
+    def advance(self) -> None:
+        self.num_steps += 1
+        self.progress, self.outcome = goals.advance(self.episode.problem, self.progress, self.world.scene)
+
+
+class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
+    """A UR5 arm at a table: read a prompt, look from two cameras, pick and place or sweep.
+
+    **Observation** — a dictionary; the cameras `front` and `top` are fixed, the arm is not shown.
+
+    | key | shape, dtype | meaning |
+    |---|---|---|
+    | `rgb` / view | (3, 128, 256) uint8 | red, green, blue; row 0 on top |
+    | `segm` / view | (128, 256) uint8 | object id of each pixel: 0 floor, 1 table sheet, 255 nothing |
+    | `ee` | int | 0 suction cup, 1 spatula |
+
+    **Action** — a dictionary; all four keys, float32 (any floating-point dtype is taken).
+
+    | key | shape | range |
+    |---|---|---|
+    | `pose0_position`, `pose1_position` | (2,) | x 0.25 … 0.75 m, y −0.5 … 0.5 m |
+    | `pose0_rotation`, `pose1_rotation` | (4,) | quaternion xyzw, each −1 … 1; only its yaw matters |
+
+    With the suction cup a step picks at pose0 and places at pose1, the object turned by the difference of
+    yaw. With the spatula it sweeps in a straight line from pose0 to pose1. An action that does not fit
+    raises `ActionError` and changes nothing.
+
+    **Reward** — 1.0 on the step that solves the task, else 0.0.
+
+    **End** — `terminated` on success or failure; `truncated` after `episode.max_steps` steps otherwise.
+
+    **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image), `success`,
+    `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
+    None), `num_steps`, `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of
+    object and texture). The images of the prompt are in `prompt`, an attribute.
+
+    **Start** — `reset(seed=k)` gives episode number k of the environment's domain, task and level: always
+    the same bytes. `reset()` draws the next number from the environment's generator.
+    `reset(options={"episode": episode})` loads a sampled episode.
+
+    Version history:
+        v0: First version.
+
+    Args:
+        task: Name of the task, such as "rotate".
+        level: "train", "L1", "L2", "L3" or "L4": which objects, textures and tasks may occur.
+        domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
+        assets: "procedural", the folder of the original asset pack, or an object that has shapes and textures.
+        compat: Follow the original benchmark also where it is odd: objects hover at the start, ids follow
+            the order of spawning, the oracle picks any visible point.
+        realtime: Record `frames`, 30 a second, while a step runs.
+        render_mode: None, or "rgb_array": `render` returns both views, front above top.
+        **task_options: Arguments of the task.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        LevelError: The task is not defined at the level.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        level: str = "train",
+        domain: str = "user",
+        assets: str | Path | Assets = "procedural",
+        compat: bool = False,
+        realtime: bool = False,
+        render_mode: str | None = None,
+        **task_options: Any,
+    ) -> None:
+        _check(task, level, render_mode)
+        self.task = task
+        self.level = level
+        self.domain = domain
+        self.assets = load_assets(assets)
+        self.compat = compat
+        self.realtime = realtime
+        self.render_mode = render_mode
+        self.task_options = task_options
+        self.observation_space = _observation_space()
+        self.action_space = _action_space()
+        self._rasteriser = Rasteriser(self.assets)
+        self._run: _Run | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: The episode's number; None draws one from the environment's generator.
+            options: May hold "episode", an `Episode` to load instead of sampling one.
+
+        Returns:
+            The first observation, and the info.
+
+        Raises:
+            SamplingError: The task finds no start for this seed.
+            ConfigError: An option is not known.
+        """
+        super().reset(seed=seed)
+        episode = _episode_option(options) or self._sample(seed)
+        rng = stream(episode.domain, episode.task, episode.level, episode.seed, "oracle")
+        world = World(episode.problem.scene, self.assets, compat=self.compat)
+        self._run = _Run(episode, world, goals.begin(episode.problem), rng)
+        return self._observe(), self._info()
+
+    def step(
+        self, action: Mapping[str, Any] | Action
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Run one whole primitive and let everything come to rest.
+
+        Args:
+            action: The four arrays, or an `Action`.
+
+        Returns:
+            Observation, reward, terminated, truncated, info, as described at the class.
+
+        Raises:
+            EpisodeError: No episode is running.
+            ActionError: The action does not fit; nothing was moved.
+        """
+        run = self._running()
+        if run.outcome.is_over or run.num_steps >= run.episode.max_steps:
+            raise EpisodeError(f"the episode ended after {run.num_steps} steps; reset() starts the next one.")
+        checked = Action.from_arrays(action.to_arrays() if isinstance(action, Action) else action)
+        run.frames = []
+        execution = run.world.execute(
+            checked,
+            watch=run.watch if run.episode.problem.constraints else None,
+            record=run.record if self.realtime else None,
+            frames_per_second=FRAMES_PER_SECOND,
+        )
+        run.grasped, run.joint_path = execution.grasped, execution.joint_path
+        run.advance()
+        terminated = run.outcome.is_over
+        truncated = run.num_steps >= run.episode.max_steps and not terminated
+        reward = 1.0 if run.outcome.success else 0.0
+        return self._observe(), reward, terminated, truncated, self._info()
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]  # Gymnasium leaves the type open
+        """Return both views, front above top, shape (256, 256, 3), uint8; None without a render mode.
+
+        Raises:
+            EpisodeError: There is no episode yet.
+        """
+        if self.render_mode is None:
+            return None
+        images = self._rasteriser.scene(self.scene)
+        return np.concatenate([np.moveaxis(images[view].rgb, 0, -1) for view in VIEWS])
+
+    def close(self) -> None:
+        """Free the simulation; a `reset` brings it back."""
+        self._run = None
+
+    def oracle_decision(self) -> OracleDecision:
+        """Ask the scripted oracle, which knows the scene, for the next action.
+
+        Raises:
+            EpisodeError: There is no episode yet.
+            OracleError: It has none.
+        """
+        run = self._running()
+        return oracle_action(
+            run.episode.problem,
+            run.progress,
+            run.world.scene,
+            assets=self.assets,
+            rng=run.oracle_rng,
+            compat=self.compat,
+        )
+
+    @property
+    def episode(self) -> Episode:
+        """The problem that is being played."""
+        return self._running().episode
+
+    @property
+    def prompt(self) -> RenderedPrompt:
+        """What the robot is told: text and rendered images; `prompt.sequence()` is its reading order."""
+        run = self._running()
+        if run.prompt is None:
+            run.prompt = self._rasteriser.prompt(run.episode.problem.prompt)
+        return run.prompt
+
+    @property
+    def scene(self) -> Scene:
+        """Where everything is now: what a policy must not know."""
+        return self._running().world.scene
+
+    @property
+    def progress(self) -> Progress:
+        """Which goals are met, and which constraints broken."""
+        return self._running().progress
+
+    @property
+    def outcome(self) -> Outcome:
+        """How the episode stands."""
+        return self._running().outcome
+
+    @property
+    def joint_path(self) -> np.ndarray:
+        """Waypoints of the arm in the last step, shape (W, 6), float32, radians."""
+        return self._running().joint_path
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        """The film of the last step, 30 frames a second; empty unless `realtime`."""
+        return tuple(self._running().frames)
+
+    def _running(self) -> _Run:
+        if self._run is None:
+            raise EpisodeError("there is no episode yet; call reset() first.")
+        return self._run
+
+    def _sample(self, seed: int | None) -> Episode:
+        return sample_episode(
+            self.task,
+            level=self.level,
+            seed=int(self.np_random.integers(_LARGEST_SEED)) if seed is None else seed,
+            domain=self.domain,
+            assets=self.assets,
+            compat=self.compat,
+            **self.task_options,
+        )
+
+    def _observe(self) -> dict[str, Any]:
+        scene = self.scene
+        images = self._rasteriser.scene(scene)
+        return {
+            "rgb": {view: images[view].rgb for view in VIEWS},
+            "segm": {view: images[view].segm for view in VIEWS},
+            "ee": END_EFFECTORS.index(scene.end_effector),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        run = self._running()
+        episode, problem = run.episode, run.episode.problem
+        return {
+            "prompt": problem.prompt.text,
+            "success": run.outcome.success,
+            "failure": run.outcome.failure,
+            "reason": run.outcome.reason,
+            "grasped": run.grasped,
+            "num_steps": run.num_steps,
+            "task": episode.task,
+            "level": episode.level,
+            "domain": episode.domain,
+            "seed": episode.seed,
+            "end_effector": problem.scene.end_effector,
+            "objects": {
+                p.id: {"object": p.object, "texture": p.texture} for p in problem.scene.placements
+            },
+        }
+
+
+def _observation_space() -> spaces.Dict:
+    rgb = {view: spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8) for view in VIEWS}
+    segm = {view: spaces.Box(0, 255, IMAGE_SHAPE, np.uint8) for view in VIEWS}
+    ee = spaces.Discrete(len(END_EFFECTORS))
+    return spaces.Dict({"rgb": spaces.Dict(rgb), "segm": spaces.Dict(segm), "ee": ee})
+
+
+def _action_space() -> spaces.Dict:
+    position = (np.array(WORKSPACE_LOW, np.float32), np.array(WORKSPACE_HIGH, np.float32))
+    rotation = (np.full(4, -1, np.float32), np.full(4, 1, np.float32))
+    bounds = {"position": position, "rotation": rotation}
+    return spaces.Dict(
+        {key: spaces.Box(*bounds[key.split("_")[1]], dtype=np.float32) for key in ACTION_SHAPES}
+    )
+
+
+def _check(task: str, level: str, render_mode: str | None) -> None:
+    levels = task_spec(task).levels
+    if level not in levels:
+        raise LevelError(f"task {task!r} is not defined at level {level!r}; it is at {', '.join(levels)}.")
+    modes = TabletopEnv.metadata["render_modes"]
+    if render_mode is not None and render_mode not in modes:
+        raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")
+
+
+def _episode_option(options: Mapping[str, Any] | None) -> Episode | None:
+    unknown = set(options or ()) - {"episode"}
+    if unknown:
+        raise ConfigError(f"reset has no option {', '.join(sorted(unknown))}; it takes 'episode'.")
+    episode = (options or {}).get("episode")
+    if episode is not None and not isinstance(episode, Episode):
+        raise ConfigError(f"option 'episode' is a {type(episode).__name__}; give an Episode.")
+    return episode
