@@ -1,0 +1,189 @@
+"""Multimodal prompts as people read them: words and small pictures in one line of text."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from openvima.scene import BACKGROUND_ID, PromptImage, RenderedPrompt
+
+Colour = tuple[int, int, int]
+
+INK: Colour = (28, 32, 38)
+PAPER: Colour = (255, 255, 255)
+EDGE: Colour = (208, 213, 220)
+_CLOSING = ".,;:!?)"  # marks that stick to what stands before them
+_ENLARGE = 4  # pictures are drawn at this multiple before they are scaled down to their place
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """A word or a picture, with its size and the space in front of it, in pixels."""
+
+    content: "str | Image.Image"
+    width: int
+    height: int
+    space: int
+
+
+def prompt_pieces(prompt: RenderedPrompt) -> "list[str | PromptImage]":
+    """Split a prompt into single words and images, in reading order."""
+    pieces: list[str | PromptImage] = []
+    for part in prompt.sequence():
+        pieces += part.split() if isinstance(part, str) else [part]
+    return pieces
+
+
+def thumbnail(image: PromptImage, height: int = 72) -> Image.Image:
+    """Draw the front view of a prompt image as a small picture.
+
+    Pictures of single objects are cut to the object; those of scenes are shown whole.
+
+    Args:
+        image: Rendered image of one placeholder.
+        height: Height of the picture in pixels.
+
+    Returns:
+        RGB picture of that height, with rounded corners on white.
+    """
+    pixels = np.ascontiguousarray(image.rgb["front"].transpose(1, 2, 0))
+    if image.kind == "object":
+        pixels = _cut_to_object(pixels, image.segm["front"])
+    rows, columns = pixels.shape[:2]
+    width = max(1, round(columns * height / rows))
+    # enlarged without smoothing first, so that textures keep their edges
+    sharp = Image.fromarray(pixels).resize((columns * _ENLARGE, rows * _ENLARGE), Image.Resampling.NEAREST)
+    return _rounded(sharp.resize((width, height), Image.Resampling.BOX), radius=max(2, height // 12))
+
+
+def draw_prompt_strip(
+    prompt: RenderedPrompt,
+    *,
+    width: int,
+    image_height: int = 64,
+    font_size: int = 22,
+    paper: Colour = PAPER,
+    ink: Colour = INK,
+) -> np.ndarray:
+    """Draw a prompt as a strip: words and pictures in reading order, wrapped over as many lines as it takes.
+
+    Args:
+        prompt: The prompt as a policy receives it.
+        width: Width of the strip in pixels.
+        image_height: Height of the pictures in pixels.
+        font_size: Size of the letters in pixels.
+        paper: Colour of the ground.
+        ink: Colour of the letters.
+
+    Returns:
+        Shape (height, `width`, 3), uint8; the height is even and follows from the number of lines.
+    """
+    margin = max(6, font_size // 2)
+    typeface = font(font_size)
+    pieces = [_piece(part, image_height, typeface, font_size) for part in prompt_pieces(prompt)]
+    lines = _wrap(_fitting(pieces, width - 2 * margin), width - 2 * margin)
+    heights = [max(piece.height for piece in line) for line in lines]
+    total = sum(heights) + margin * (len(lines) + 1)
+    strip = Image.new("RGB", (width, total + total % 2), paper)
+    draw = ImageDraw.Draw(strip)
+    top = margin
+    for line, height in zip(lines, heights, strict=True):
+        left = margin
+        for index, piece in enumerate(line):
+            left += piece.space if index else 0
+            middle = top + height // 2
+            if isinstance(piece.content, str):
+                draw.text((left, middle), piece.content, font=typeface, fill=ink, anchor="lm")
+            else:
+                strip.paste(piece.content, (left, middle - piece.height // 2))
+            left += piece.width
+        top += height + margin
+    return np.asarray(strip)
+
+
+@cache
+def font(size: int, *, bold: bool = False) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
+    """Load a typeface that comes with the installation, so that strips look alike on every machine.
+
+    Args:
+        size: Size of the letters in pixels.
+        bold: Whether to take the bold cut.
+    """
+    try:
+        import matplotlib
+    except ImportError:
+        return ImageFont.load_default(size)
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), size)
+
+
+def _piece(part: "str | PromptImage", image_height: int, typeface, font_size: int) -> _Piece:
+    space = font_size // 3
+    if isinstance(part, str):
+        width = int(np.ceil(typeface.getlength(part)))
+        return _Piece(part, width, font_size, 0 if part[0] in _CLOSING else space)
+    picture = thumbnail(part, image_height)
+    return _Piece(picture, picture.width, picture.height, space)
+
+
+def _fitting(pieces: list[_Piece], width: int) -> list[_Piece]:
+    """Scale down pictures that are wider than a line."""
+    fitting = []
+    for piece in pieces:
+        if isinstance(piece.content, Image.Image) and piece.width > width:
+            height = max(1, piece.height * width // piece.width)
+            picture = piece.content.resize((width, height), Image.Resampling.BOX)
+            piece = _Piece(picture, width, height, piece.space)
+        fitting.append(piece)
+    return fitting
+
+
+def _wrap(pieces: list[_Piece], width: int) -> list[list[_Piece]]:
+    lines: list[list[_Piece]] = [[]]
+    used = 0
+    for piece in pieces:
+        needed = piece.width + (piece.space if lines[-1] else 0)
+        if lines[-1] and used + needed > width and piece.space:
+            lines.append([])
+            used, needed = 0, piece.width
+        lines[-1].append(piece)
+        used += needed
+    return [line for line in lines if line] or [[_Piece("", 0, 1, 0)]]
+
+
+def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
+    """Cut an object's picture to the object with a margin, never narrower than it is high."""
+    shown = (segm != BACKGROUND_ID) & (pixels != 255).any(axis=2)
+    if not shown.any():
+        return pixels
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    margin = 4
+    height = int(rows[-1] - rows[0]) + 1 + 2 * margin
+    width = max(int(columns[-1] - columns[0]) + 1 + 2 * margin, height)
+    height = max(height, width // 3)
+    top = int(rows[0] + rows[-1] + 1 - height) // 2
+    left = int(columns[0] + columns[-1] + 1 - width) // 2
+    cut = np.full((height, width, 3), 255, dtype=np.uint8)
+    source_rows, source_columns = segm.shape
+    row0, row1 = max(top, 0), min(top + height, source_rows)
+    column0, column1 = max(left, 0), min(left + width, source_columns)
+    cut[row0 - top : row1 - top, column0 - left : column1 - left] = pixels[row0:row1, column0:column1]
+    return cut
+
+
+def _rounded(picture: Image.Image, radius: int) -> Image.Image:
+    scale = 4  # the mask is drawn larger and scaled down for a smooth edge
+    size = (picture.width * scale, picture.height * scale)
+    mask, edge = Image.new("L", size, 0), Image.new("L", size, 0)
+    box = (0, 0, size[0] - 1, size[1] - 1)
+    ImageDraw.Draw(mask).rounded_rectangle(box, radius * scale, fill=255)
+    ImageDraw.Draw(edge).rounded_rectangle(box, radius * scale, outline=255, width=scale)
+    framed = Image.new("RGB", picture.size, PAPER)
+    framed.paste(picture, mask=mask.resize(picture.size, Image.Resampling.BOX))
+    framed.paste(EDGE, mask=edge.resize(picture.size, Image.Resampling.BOX))
+    return framed
+
+
+__all__ = ["draw_prompt_strip", "font", "prompt_pieces", "thumbnail"]

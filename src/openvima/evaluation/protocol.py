@@ -1,0 +1,240 @@
+"""The protocol of an evaluation: which policies play which tasks at which levels on which seeds.
+
+Episodes are grouped into batches before anything runs, in a way that depends on the protocol alone. Workers take
+whole batches, so their number changes neither the batches nor the results.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from openvima.catalog.partitions import LEVELS
+from openvima.errors import ConfigError, LevelError, unknown_name
+from openvima.tasks.registry import list_tasks, task_spec
+
+ORACLE = "oracle"
+NAMED_POLICIES = (ORACLE, "random", "untrained")
+_WEIGHTS = (".safetensors", ".ckpt", ".pt", ".pth", ".bin")
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationConfig:
+    """What to evaluate, and how.
+
+    Args:
+        policies: Each "oracle", "random", "untrained" or a run folder; a folder can be given a name as
+            "name=path", by default it has that of the folder.
+        tasks: Names of tasks, or ("all",) for every task that the level holds.
+        levels: From "train", "L1", "L2", "L3", "L4".
+        episodes: Episodes for each policy, task and level.
+        seed: First seed, of domain "eval"; the others follow without gaps.
+        workers: Processes; the results do not depend on their number.
+        out: Folder to write to.
+        assets: "procedural", or a checkout of the original benchmark.
+        batch: Episodes that are played together, so that a policy decides for all of them at once.
+        videos: Filmed episodes of each policy and task, for the report.
+        force: Overwrite results of another evaluation in `out`.
+    """
+
+    policies: tuple[str, ...]
+    tasks: tuple[str, ...] = ("all",)
+    levels: tuple[str, ...] = ("L1", "L2", "L3", "L4")
+    episodes: int = 50
+    seed: int = 0
+    workers: int = 1
+    out: Path = Path("evaluation")
+    assets: str = "procedural"
+    batch: int = 16
+    videos: int = 1
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value}; it must be at least {least}."
+            for name, value, least in (
+                ("episodes", self.episodes, 1),
+                ("seed", self.seed, 0),
+                ("workers", self.workers, 1),
+                ("batch", self.batch, 1),
+                ("videos", self.videos, 0),
+            )
+            if value < least
+        ]
+        problems += [
+            f"{name} is empty; give at least one."
+            for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
+            if not values
+        ]
+        if problems:
+            raise ConfigError(" ".join(problems))
+
+    def record(self) -> dict[str, object]:
+        """Settings that the results depend on, as plain JSON values; no paths, workers or videos."""
+        return {
+            "policies": [source.name for source in policy_sources(self.policies)],
+            "tasks": list(self.tasks),
+            "levels": list(self.levels),
+            "episodes": self.episodes,
+            "seed": self.seed,
+            "domain": "eval",
+            "batch": self.batch,
+            "assets": "procedural" if self.assets == "procedural" else "original",
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class PolicySource:
+    """A policy under the name that it bears in the results.
+
+    Args:
+        name: Name in the results.
+        source: "oracle", "random", "untrained" or the path of a run folder or checkpoint.
+    """
+
+    name: str
+    source: str
+
+    @property
+    def kind(self) -> str:
+        """The source itself if it is one of the named policies, else "run"."""
+        return self.source if self.source in NAMED_POLICIES else "run"
+
+    def record(self) -> dict[str, str]:
+        """What the policy is; for a trained one with a hash of its weights.
+
+        Raises:
+            ConfigError: There is no such run folder.
+        """
+        if self.kind != "run":
+            return {"kind": self.kind}
+        return {"kind": "run", "sha256": weights_hash(Path(self.source))}
+
+
+def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
+    """Read policies as given on the command line.
+
+    Raises:
+        ConfigError: Two policies bear the same name.
+    """
+    sources = []
+    for given in policies:
+        name, equals, source = given.partition("=")
+        sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
+    names = [source.name for source in sources]
+    repeated = sorted({name for name in names if names.count(name) > 1 or not name})
+    if repeated:
+        raise ConfigError(f"policies need distinct names, got {', '.join(names)}; name them as NAME=PATH.")
+    return tuple(sources)
+
+
+def weights_hash(path: Path) -> str:
+    """SHA-256 over the files of weights in a run folder, or over one checkpoint file, as hexadecimal text.
+
+    Raises:
+        ConfigError: There is no such file or folder, or the folder holds no weights.
+    """
+    if not path.exists():
+        hint = unknown_name("policy", str(path), NAMED_POLICIES)
+        raise ConfigError(f"{hint} Or give the folder of a training run.")
+    files = [path] if path.is_file() else sorted(f for f in path.rglob("*") if f.suffix in _WEIGHTS)
+    if not files:
+        raise ConfigError(f"{path} holds no weights ({', '.join(_WEIGHTS)}); give the folder of a training run.")
+    digest = hashlib.sha256()
+    for file in files:
+        with open(file, "rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Episodes of one policy, task and level with consecutive seeds, played together.
+
+    Args:
+        policy: Name of the policy in the results.
+        source: Where the policy comes from, as in `PolicySource`.
+        task: Name of the task.
+        level: Level of the episodes.
+        first_seed: Seed of the first one.
+        episodes: How many.
+        assets: As in `EvaluationConfig`.
+    """
+
+    policy: str
+    source: str
+    task: str
+    level: str
+    first_seed: int
+    episodes: int
+    assets: str = "procedural"
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the episodes."""
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+    def key(self, fingerprint: str) -> str:
+        """Name for the batch's stored outcomes: changes with anything that they depend on.
+
+        Args:
+            fingerprint: Text that stands for the policy's weights and the package's version.
+        """
+        content = json.dumps([asdict(self), fingerprint], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:24]
+
+
+def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
+    """Pairs of task and level to play, levels first in order.
+
+    With "all", a level's tasks are those that it holds; a task named explicitly must be held by every level.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        LevelError: There is no such level, or it does not hold a named task.
+        ConfigError: No level holds any of the tasks.
+    """
+    for level in config.levels:
+        if level not in LEVELS:
+            raise LevelError(unknown_name("level", level, LEVELS))
+    known = list_tasks()
+    if "all" in config.tasks:
+        pairs = [(task, level) for level in config.levels for task in known if level in task_spec(task).levels]
+        if not pairs:
+            raise ConfigError(f"levels {', '.join(config.levels)} hold none of the tasks {', '.join(known)}.")
+        return pairs
+    missing = [
+        f"{task} is not defined at {level} (only at {', '.join(task_spec(task).levels)})"
+        for level in config.levels
+        for task in config.tasks
+        if level not in task_spec(task).levels
+    ]
+    if missing:
+        raise LevelError(f"{'; '.join(missing)}. Leave it out, or give --tasks all to take what each level holds.")
+    return [(task, level) for level in config.levels for task in config.tasks]
+
+
+def plan(config: EvaluationConfig) -> list[Batch]:
+    """Divide an evaluation into batches: by policy, level and task, then by seed in steps of `config.batch`."""
+    return [
+        Batch(
+            policy=policy.name,
+            source=policy.source,
+            task=task,
+            level=level,
+            first_seed=config.seed + offset,
+            episodes=min(config.batch, config.episodes - offset),
+            assets=config.assets,
+        )
+        for policy in policy_sources(config.policies)
+        for task, level in cells(config)
+        for offset in range(0, config.episodes, config.batch)
+    ]
+
+
+def _default_name(source: str) -> str:
+    if source in NAMED_POLICIES:
+        return source
+    path = Path(source)
+    return path.parent.name if path.suffix in _WEIGHTS else path.name

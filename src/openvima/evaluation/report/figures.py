@@ -1,0 +1,150 @@
+"""Charts of the report: plain SVG that takes its colours from the page, so that it suits light and dark."""
+
+import html
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from openvima.evaluation.results import Results
+
+# Stand-ins that matplotlib draws with; the page's colours replace them, see `_themed`.
+_INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
+_PANEL_WIDTH_IN = 3.9
+_STYLE = {
+    "svg.hashsalt": "openvima",  # element names in the file are the same in every run
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "text.color": _INK,
+    "axes.labelcolor": _MUTED,
+    "axes.edgecolor": _GRID,
+    "xtick.color": _MUTED,
+    "ytick.color": _MUTED,
+    "grid.color": _GRID,
+    "grid.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.spines.left": False,
+}
+
+
+def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str:
+    """Draw the success rates of one level: a row a task, a dot with its interval a policy.
+
+    Args:
+        results: The evaluation.
+        level: The level to show.
+        colours: Name of each policy to the CSS variable of its colour, such as "--series-1".
+
+    Returns:
+        An `<svg>` element.
+    """
+    tasks, policies = results.tasks(level), results.policy_names()
+    height_in = 0.55 + len(tasks) * (0.16 + 0.13 * len(policies))
+    figure, axes = _panel(height_in, margins_in=(0.08, 0.3, 0.1, 0.05))
+    spread = 0.62 / max(1, len(policies) - 1) if len(policies) > 1 else 0.0
+    for task_index, task in enumerate(tasks):
+        axes.text(0, task_index - 0.47, task, fontsize=9.5, color=_INK, va="center")
+        for index, policy in enumerate(policies):
+            row = results.row(policy, task, level)
+            if row is None:
+                continue
+            y = task_index + (index - (len(policies) - 1) / 2) * spread + 0.08
+            low, high = (100 * end for end in row.interval)
+            colour = _series(colours[policy])
+            axes.plot([low, high], [y, y], color=colour, linewidth=2.2, alpha=0.45, solid_capstyle="round")
+            axes.plot([100 * row.successes / row.episodes], [y], "o", color=colour, markersize=5.5)
+    axes.set_xlim(-2, 102)
+    axes.set_ylim(len(tasks) - 0.4, -0.65)
+    axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+    axes.set_yticks([])
+    axes.tick_params(length=0)
+    return _themed(figure, f"level-{level}", f"Success rates at level {level}", colours.values())
+
+
+def curve_chart(
+    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, label: str, percent: bool = False
+) -> str:
+    """Draw curves over training steps.
+
+    Args:
+        curves: Name of each curve to its (step, value) points.
+        title: What the chart shows, for screen readers and as base of its names.
+        label: What stands on the vertical axis.
+        percent: Whether values are fractions to be shown as per cent, on an axis from 0 to 100.
+
+    Returns:
+        An `<svg>` element.
+    """
+    variables = [f"--series-{index + 1}" for index in range(len(curves))]
+    figure, axes = _panel(2.5, margins_in=(0.5, 0.45, 0.1, 0.3))
+    for (name, points), variable in zip(curves.items(), variables, strict=True):
+        steps = [step for step, _ in points]
+        values = [100 * value if percent else value for _, value in points]
+        marker = "o" if len(points) < 30 else ""
+        axes.plot(steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=name)
+    if percent:
+        axes.set_ylim(-2, 102)
+        axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+    axes.set_title(label, loc="left", fontsize=10, color=_INK)
+    axes.set_xlabel("step")
+    axes.tick_params(length=0)
+    if len(curves) > 1:
+        axes.legend(frameon=False, fontsize=9)
+    return _themed(figure, f"curve-{re.sub(r'[^a-z]+', '-', title.lower())}", title, variables)
+
+
+def _panel(height_in: float, margins_in: tuple[float, float, float, float]) -> tuple[Any, Any]:
+    """Make a figure with one pair of axes; margins are left, bottom, right, top."""
+    from matplotlib import rc_context  # Any above: matplotlib is only imported where something is drawn
+    from matplotlib.figure import Figure
+
+    left, bottom, right, top = margins_in
+    width = (_PANEL_WIDTH_IN - left - right) / _PANEL_WIDTH_IN
+    height = (height_in - bottom - top) / height_in
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(_PANEL_WIDTH_IN, height_in))
+        axes = figure.add_axes((left / _PANEL_WIDTH_IN, bottom / height_in, width, height))
+    return figure, axes
+
+
+def _series(variable: str) -> str:
+    """Stand-in colour for a CSS variable: distinct for the names in use, never one of the fixed ones."""
+    return "#04" + f"{sum(ord(c) * 31**i for i, c in enumerate(variable)) % 0xFFFF:04x}"
+
+
+def _themed(figure: Any, name: str, title: str, variables: Iterable[str]) -> str:  # Any: see `_panel`
+    """Turn a figure into an `<svg>` element for the page.
+
+    Args:
+        figure: The matplotlib figure.
+        name: Put before every element's name, which must be unique in the page.
+        title: What screen readers say.
+        variables: CSS variables of the series' colours.
+    """
+    from matplotlib import rc_context
+
+    text = io.StringIO()
+    with rc_context(_STYLE):
+        metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(text, format="svg", metadata=metadata, transparent=True)
+    svg = text.getvalue()
+    colours = {_series(variable): variable for variable in variables}
+    for stand_in, variable in (colours | {_INK: "--ink", _MUTED: "--muted", _GRID: "--line"}).items():
+        svg = svg.replace(stand_in, f"var({variable})")
+    view_box = re.search(r'viewBox="([^"]*)"', svg)
+    body = svg[svg.index("<defs>") :]
+    for pattern, replacement in (
+        (r"<style.*?</style>", ""),  # would apply to the whole page
+        (r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px"),  # letters are those of the page
+        (r"font-family: [^;\"]*;?", ""),
+        ("xlink:href", "href"),
+        (r'\bid="', f'id="{name}-'),
+        (r'(url\(|href=")#', rf"\1#{name}-"),
+    ):
+        body = re.sub(pattern, replacement, body, flags=re.DOTALL)
+    size = view_box.group(1) if view_box else ""
+    return f'<svg viewBox="{size}" role="img" aria-label="{html.escape(title)}">{body.rstrip()}'

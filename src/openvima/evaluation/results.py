@@ -1,0 +1,242 @@
+"""What an evaluation found: outcomes of single episodes, counted by policy, task and level."""
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from openvima.errors import DatasetError
+from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
+
+SCHEMA = 1
+FILE_NAME = "results.json"
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeOutcome:
+    """How one episode ended.
+
+    Args:
+        seed: The episode's seed, of domain "eval".
+        success: Whether the task was done in time.
+        steps: Actions taken.
+        reason: Empty on success, else one sentence.
+        kind: Empty on success, else the reason without names and numbers, for counting.
+    """
+
+    seed: int
+    success: bool
+    steps: int
+    reason: str = ""
+    kind: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """All episodes of one policy on one task at one level.
+
+    Args:
+        policy: Name of the policy in this evaluation.
+        task: Name of the task.
+        level: "train", "L1", "L2", "L3" or "L4".
+        oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
+        outcomes: One entry an episode, seeds ascending.
+    """
+
+    policy: str
+    task: str
+    level: str
+    oracle_max_steps: int
+    outcomes: tuple[EpisodeOutcome, ...]
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes played."""
+        return len(self.outcomes)
+
+    @property
+    def successes(self) -> int:
+        """Number of episodes solved within the time limit."""
+        return sum(outcome.success for outcome in self.outcomes)
+
+    @property
+    def successes_strict(self) -> int:
+        """Number of episodes solved in no more steps than the oracle may take."""
+        return sum(outcome.success and outcome.steps <= self.oracle_max_steps for outcome in self.outcomes)
+
+    @property
+    def interval(self) -> Interval:
+        """95 % Wilson interval of the success rate."""
+        return wilson_interval(self.successes, self.episodes)
+
+    @property
+    def mean_steps(self) -> float:
+        """Mean number of actions an episode, solved or not."""
+        return sum(outcome.steps for outcome in self.outcomes) / max(1, self.episodes)
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """How often each kind of failure came about, most frequent first."""
+        kinds = Counter(outcome.kind for outcome in self.outcomes if not outcome.success)
+        return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
+
+
+@dataclass(frozen=True, slots=True)
+class LevelMean:
+    """Unweighted mean success rate of one policy over the tasks of one level."""
+
+    policy: str
+    level: str
+    mean: float
+    interval: Interval
+    tasks: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """A finished evaluation.
+
+    Args:
+        rows: In the order policy, level, task.
+        config: What was asked for, as plain values.
+        versions: Versions of the packages that results depend on.
+        policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …}.
+    """
+
+    rows: tuple[Row, ...]
+    config: dict[str, Any] = field(default_factory=dict)  # plain JSON values
+    versions: dict[str, str] = field(default_factory=dict)
+    policies: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def policy_names(self) -> list[str]:
+        """Names of the policies, in the order of the rows."""
+        return _in_order(row.policy for row in self.rows)
+
+    def levels(self) -> list[str]:
+        """Levels that occur, in the order of the rows."""
+        return _in_order(row.level for row in self.rows)
+
+    def tasks(self, level: str | None = None) -> list[str]:
+        """Tasks that occur, at one level or at all."""
+        return _in_order(row.task for row in self.rows if level in (None, row.level))
+
+    def row(self, policy: str, task: str, level: str) -> Row | None:
+        """The row of that policy, task and level, if there is one."""
+        wanted = (policy, task, level)
+        return next((row for row in self.rows if (row.policy, row.task, row.level) == wanted), None)
+
+    def level_means(self) -> list[LevelMean]:
+        """Mean over the tasks of each level, for each policy."""
+        means = []
+        for policy in self.policy_names():
+            for level in self.levels():
+                rows = [row for row in self.rows if (row.policy, row.level) == (policy, level)]
+                if rows:
+                    mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
+                    means.append(LevelMean(policy, level, mean, interval, tuple(row.task for row in rows)))
+        return means
+
+    def to_json(self) -> str:
+        """Return the text of `results.json`; equal results give equal bytes."""
+        content = {
+            "schema": SCHEMA,
+            "rows": [_row_record(row) for row in self.rows],
+            "levels": [_level_record(mean) for mean in self.level_means()],
+            "policies": self.policies,
+            "config": self.config,
+            "versions": self.versions,
+        }
+        return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+    def write(self, path: Path) -> Path:
+        """Write `results.json`; an interrupted write leaves the old file or none."""
+        return write_text(path, self.to_json())
+
+    @staticmethod
+    def read(path: Path) -> "Results":
+        """Read a `results.json`, or the one of an evaluation's folder.
+
+        Raises:
+            DatasetError: The file is missing, damaged or of another schema.
+        """
+        path = path / FILE_NAME if path.is_dir() else path
+        if not path.is_file():
+            raise DatasetError(f"there is no {path}; `openvima evaluate --out {path.parent}` writes one.")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content.get("schema") != SCHEMA:
+                raise DatasetError(
+                    f"{path} has schema {content.get('schema')!r}; this version reads schema {SCHEMA}. "
+                    "Evaluate again, or read it with the version of openvima that wrote it."
+                )
+            rows = tuple(_row_from_record(record) for record in content["rows"])
+            return Results(rows, content["config"], content["versions"], content["policies"])
+        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            raise DatasetError(f"{path} is damaged ({error!r}); evaluate again.") from error
+
+
+def failure_kind(reason: str) -> str:
+    """Take the names of single objects out of a reason, so that equal causes count as one.
+
+    Example:
+        >>> failure_kind("object 6 (red letter A) left the workspace")
+        'object left the workspace'
+    """
+    return re.sub(r"\bobject \d+( \([^)]*\))?", "object", reason).strip().rstrip(".") or "unknown"
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a whole text file or nothing: to a temporary name first, then renamed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))
+
+
+def _row_record(row: Row) -> dict[str, object]:
+    return {
+        "policy": row.policy,
+        "task": row.task,
+        "level": row.level,
+        "successes": row.successes,
+        "episodes": row.episodes,
+        "rate": _rounded(row.successes / row.episodes),
+        "interval": [_rounded(end) for end in row.interval],
+        "successes_strict": row.successes_strict,
+        "oracle_max_steps": row.oracle_max_steps,
+        "mean_steps": _rounded(row.mean_steps),
+        "seeds": [row.outcomes[0].seed, row.outcomes[-1].seed],
+        "failures": row.failures,
+        "outcomes": [asdict(outcome) for outcome in row.outcomes],
+    }
+
+
+def _row_from_record(record: Mapping[str, Any]) -> Row:
+    outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
+    return Row(record["policy"], record["task"], record["level"], record["oracle_max_steps"], outcomes)
+
+
+def _level_record(mean: LevelMean) -> dict[str, object]:
+    record = asdict(mean)
+    record["mean"] = _rounded(mean.mean)
+    record["interval"] = [_rounded(end) for end in mean.interval]
+    return record
+
+
+def _rounded(value: float) -> float:
+    return round(value, 6)
