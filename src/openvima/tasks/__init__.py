@@ -1,1 +1,24 @@
 """The tasks and the machinery that they share."""
+
+from openvima.tasks.goals import Progress, advance, begin, watch
+from openvima.tasks.oracle import OracleDecision, oracle_action
+from openvima.tasks.registry import TaskSpec, list_tasks, register_task, task_spec
+from openvima.tasks.sampling import TableSampler, sample_episode
+from openvima.tasks.seeding import DOMAINS, stream
+
+__all__ = [
+    "DOMAINS",
+    "OracleDecision",
+    "Progress",
+    "TableSampler",
+    "TaskSpec",
+    "advance",
+    "begin",
+    "list_tasks",
+    "oracle_action",
+    "register_task",
+    "sample_episode",
+    "stream",
+    "task_spec",
+    "watch",
+]

@@ -1,0 +1,45 @@
+"""Oriented rectangles on the table and whether they come near one another."""
+
+import math
+from dataclasses import dataclass
+
+from openvima.scene import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Rectangle:
+    """A rectangle on the table, turned by `yaw_rad`.
+
+    Args:
+        x, y: Centre in metres.
+        yaw_rad: Direction of its first axis.
+        half_x, half_y: Half extents along its own axes in metres.
+    """
+
+    x: float
+    y: float
+    yaw_rad: float
+    half_x: float
+    half_y: float
+
+    @staticmethod
+    def of_box(pose: Pose, size_x: float, size_y: float) -> "Rectangle":
+        """Footprint of a box that lies flat, its link frame in the middle."""
+        return Rectangle(pose.x, pose.y, pose.yaw_rad, size_x / 2, size_y / 2)
+
+    def comes_near(self, other: "Rectangle", margin_m: float = 0.0) -> bool:
+        """Whether the two rectangles overlap, or no axis of either shows a gap of `margin_m` between them.
+
+        At the corners the gap may thus be a little wider than the margin and still count as near.
+        """
+        dx, dy = other.x - self.x, other.y - self.y
+        for yaw in (self.yaw_rad, self.yaw_rad + math.pi / 2, other.yaw_rad, other.yaw_rad + math.pi / 2):
+            distance = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
+            if distance >= self.half_width(yaw) + other.half_width(yaw) + margin_m:
+                return False
+        return True
+
+    def half_width(self, direction_rad: float) -> float:
+        """Half of the rectangle's extent along a direction, in metres."""
+        turn = direction_rad - self.yaw_rad
+        return self.half_x * abs(math.cos(turn)) + self.half_y * abs(math.sin(turn))

@@ -1,0 +1,153 @@
+"""The list of tasks: each task file registers its `sample` function here."""
+
+import functools
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
+from openvima.errors import LevelError, UnknownTaskError, unknown_name
+from openvima.scene import EndEffector, Problem
+
+SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSpec:
+    """What is known of a task without sampling it.
+
+    Args:
+        name: Name as in "rotate".
+        family: Group under which results are usually reported.
+        template: The prompt with its slots, as documentation.
+        end_effector: "suction" or "spatula".
+        pools: What the task may draw from, for each level at which it is defined.
+        oracle_max_steps: Steps within which the oracle must be done.
+        summary: First line of the task file's docstring.
+        sample: Draws one `Problem` from a `TableSampler`; keyword arguments are the task's options.
+    """
+
+    name: str
+    family: str
+    template: str
+    end_effector: EndEffector
+    pools: Mapping[Level, Pool]
+    oracle_max_steps: int
+    summary: str
+    sample: SampleFunction
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """Levels at which the task is defined, "train" first."""
+        return tuple(self.pools)
+
+    @property
+    def max_steps(self) -> int:
+        """Steps that a policy is given: two more than the oracle."""
+        return self.oracle_max_steps + 2
+
+    @property
+    def options(self) -> dict[str, Any]:  # Any: options are of whatever type the task declares
+        """Names and defaults of what a user may vary."""
+        parameters = inspect.signature(self.sample).parameters.values()
+        return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+
+    def pool(self, level: str) -> Pool:
+        """Return what the task may draw from at a level.
+
+        Raises:
+            LevelError: There is no such level, or the task is not defined there.
+        """
+        for known, entry in self.pools.items():
+            if known == level:
+                return entry
+        if level not in LEVELS:
+            raise LevelError(unknown_name("level", level, LEVELS))
+        raise LevelError(f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}.")
+
+
+_TASKS: dict[str, TaskSpec] = {}
+
+
+def register_task(
+    name: str,
+    *,
+    family: str,
+    template: str,
+    oracle_max_steps: int,
+    end_effector: EndEffector = "suction",
+    pools: Mapping[Level, Pool] | None = None,
+) -> Callable[[SampleFunction], SampleFunction]:
+    """Decorate the `sample` function of a task file, which puts the task on the list.
+
+    Args:
+        name: Name of the task.
+        family: Group under which results are usually reported.
+        template: The prompt with its slots.
+        oracle_max_steps: Steps within which the oracle must be done.
+        end_effector: Tool of the arm.
+        pools: What the task may draw from at each level; by default the catalogue's entry of that name.
+
+    Returns:
+        The decorator; it returns the function unchanged.
+
+    Raises:
+        ValueError: Another function has that name already.
+    """
+
+    def register(sample: SampleFunction) -> SampleFunction:
+        if name in _TASKS:
+            raise ValueError(f"task {name!r} is registered twice; task names are unique.")
+        _TASKS[name] = TaskSpec(
+            name=name,
+            family=family,
+            template=template,
+            end_effector=end_effector,
+            pools=pools or {level: pool(name, level) for level in levels_of(name)},
+            oracle_max_steps=oracle_max_steps,
+            summary=_summary(sample),
+            sample=sample,
+        )
+        return sample
+
+    return register
+
+
+def _summary(sample: SampleFunction) -> str:
+    """First line of the task file's docstring, without the name before the colon."""
+    module = inspect.getmodule(sample)
+    first = ((module and module.__doc__) or "").partition("\n")[0]
+    return first.partition(": ")[2] or first
+
+
+def task_spec(name: str) -> TaskSpec:
+    """Return what is registered under a name.
+
+    Raises:
+        UnknownTaskError: There is no such task; the message suggests the nearest name.
+    """
+    _load_task_files()
+    try:
+        return _TASKS[name]
+    except (KeyError, TypeError):
+        hint = f"`openvima tasks` lists all {len(_TASKS)}."
+        raise UnknownTaskError(unknown_name("task", name, _TASKS, hint)) from None
+
+
+def list_tasks() -> tuple[str, ...]:
+    """Names of all tasks, in alphabetical order."""
+    _load_task_files()
+    return tuple(sorted(_TASKS))
+
+
+@functools.cache
+def _load_task_files() -> None:
+    """Import every module of this package, so that a task is found by its file being there."""
+    import openvima.tasks as package
+
+    for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+        if not module.name.endswith(".kernels"):  # compiled code, loaded when an episode is sampled
+            importlib.import_module(module.name)
