@@ -1,5 +1,6 @@
 """Reader of Wavefront .obj files: triangles with texture coordinates and normals, in the file's units."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ class ObjMesh:
         vertices: Shape (F, 3, 3), float64: triangle, corner, xyz.
         normals: Same shape; of the triangle where the file gives none.
         uvs: Shape (F, 3, 2), float64; 0 where the file gives none.
-        parts: For each triangle the number of the named object ("o" line) that it belongs to, shape (F,), int32.
+        parts: For each triangle the number of the named object ("o" line) that it is part of, shape (F,), int32.
     """
 
     vertices: np.ndarray
@@ -48,7 +49,7 @@ def parse_obj(text: str, name: str) -> ObjMesh:
             elif key == "f":
                 counts = (len(numbers["v"]), len(numbers["vt"]), len(numbers["vn"]))
                 corners = [_corner(word, counts) for word in rest.split()]
-                for second, third in zip(corners[1:-1], corners[2:], strict=True):
+                for second, third in itertools.pairwise(corners[1:]):
                     faces.append((corners[0], second, third))
                     parts.append(part)
         except ValueError as error:
@@ -69,7 +70,7 @@ def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
     indices = [int(field) if field else 0 for field in fields] + [0] * (3 - len(fields))
     # Files count from 1, or backwards from the newest entry with negative numbers.
     v, vt, vn = (i - 1 if i >= 0 else n + i for i, n in zip(indices, counts, strict=True))
-    if not 0 <= v:
+    if v < 0:
         raise ValueError(f"no vertex {indices[0]}")
     return v, vt, vn
 

@@ -1,7 +1,7 @@
 """The original asset pack, read from a checkout of VIMA-Bench: meshes, textures and body shapes.
 
-With it, images are those of the benchmark. The files are checked against known hashes, so that a pack which is
-incomplete or differs is reported instead of giving other pixels.
+With it, images are those of the benchmark. The files are checked against known hashes, so that a pack which
+is incomplete or differs is reported instead of giving other pixels.
 """
 
 import hashlib
@@ -199,7 +199,9 @@ def _texture(folder: Path, texture_name: str) -> np.ndarray:
         with Image.open(io.BytesIO(_read(folder, relative_path))) as image:
             return np.array(image.convert("RGB"))
     except (UnidentifiedImageError, OSError) as error:
-        raise AssetError(f"{folder / relative_path} cannot be decoded ({error}); restore the file.") from error
+        raise AssetError(
+            f"{folder / relative_path} cannot be decoded ({error}); restore the file."
+        ) from error
 
 
 def image_file(texture: TextureSpec) -> str:

@@ -12,7 +12,9 @@ VIEWS: tuple[View, View] = ("front", "top")
 
 Row = tuple[float, float, float, float]
 
-MIN_DOUBLED_AREA_PX2 = 0.01  # triangles up to this doubled area are left out, as the benchmark's renderer does
+MIN_DOUBLED_AREA_PX2 = (
+    0.01  # triangles up to this doubled area are left out, as the benchmark's renderer does
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +46,8 @@ class Camera:
     def enlarged(self, factor: int) -> "Camera":
         """Return the same view in `factor` times the resolution.
 
-        Of every `factor` × `factor` pixels, the lower left one sees the point that the plain image samples there:
-        `large[factor - 1 :: factor, ::factor]` is the plain image.
+        Of every `factor` × `factor` pixels, the lower left one sees the point that the plain image samples
+        there: `large[factor - 1 :: factor, ::factor]` is the plain image.
 
         Args:
             factor: A whole number from 1.
@@ -74,8 +76,9 @@ class Camera:
         return np.array([self.right, self.up, self.away, numbers], dtype=np.float64)
 
 
-# The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of the front
-# camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move whole pixel rows.
+# The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of the
+# front camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move whole
+# rows of pixels.
 _COS_45 = 0.70710677
 TOP = Camera(
     view="top",
@@ -106,8 +109,8 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
         camera: The view; its image is `camera.height` × `camera.width` pixels.
 
     Returns:
-        Shape (..., 2), float64: column, then row, row 0 on top. Whole numbers are the points that pixels sample.
-        Points outside the image keep their coordinates; nothing is clipped.
+        Shape (..., 2), float64: column, then row, row 0 on top. Whole numbers are the points that pixels
+        sample. Points outside the image keep their coordinates; nothing is clipped.
 
     Raises:
         ShapeError: The last axis of `points` does not have length 3.

@@ -1,6 +1,6 @@
 """Numba kernels: filling and shading triangles, seen by a camera or straight from above.
 
-Nothing here is checked; the modules beside it own the arguments. Each kernel has a slow twin in `tests/naive.py`.
+Nothing is checked here; the modules beside it own the arguments. Each kernel has a slow twin in the tests.
 """
 
 import math
@@ -114,9 +114,21 @@ def draw_triangles(
                 if pixel_depth > depth[row, column]:
                     continue
                 if intensity < 0.0 or not is_flat[f]:
-                    nx = weight_a * normals[f, 0, 0] + weight_b * normals[f, 1, 0] + weight_c * normals[f, 2, 0]
-                    ny = weight_a * normals[f, 0, 1] + weight_b * normals[f, 1, 1] + weight_c * normals[f, 2, 1]
-                    nz = weight_a * normals[f, 0, 2] + weight_b * normals[f, 1, 2] + weight_c * normals[f, 2, 2]
+                    nx = (
+                        weight_a * normals[f, 0, 0]
+                        + weight_b * normals[f, 1, 0]
+                        + weight_c * normals[f, 2, 0]
+                    )
+                    ny = (
+                        weight_a * normals[f, 0, 1]
+                        + weight_b * normals[f, 1, 1]
+                        + weight_c * normals[f, 2, 1]
+                    )
+                    nz = (
+                        weight_a * normals[f, 0, 2]
+                        + weight_b * normals[f, 1, 2]
+                        + weight_c * normals[f, 2, 2]
+                    )
                     length = math.sqrt(nx * nx + ny * ny + nz * nz)
                     if length > 0.0:
                         nx, ny, nz = nx / length, ny / length, nz / length

@@ -1,7 +1,8 @@
 """The label raster: which object is topmost at each small square of the table, seen from straight above.
 
-It is privileged knowledge: samplers use it to find free places and the oracle to find points to pick. Rows run along
-y and columns along x: the centre of cell (row u, column v) is (0.25 + (v + 0.5) p, −0.5 + (u + 0.5) p), p = 3.125 mm.
+It is privileged knowledge: samplers use it to find free places and the oracle to find points to pick. Rows run
+along y and columns along x: with p = 3.125 mm, the centre of the cell in row u and column v is
+(0.25 + (v + 0.5) p, −0.5 + (u + 0.5) p).
 """
 
 from collections.abc import Iterable
@@ -23,7 +24,7 @@ def empty_labels() -> tuple[np.ndarray, np.ndarray]:
     """Return the raster of the bare table and its heights, to stamp objects into.
 
     Returns:
-        Labels, shape (320, 160), int16, all 0; heights in metres, shape (320, 160), float32, all 0 (the sheet).
+        Labels, int16, all 0, and heights in metres, float32, all 0 (the sheet); both of shape (320, 160).
     """
     return np.zeros(LABEL_SHAPE, dtype=np.int16), np.zeros(LABEL_SHAPE, dtype=np.float32)
 
@@ -63,8 +64,8 @@ def label_raster(placements: Scene | Iterable[Placement], assets: Assets) -> np.
         assets: Where their shapes come from.
 
     Returns:
-        Shape (320, 160), int16, rows along y and columns along x; 0 where there is no object. Surfaces below the
-        sheet or from 0.3 m up do not count.
+        Shape (320, 160), int16, rows along y and columns along x; 0 where there is no object. Surfaces below
+        the sheet or from 0.3 m up do not count.
     """
     raster, heights = empty_labels()
     for placement in placements.placements if isinstance(placements, Scene) else placements:
@@ -82,4 +83,6 @@ def cell_centres(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     Returns:
         x, y of the cells' centres in metres, shape (..., 2), float64.
     """
-    return np.stack([_ORIGIN[0] + np.asarray(columns) * CELL_M, _ORIGIN[1] + np.asarray(rows) * CELL_M], axis=-1)
+    return np.stack(
+        [_ORIGIN[0] + np.asarray(columns) * CELL_M, _ORIGIN[1] + np.asarray(rows) * CELL_M], axis=-1
+    )

@@ -62,7 +62,7 @@ class Image:
     Args:
         rgb: Colours, shape (3, H, W), uint8, row 0 on top.
         segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 nothing.
-        height: Height above the table in metres, shape (H, W), float32; NaN where nothing is. None unless asked.
+        height: Metres above the table, shape (H, W), float32; NaN where nothing is. None unless asked for.
     """
 
     rgb: np.ndarray
@@ -73,7 +73,7 @@ class Image:
 class Rasteriser:
     """Draws scenes and prompts with one asset pack.
 
-    Flat light, no shadows, no smoothing: the look of VIMA-Bench, pixel for pixel where the pack is the original.
+    Flat light, no shadows, no smoothing: the look of VIMA-Bench, pixel for pixel with its asset pack.
     One instance must not be used by two threads at once.
 
     Args:
@@ -107,7 +107,7 @@ class Rasteriser:
             View name to image.
 
         Raises:
-            UnknownObjectError, UnknownTextureError, AssetError: The pack has no shape or texture for an object.
+            UnknownObjectError, UnknownTextureError, AssetError: An object has no shape or texture.
             ShapeError: An id or texture that images cannot hold.
             ConfigError: `enlarge` is below 1.
         """
@@ -118,12 +118,14 @@ class Rasteriser:
         """Draw all images of a prompt, both views each.
 
         Raises:
-            UnknownObjectError, UnknownTextureError, AssetError: The pack has no shape or texture for an object.
+            UnknownObjectError, UnknownTextureError, AssetError: An object has no shape or texture.
         """
         images = {}
         for name, fill in prompt.images:
             images[name] = (
-                self._object_image(name, fill) if isinstance(fill, ObjectImage) else self._scene_image(name, fill)
+                self._object_image(name, fill)
+                if isinstance(fill, ObjectImage)
+                else self._scene_image(name, fill)
             )
         return RenderedPrompt(prompt.text, images)
 
