@@ -71,6 +71,10 @@ class OracleError(OpenVimaError, RuntimeError):
     """The scripted oracle has no action for the present scene."""
 
 
+class WorkerError(OpenVimaError, RuntimeError):
+    """A process that worked for this one died."""
+
+
 class ShardError(OpenVimaError, ValueError):
     """A file of demonstrations is damaged, truncated or of another format."""
 

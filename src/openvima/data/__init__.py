@@ -1,1 +1,29 @@
 """Writing and reading demonstrations."""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from openvima.data.generate import GenerateConfig, generate
+    from openvima.data.reader import Dataset, Shard
+    from openvima.data.records import Demonstration, rollout_oracle
+    from openvima.data.writer import ShardWriter
+
+# Reading needs no simulation, so each name brings only what it needs.
+_HOMES = {
+    "Dataset": "reader",
+    "Demonstration": "records",
+    "GenerateConfig": "generate",
+    "Shard": "reader",
+    "ShardWriter": "writer",
+    "generate": "generate",
+    "rollout_oracle": "records",
+}
+
+__all__ = ["Dataset", "Demonstration", "GenerateConfig", "Shard", "ShardWriter", "generate", "rollout_oracle"]
+
+
+def __getattr__(name: str) -> object:
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"openvima.data.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -166,9 +166,7 @@ def _summary(demo: Demonstration) -> dict:
         ],
         "end_effector": demo.end_effector,
         "ids": [demo.pick_ids, demo.place_ids],
-        "objects": [
-            [p.id, p.object, p.texture, p.size, p.fixed, p.scale] for p in demo.scenes[0].placements
-        ],
+        "objects": [[p.id, p.object, p.texture, p.size, p.fixed, p.scale] for p in demo.scenes[0].placements],
         "outcome": [demo.outcome.success, demo.outcome.failure, demo.outcome.reason],
         "assets": demo.assets,
     }

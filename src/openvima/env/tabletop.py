@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
-from openvima.errors import ConfigError, EpisodeError, LevelError
+from openvima.errors import ConfigError, EpisodeError
 from openvima.render.camera import VIEWS
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import (
@@ -175,7 +175,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
         """
         super().reset(seed=seed)
         episode = _episode_option(options) or self._sample(seed)
-        rng = stream(episode.domain, episode.task, episode.level, episode.seed, "oracle")
+        rng = stream(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
         world = World(episode.problem.scene, self.assets, compat=self.compat)
         self._run = _Run(episode, world, goals.begin(episode.problem), rng)
         return self._observe(), self._info()
@@ -323,9 +323,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
             "domain": episode.domain,
             "seed": episode.seed,
             "end_effector": problem.scene.end_effector,
-            "objects": {
-                p.id: {"object": p.object, "texture": p.texture} for p in problem.scene.placements
-            },
+            "objects": {p.id: {"object": p.object, "texture": p.texture} for p in problem.scene.placements},
         }
 
 
@@ -346,9 +344,7 @@ def _action_space() -> spaces.Dict:
 
 
 def _check(task: str, level: str, render_mode: str | None) -> None:
-    levels = task_spec(task).levels
-    if level not in levels:
-        raise LevelError(f"task {task!r} is not defined at level {level!r}; it is at {', '.join(levels)}.")
+    task_spec(task).pool(level)
     modes = TabletopEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")

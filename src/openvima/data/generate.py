@@ -1,0 +1,281 @@
+"""Writing data sets: oracle demonstrations by several processes, the same bytes whatever their number."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from openvima.catalog.packs import load_assets
+from openvima.data.encoding import ShardInfo, SkipKind, Skipped
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, index_bytes, manifest_bytes
+from openvima.data.reader import Shard
+from openvima.data.records import Demonstration, package_versions, rollout_oracle
+from openvima.data.schema import INDEX_COLUMNS
+from openvima.data.workers import run_in_processes
+from openvima.data.writer import ShardWriter, remove_leftovers, write_whole
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
+from openvima.tasks import list_tasks, task_spec
+
+DOMAIN = "train"
+LARGEST_SHARD = 1000  # episodes, about 25 MB
+SHARDS_PER_TASK = 8  # of a small data set, so that several workers have something to do
+# A shard may try this many seeds for each episode that it needs, and some more; a task of which the oracle
+# solves so few needs repair rather than patience.
+SEEDS_PER_EPISODE = 4
+SPARE_SEEDS = 12
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class GenerateConfig:
+    """What to generate, and where.
+
+    Args:
+        out: The folder.
+        tasks: Names of the tasks; ("all",) means all that the level has.
+        episodes: Successful episodes of each task.
+        level: "train" or "L1" to "L4".
+        seed: First seed.
+        shard_size: Episodes in a file; None chooses an eighth of `episodes`, 1,000 at most.
+        workers: Number of processes.
+        assets: "procedural", or the folder of the original asset pack.
+        force: Delete a data set that is in the folder.
+    """
+
+    out: Path
+    tasks: tuple[str, ...] = ("all",)
+    episodes: int = 100
+    level: str = "train"
+    seed: int = 0
+    shard_size: int | None = None
+    workers: int = 1
+    assets: str = "procedural"
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value}; it must be at least {least}."
+            for name, value, least in (
+                ("episodes", self.episodes, 1),
+                ("seed", self.seed, 0),
+                ("shard_size", self.shard_size, 1),
+                ("workers", self.workers, 1),
+            )
+            if value is not None and value < least
+        ]
+        if not self.tasks:
+            problems.append("tasks is empty; name some, or 'all'.")
+        if problems:
+            raise ConfigError(" ".join(problems))
+
+    def resolved_tasks(self) -> tuple[str, ...]:
+        """Return the names of the tasks, sorted.
+
+        Raises:
+            UnknownTaskError: There is no such task.
+            LevelError: A task is not defined at the level.
+        """
+        if self.tasks == ("all",):
+            return tuple(sorted(task for task in list_tasks() if self.level in task_spec(task).levels))
+        for task in self.tasks:
+            task_spec(task).pool(self.level)
+        return tuple(sorted(set(self.tasks)))
+
+    def resolved_shard_size(self) -> int:
+        """Return the number of episodes in a full shard."""
+        return self.shard_size or min(LARGEST_SHARD, -(-self.episodes // SHARDS_PER_TASK))
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One shard to be written: so many episodes out of a range of seeds of its own.
+
+    Args:
+        path: The file.
+        info: What all its rows have in common.
+        episodes: Number of successful episodes.
+        seeds: Seeds to try, in order.
+        assets: Asset pack, as `load_assets` takes it.
+    """
+
+    path: Path
+    info: ShardInfo
+    episodes: int
+    seeds: range
+    assets: str
+
+
+def generate(config: GenerateConfig, report: Report | None = None) -> Path:
+    """Write demonstrations by the oracle, or those that a data folder still lacks.
+
+    Args:
+        config: What to generate.
+        report: Called with episodes done, episodes in all, and a note.
+
+    Returns:
+        The folder: shards, `index.parquet` and `dataset.json`. Its bytes depend on the settings and versions
+        alone, not on the number of workers or on interruptions.
+
+    Raises:
+        UnknownTaskError, LevelError, ConfigError: The settings do not fit.
+        DatasetError: The folder holds a data set of other settings or versions.
+        WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
+        OracleError: The oracle solved too few episodes.
+    """
+    blocks = plan(config)
+    config.out.mkdir(parents=True, exist_ok=True)
+    if config.force:
+        _clear(config.out)
+    _check_folder(config, blocks)
+    missing = [block for block in blocks if not _is_done(block)]
+    num_done = sum(block.episodes for block in blocks) - sum(block.episodes for block in missing)
+    if missing or not (config.out / MANIFEST_NAME).is_file():
+        run_in_processes(write_block, missing, config.workers, report=_shifted(report, num_done, blocks))
+        finish(config, blocks)
+    return config.out
+
+
+def plan(config: GenerateConfig) -> list[Block]:
+    """Divide the work into blocks; the division depends on the settings alone."""
+    size, versions = config.resolved_shard_size(), package_versions()
+    stride = SEEDS_PER_EPISODE * size + SPARE_SEEDS
+    assets = load_assets(config.assets).name
+    blocks = []
+    for task in config.resolved_tasks():
+        for number, start in enumerate(range(0, config.episodes, size)):
+            first = config.seed + number * stride
+            blocks.append(
+                Block(
+                    path=config.out / f"{task}-{config.level}-{number:05d}.arrow",
+                    info=ShardInfo(task, config.level, DOMAIN, number, size, config.seed, assets, versions),
+                    episodes=min(size, config.episodes - start),
+                    seeds=range(first, first + stride),
+                    assets=config.assets,
+                )
+            )
+    return blocks
+
+
+def write_block(block: Block, count: Callable[[int], None]) -> None:
+    """Write one shard.
+
+    Args:
+        block: What to write.
+        count: Called with the number of episodes written so far.
+
+    Raises:
+        OracleError: The oracle solved too few of the block's episodes.
+    """
+    with ShardWriter(block.path, block.info) as writer:
+        for number, (demo, skipped) in enumerate(demonstrations(block), start=1):
+            writer.write(demo, skipped)
+            count(number)
+
+
+def demonstrations(block: Block) -> Iterator[tuple[Demonstration, list[Skipped]]]:
+    """Yield the successful demonstrations of a block, each with the seeds tried in vain before it.
+
+    Raises:
+        OracleError: The seeds ran out.
+    """
+    env = _env(block.info.task, block.info.level, block.assets)
+    num_found, skipped = 0, []
+    for seed in block.seeds:
+        demo = attempt(env, seed)
+        if isinstance(demo, Skipped):
+            skipped.append(demo)
+            continue
+        yield demo, skipped
+        num_found, skipped = num_found + 1, []
+        if num_found == block.episodes:
+            return
+    raise OracleError(
+        f"the oracle solved {num_found} of {len(block.seeds)} episodes of {block.info.task!r} at level "
+        f"{block.info.level}, {block.episodes} were needed; the last one failed: {skipped[-1].reason}."
+    )
+
+
+def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
+    """Let the oracle play one episode; say why if that gives no demonstration."""
+    try:
+        demo = rollout_oracle(env, seed)
+    except SamplingError as error:
+        return Skipped(seed, "not_sampled", str(error))
+    except OracleError as error:
+        return Skipped(seed, "no_action", str(error))
+    if demo.outcome.success:
+        return demo
+    kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
+    return Skipped(seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
+
+
+def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Write index and manifest of a folder whose shards are all there."""
+    rows = []
+    for block in blocks:
+        for row, columns in enumerate(Shard(block.path).columns(INDEX_COLUMNS)):
+            rows.append({**columns, "shard": block.path.name, "row": row})
+    settings = {
+        "tasks": list(config.resolved_tasks()),
+        "level": config.level,
+        "domain": DOMAIN,
+        "episodes": config.episodes,
+        "seed": config.seed,
+        "shard_size": config.resolved_shard_size(),
+        "assets": blocks[0].info.assets,
+    }
+    write_whole(config.out / INDEX_NAME, index_bytes(rows))
+    manifest = manifest_bytes(rows, config=settings, versions=blocks[0].info.versions)
+    write_whole(config.out / MANIFEST_NAME, manifest)
+    remove_leftovers(config.out)
+
+
+@lru_cache(maxsize=4)
+def _env(task: str, level: str, assets: str) -> TabletopEnv:
+    return TabletopEnv(task, level=level, domain=DOMAIN, assets=assets)
+
+
+def _is_done(block: Block) -> bool:
+    """A shard is done if its name exists, unless fewer episodes were asked for when it was written."""
+    return block.path.is_file() and len(Shard(block.path)) == block.episodes
+
+
+def _check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Refuse a folder whose shards do not belong to the data set that is asked for."""
+    wanted = {block.path.name: block for block in blocks}
+    for path in sorted(config.out.glob("*.arrow")):
+        block = wanted.get(path.name)
+        found = Shard(path)
+        problems = _differences(found.info, blocks[0].info)
+        if block is None and not problems:
+            problems = [f"it is not among the {len(blocks)} shards of {config.episodes} episodes a task"]
+        if block is not None and len(found) > block.episodes:
+            problems.append(f"it has {len(found)} episodes, asked for are {block.episodes}")
+        if problems:
+            raise DatasetError(
+                f"{path} belongs to another data set: {'; '.join(problems)}. "
+                "Give its settings, another --out, or --force to delete it."
+            )
+
+
+def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
+    names = ("level", "domain", "shard_size", "first_seed", "assets")
+    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
+    pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
+    return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]
+
+
+def _clear(folder: Path) -> None:
+    for path in [folder / MANIFEST_NAME, folder / INDEX_NAME, *folder.glob("*.arrow")]:
+        path.unlink(missing_ok=True)
+    remove_leftovers(folder)
+
+
+def _shifted(report: Report | None, num_done: int, blocks: Sequence[Block]) -> Callable[[int], None]:
+    total = sum(block.episodes for block in blocks)
+    if report is None:
+        return lambda count: None
+    report(num_done, total, "")
+    return lambda count: report(num_done + count, total, "")

@@ -1,0 +1,127 @@
+"""Running jobs in several processes of one machine, each on one thread."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait as wait_for
+from typing import Any, Protocol
+
+from openvima.errors import WorkerError
+
+POLL_S = 0.2
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_counters: Any = (
+    None  # in a worker: the shared array of counts; Any: multiprocessing has no public type for it
+)
+
+
+class Job(Protocol):
+    """Work on one item, which calls `count` with the number of things done so far."""
+
+    def __call__(self, item: Any, count: Callable[[int], None]) -> None:
+        """Do it."""
+
+
+def run_in_processes(
+    job: Job, items: Sequence[object], num_workers: int, *, report: Callable[[int], None]
+) -> None:
+    """Run a job on every item.
+
+    Args:
+        job: A function of a module (workers import it).
+        items: Its arguments; they are pickled.
+        num_workers: Number of processes; with one, everything happens in this process.
+        report: Called now and then with the sum of all counts.
+
+    Raises:
+        WorkerError: A worker was killed from outside.
+        Exception: Whatever a job raised; the other jobs are stopped.
+    """
+    if num_workers == 1 or len(items) <= 1:
+        _run_here(job, items, report)
+        return
+    context = multiprocessing.get_context("spawn")
+    counters = context.RawArray("q", len(items))  # one slot a job: no lock that a killed worker could keep
+    others = set(multiprocessing.active_children())
+    with _one_thread_each():
+        pool = ProcessPoolExecutor(
+            min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
+        )
+        try:
+            futures = [pool.submit(_run_one, job, item, slot) for slot, item in enumerate(items)]
+            _wait_for_all(futures, lambda: report(sum(counters)))
+        except BrokenProcessPool:
+            raise WorkerError(
+                "a worker process was killed (often for lack of memory; --workers lowers the need). "
+                "Whole files were kept, and the same command continues."
+            ) from None
+        except BaseException:  # a job's own error, or Ctrl-C: the rest would work in vain
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _run_here(job: Job, items: Sequence[object], report: Callable[[int], None]) -> None:
+    num_before = 0
+    for item in items:
+        last = 0
+
+        def count(done: int, before: int = num_before) -> None:
+            nonlocal last
+            last = done
+            report(before + done)
+
+        job(item, count)
+        num_before += last
+
+
+def _wait_for_all(futures: Sequence[Future], tick: Callable[[], None]) -> None:
+    pending = set(futures)
+    while pending:
+        done, pending = wait(pending, timeout=POLL_S, return_when=FIRST_EXCEPTION)
+        for future in done:
+            future.result()
+        tick()
+
+
+@contextlib.contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that start inside the block use one thread each; they read this before any code of ours."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker(counters: Any) -> None:  # Any: see `_counters`
+    global _counters
+    _counters = counters
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this only runs in workers
+    wait_for([parent.sentinel])
+    os._exit(1)
+
+
+def _run_one(job: Job, item: object, slot: int) -> None:
+    def count(done: int) -> None:
+        _counters[slot] = done
+
+    job(item, count)
