@@ -79,9 +79,7 @@ def main() -> None:
             f"{row['iou_min']:8.4f} {row['rgb_mae_mean']:18.4f} {row['rgb_mae_max']:6.3f}"
         )
     not_redrawn = sum(agreement.num_not_redrawn for agreement in tasks.values())
-    print(
-        f"Colour errors are of 255. Not compared for want of recorded poses or scales: {not_redrawn} images."
-    )
+    print(f"Colour errors are of 255. Without recorded poses or scales, so not compared: {not_redrawn}.")
     if arguments.json:
         arguments.json.write_text(json.dumps({"tasks": summaries}, indent=2) + "\n", encoding="utf-8")
 

@@ -1,7 +1,7 @@
 """Reader of recorded scenes of the public benchmark, and the comparison of our images with its images.
 
-A folder of scenes holds `TASK-SEED.json` (objects with the poses and shapes that the benchmark had, and prompt
-images with their objects) and `TASK-SEED.npz` (its images). The poses there are those of centres of mass.
+A folder of scenes holds `TASK-SEED.json` (objects with the poses and shapes that the benchmark had, and
+prompt images with their objects) and `TASK-SEED.npz` (its images). Poses are those of centres of mass.
 """
 
 import json

@@ -90,7 +90,7 @@ def line(size: Vector3) -> Geometry:
 
 
 def container(size: Vector3) -> Geometry:
-    """Return an open box, origin at its centre; the middle planes of its walls lie on the borders of `size`."""
+    """Return an open box, origin at its centre; the middle planes of its walls lie on the borders."""
     x, y, height = size[0], size[1], size[2] / HEIGHT_DIVISOR
     boxes = [
         Box((x, y, WALL_M), (0.0, 0.0, -height / 2)),

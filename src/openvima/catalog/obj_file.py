@@ -16,7 +16,7 @@ class ObjMesh:
         vertices: Shape (F, 3, 3), float64: triangle, corner, xyz.
         normals: Same shape; of the triangle where the file gives none.
         uvs: Shape (F, 3, 2), float64; 0 where the file gives none.
-        parts: For each triangle the number of the named object ("o" line) that it is part of, shape (F,), int32.
+        parts: Number of the named object ("o" line) that each triangle is part of, shape (F,), int32.
     """
 
     vertices: np.ndarray

@@ -76,9 +76,9 @@ class Camera:
         return np.array([self.right, self.up, self.away, numbers], dtype=np.float64)
 
 
-# The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of the
-# front camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move whole
-# rows of pixels.
+# The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of
+# the front camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move
+# whole rows of pixels.
 _COS_45 = 0.70710677
 TOP = Camera(
     view="top",

@@ -1,7 +1,7 @@
 """The label raster: which object is topmost at each small square of the table, seen from straight above.
 
-It is privileged knowledge: samplers use it to find free places and the oracle to find points to pick. Rows run
-along y and columns along x: with p = 3.125 mm, the centre of the cell in row u and column v is
+It is privileged knowledge: samplers use it to find free places and the oracle to find points to pick. Rows
+run along y and columns along x: with p = 3.125 mm, the centre of the cell in row u and column v is
 (0.25 + (v + 0.5) p, −0.5 + (u + 0.5) p).
 """
 
