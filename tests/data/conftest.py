@@ -1,0 +1,84 @@
+"""Demonstrations that no simulation made, for tests of storage."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from openvima.data import Demonstration
+from openvima.data.encoding import ShardInfo
+from openvima.scene import (
+    Action,
+    ObjectRecord,
+    Outcome,
+    Placement,
+    Pose,
+    PromptImage,
+    RenderedPrompt,
+    Scene,
+)
+
+VERSIONS = {"openvima": "0", "numpy": "0"}
+INFO = ShardInfo("stack", "train", "train", 0, 3, 0, "none", VERSIONS)
+
+
+def _made_up(seed: int = 0, *, num_steps: int = 2, num_images: int = 2) -> Demonstration:
+    """A demonstration full of random numbers."""
+    rng = np.random.default_rng(seed)
+
+    def images(*leading: int, channels: tuple[int, ...] = (3,)) -> dict[str, np.ndarray]:
+        shape = (*leading, *channels, 128, 256)
+        return {view: rng.integers(0, 256, shape, dtype=np.uint8) for view in ("front", "top")}
+
+    def scene() -> Scene:
+        return Scene(tuple(_placement(object_id, rng) for object_id in (5, 6)), "spatula")
+
+    first = scene()
+    scenes = [first]
+    for _ in range(num_steps):
+        scenes.append(first.with_poses({p.id: p.pose for p in scene().placements}))
+    names = [f"image_{number}" for number in range(num_images)]
+    prompt_images = {
+        name: PromptImage(
+            name, "scene", images(), images(channels=()), (ObjectRecord(2, "flower", "red swirl"),)
+        )
+        for name in names
+    }
+    return Demonstration(
+        task="stack",
+        level="train",
+        domain="train",
+        seed=seed,
+        num_redraws=3,
+        max_steps=num_steps + 2,
+        prompt=RenderedPrompt(" and ".join(f"{{{name}}}" for name in names), prompt_images),
+        rgb=images(num_steps + 1),
+        segm=images(num_steps + 1, channels=()),
+        end_effector="spatula",
+        actions=tuple(Action.planar((0.3, 0.1), (0.6, -0.2), 0.1 * (k + 1)) for k in range(num_steps)),
+        pick_ids=tuple(range(5, 5 + num_steps)),
+        place_ids=(-1,) * num_steps,
+        joint_paths=tuple(rng.random((length, 6), dtype=np.float32) for length in range(num_steps)),
+        scenes=tuple(scenes),
+        outcome=Outcome(success=True, reason="all goals are met"),
+        assets="none",
+        versions=VERSIONS,
+    )
+
+
+def _placement(object_id: int, rng: np.random.Generator) -> Placement:
+    x, y, z, *quaternion = rng.normal(size=7).tolist()
+    qx, qy, qz, qw = quaternion
+    pose = Pose((x, y, z), (qx, qy, qz, qw))
+    return Placement(object_id, "flower", "red swirl", (0.1, 0.2, 0.3), pose, object_id == 5, (1.0, 2.0, 0.7))
+
+
+@pytest.fixture
+def made_up() -> Callable[..., Demonstration]:
+    """A function that makes a demonstration of a seed, `num_steps` and `num_images`."""
+    return _made_up
+
+
+@pytest.fixture
+def info() -> ShardInfo:
+    return INFO
