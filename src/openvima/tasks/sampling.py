@@ -259,6 +259,8 @@ class TableSampler:
         corners = pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
         if (corners < WORKSPACE_LOW).any() or (corners > WORKSPACE_HIGH).any():
             return False
+        if not self.placements:
+            return True
         labels, heights = np.zeros_like(self._labels), np.zeros_like(self._heights)
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
         self._stamp(labels, heights, Placement(1, object_name, "", size, raised))

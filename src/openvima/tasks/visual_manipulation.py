@@ -37,16 +37,20 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
         "target", lambda: (table.choose(dragged_objects), target_texture), apart_m=apart_m
     )
 
-    looks_taken = {(base.object, base.texture), (target.object, target.texture)}
-    looks = [
-        (shape, texture)
-        for shape in (*dragged_objects, *base_objects)
-        for texture in (*dragged_textures, *base_textures)
-        if (shape, texture) not in looks_taken
-    ]
+    taken = {(base.object, base.texture), (target.object, target.texture)}
+
+    def draw_distractor() -> tuple[str, str]:
+        while True:
+            look = (
+                table.choose((*dragged_objects, *base_objects)),
+                table.choose((*dragged_textures, *base_textures)),
+            )
+            if look not in taken:
+                return look
+
     distractors = table.place(
         "distractor",
-        lambda: table.choose(looks),
+        draw_distractor,
         count=num_distractors,
         tries=num_distractors + 10,
         apart_m=apart_m,
