@@ -1,0 +1,1 @@
+"""Network parts that policies share. They need torch (`pip install openvima[train]`)."""

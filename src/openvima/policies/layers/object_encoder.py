@@ -1,0 +1,108 @@
+"""Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
+
+Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token; `...` leading axes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+from openvima.policies.layers.mlp import mlp
+from openvima.policies.layers.vit import VisionTransformer, VitConfig
+
+NUM_VIEWS = 2
+_BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # box = centre x, centre y, height, width in pixels of a 128 × 256 image
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectEncoderConfig:
+    """Sizes of the object encoder.
+
+    Args:
+        crop: The crop encoder.
+        box_width: Width of the box features.
+        width: Width of an object token.
+        fuse_views: One token for both views of an object, instead of one for each.
+        appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
+    """
+
+    crop: VitConfig
+    box_width: int
+    width: int
+    fuse_views: bool = False
+    appearance_width: int = 0
+
+    def __post_init__(self) -> None:
+        if self.appearance_width and not self.fuse_views:
+            raise ConfigError("object encoder: an appearance embedding needs fuse_views, one token per object.")
+
+
+class ObjectEncoder(nn.Module):
+    """Crops -> features (`encode_crops`), then features and boxes -> tokens (`forward`).
+
+    Three objects, views apart: [front 1, front 2, front 3, top 1, top 2, top 3]; fused: [1, 2, 3].
+    The two parts are apart so that the features of crops that never change can be computed once.
+    """
+
+    box_units: torch.Tensor
+
+    def __init__(self, config: ObjectEncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        features = config.crop.output_width
+        self.register_buffer("box_units", torch.tensor(_BOX_UNITS), persistent=False)
+        self.crop_encoder = VisionTransformer(config.crop)
+        box_widths = (4, config.box_width, config.box_width, config.box_width)
+        self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))
+        per_view = features + config.box_width
+        if config.fuse_views:
+            self.fusion = nn.Linear(NUM_VIEWS * (per_view + 1), config.width)
+        else:
+            self.fusion = nn.ModuleList(nn.Linear(per_view, config.width) for _ in range(NUM_VIEWS))
+        if config.appearance_width:
+            self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
+
+    def encode_crops(self, crops: torch.Tensor) -> torch.Tensor:
+        """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
+        return self.crop_encoder(crops.flatten(0, -4)).unflatten(0, crops.shape[:-3])
+
+    def forward(
+        self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
+    ) -> torch.Tensor:
+        """Make tokens.
+
+        Args:
+            features_VNF: Crop features, shape (..., 2, N, F).
+            boxes_VN4: Boxes in pixels, shape (..., 2, N, 4), integers.
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N). Only fusing looks at it.
+
+        Returns:
+            Shape (..., N, D) with fused views, else (..., 2 · N, D), all front slots first.
+        """
+        boxes_VN4 = boxes_VN4.to(features_VNF.dtype) / self.box_units
+        views = [
+            torch.cat([features_VNF[..., v, :, :], encoder(boxes_VN4[..., v, :, :])], dim=-1)
+            for v, encoder in enumerate(self.box_encoders)
+        ]
+        if not self.config.fuse_views:
+            return torch.cat([self.fusion[v](view) for v, view in enumerate(views)], dim=-2)
+        visible = [masks_VN[..., v, :, None].to(features_VNF.dtype) for v in range(NUM_VIEWS)]
+        seen = [view * mask for view, mask in zip(views, visible, strict=True)]
+        return self.fusion(torch.cat([*seen, *visible], dim=-1))
+
+    def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
+        """Embed what objects look like, wherever they lie.
+
+        Args:
+            features_VNF: Crop features, shape (..., 2, N, F).
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N).
+
+        Returns:
+            Vectors of length 1, shape (..., N, appearance width); their products are similarities.
+        """
+        seen_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
+        both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
+        return F.normalize(self.appearance(both), dim=-1)

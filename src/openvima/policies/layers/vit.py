@@ -1,0 +1,109 @@
+"""The vision transformer that turns a 32 × 32 crop into one feature vector.
+
+Shape suffixes: N crops, C channels, P patches plus the class token, H heads, W width, K width of one head.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+
+# Mean and standard deviation of R, G, B over the benchmark's training frames, as the published policies use them.
+PIXEL_MEAN = (0.3471, 0.3429, 0.3383)
+PIXEL_STD = (0.3011, 0.2961, 0.2956)
+
+
+@dataclass(frozen=True, slots=True)
+class VitConfig:
+    """Sizes of the crop encoder.
+
+    Args:
+        width: Width of its tokens.
+        num_layers: Residual blocks.
+        num_heads: Attention heads in each.
+        output_width: Length of the feature vector.
+        patch_size: Side of a patch in pixels.
+        crop_size: Side of the crop in pixels.
+    """
+
+    width: int
+    num_layers: int
+    num_heads: int
+    output_width: int
+    patch_size: int = 16
+    crop_size: int = 32
+
+    def __post_init__(self) -> None:
+        if self.width % self.num_heads:
+            raise ConfigError(f"crop encoder: width {self.width} must be a multiple of {self.num_heads} heads.")
+        if self.crop_size % self.patch_size:
+            raise ConfigError(f"crop encoder: {self.patch_size} px patches do not tile {self.crop_size} px.")
+
+
+class VisionTransformer(nn.Module):
+    """Class token and patches of one crop -> pre-norm blocks -> features of the class token.
+
+    For a 32 × 32 crop in patches of 16: [class, upper left, upper right, lower left, lower right].
+    """
+
+    pixel_mean: torch.Tensor
+    pixel_std: torch.Tensor
+
+    def __init__(self, config: VitConfig) -> None:
+        super().__init__()
+        width, scale = config.width, config.width**-0.5
+        num_patches = (config.crop_size // config.patch_size) ** 2
+        self.register_buffer("pixel_mean", torch.tensor(PIXEL_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("pixel_std", torch.tensor(PIXEL_STD).view(3, 1, 1), persistent=False)
+        self.patches = nn.Conv2d(3, width, config.patch_size, stride=config.patch_size, bias=False)
+        self.class_token = nn.Parameter(torch.randn(width) * scale)
+        self.positions = nn.Parameter(torch.randn(num_patches + 1, width) * scale)
+        self.norm_before = nn.LayerNorm(width)
+        self.blocks = nn.ModuleList(VitBlock(width, config.num_heads) for _ in range(config.num_layers))
+        self.norm_after = nn.LayerNorm(width)
+        self.projection = nn.Linear(width, config.output_width, bias=False)
+        nn.init.normal_(self.projection.weight, std=scale)
+
+    def forward(self, crops_NCYX: torch.Tensor) -> torch.Tensor:
+        """Encode crops.
+
+        Args:
+            crops_NCYX: Shape (N, 3, 32, 32), uint8, or floating-point in the same range of 0 to 255.
+
+        Returns:
+            Shape (N, output_width), in the precision of the weights.
+        """
+        pixels = crops_NCYX.to(self.positions.dtype) / 255
+        patches_NPW = self.patches((pixels - self.pixel_mean) / self.pixel_std).flatten(2).transpose(1, 2)
+        class_N1W = self.class_token.expand(len(patches_NPW), 1, -1)
+        x_NPW = self.norm_before(torch.cat([class_N1W, patches_NPW], dim=1) + self.positions)
+        for block in self.blocks:
+            x_NPW = block(x_NPW)
+        return self.projection(self.norm_after(x_NPW[:, 0]))
+
+
+class VitBlock(nn.Module):
+    """Pre-norm self-attention and MLP, both added to their input."""
+
+    def __init__(self, width: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.norm_attention = nn.LayerNorm(width)
+        self.query_key_value = nn.Linear(width, 3 * width)
+        self.attention_out = nn.Linear(width, width)
+        self.norm_mlp = nn.LayerNorm(width)
+        self.widen = nn.Linear(width, 4 * width)
+        self.narrow = nn.Linear(4 * width, width)
+
+    def forward(self, x_NPW: torch.Tensor) -> torch.Tensor:
+        """Map tokens to tokens, shape (N, P, W)."""
+        packed = self.query_key_value(self.norm_attention(x_NPW))
+        # (N, P, 3·W) -> (3, N, H, P, K)
+        query, key, value = packed.unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        x_NPW = x_NPW + self.attention_out(mixed.transpose(1, 2).flatten(2))
+        hidden = self.widen(self.norm_mlp(x_NPW))
+        return x_NPW + self.narrow(hidden * torch.sigmoid(1.702 * hidden))  # QuickGELU

@@ -1,0 +1,92 @@
+"""Words and image places of a prompt as numbers, over the benchmark's closed vocabulary.
+
+The vocabulary ships with the package, one word a line in `vocabulary.txt`. New words go to its end: the line
+number is the word's id in every checkpoint.
+"""
+
+import difflib
+import re
+from functools import cache
+from importlib import resources
+
+from openvima.errors import PromptError
+from openvima.scene import PromptImage, RenderedPrompt
+
+PADDING_ID, END_ID = 0, 1
+LARGEST_NUMBER = 360
+_FIRST_NUMBER_ID = 2
+_FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
+_PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|\d+|\S")
+
+
+@cache
+def word_ids() -> dict[str, int]:
+    """Return every word and punctuation mark with its id; numbers from 0 to 360 lie below them."""
+    text = resources.files("openvima.policies").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    return {word: _FIRST_WORD_ID + index for index, word in enumerate(text.split())}
+
+
+def vocabulary_size() -> int:
+    """Number of ids: padding, the end mark, numbers and words."""
+    return _FIRST_WORD_ID + len(word_ids())
+
+
+def encode_text(text: str) -> list[int]:
+    """Turn a piece of text into ids; case does not matter.
+
+    Args:
+        text: Words, whole numbers from 0 to 360 and punctuation, without placeholders.
+
+    Returns:
+        One id for each word, number or mark; no end mark.
+
+    Raises:
+        PromptError: A word or number is not in the vocabulary.
+
+    Example:
+        >>> encode_text("30 degrees.") == [32, word_ids()["degrees"], word_ids()["."]]
+        True
+    """
+    ids, unknown = [], []
+    for piece in _PIECE.findall(text.lower()):
+        token = _number_id(piece) if piece.isdigit() else word_ids().get(piece)
+        if token is None:
+            unknown.append(piece)
+        else:
+            ids.append(token)
+    if unknown:
+        raise PromptError(_unknown_words(unknown, text))
+    return ids
+
+
+def encode_prompt(prompt: RenderedPrompt) -> list[int | PromptImage]:
+    """Turn a prompt into word ids and images in reading order, with the end mark last.
+
+    Args:
+        prompt: Text with placeholders, and an image for each of them.
+
+    Returns:
+        Ids of words, and the image itself wherever a placeholder stood.
+
+    Raises:
+        PromptError: A word is not in the vocabulary, or placeholders and images do not match.
+    """
+    sequence: list[int | PromptImage] = []
+    for part in prompt.sequence():
+        sequence += encode_text(part) if isinstance(part, str) else [part]
+    return [*sequence, END_ID]
+
+
+def _number_id(digits: str) -> int | None:
+    number = int(digits)
+    return _FIRST_NUMBER_ID + number if number <= LARGEST_NUMBER else None
+
+
+def _unknown_words(unknown: list[str], text: str) -> str:
+    shown = ", ".join(repr(word) for word in dict.fromkeys(unknown))
+    near = difflib.get_close_matches(unknown[0], word_ids(), n=1)
+    suggestion = f" Did you mean {near[0]!r}?" if near else ""
+    return (
+        f"the prompt text {text!r} contains {shown}, which the policy's vocabulary lacks.{suggestion} "
+        f"It holds the words of the 17 tasks and whole numbers from 0 to {LARGEST_NUMBER}."
+    )

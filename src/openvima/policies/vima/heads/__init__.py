@@ -1,0 +1,1 @@
+"""Action heads: from the decoder's action query to an action."""

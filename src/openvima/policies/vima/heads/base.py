@@ -1,0 +1,107 @@
+"""What every action head takes and gives.
+
+Shape suffixes: B batch, T steps, N objects in view, M objects in the prompt, D width, A width of appearance.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+
+# Positions and quaternions of both poses in one vector, in this order, as everywhere in the policies.
+ACTION_PARTS = {
+    "pose0_position": slice(0, 2),
+    "pose0_rotation": slice(2, 6),
+    "pose1_position": slice(6, 8),
+    "pose1_rotation": slice(8, 12),
+}
+ACTION_WIDTH = 12
+_LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
+_HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadInputs:
+    """What the decoder and the object encoder know at each step.
+
+    Args:
+        query_BTD: Output of the decoder at the action query.
+        objects_BTND: Output of the decoder at the objects in view.
+        masks_BTN: Which of these exist.
+        appearance_BTNA: Appearance of the objects in view.
+        positions_BTN2: Table points under the objects' boxes, metres.
+        grasps_BTN2: Table points under the objects' most interior pixels, metres.
+        prompt_BMD: Encoded prompt at its object tokens.
+        prompt_masks_BM: Which of these exist.
+        prompt_appearance_BMA: Appearance of the prompt's objects.
+    """
+
+    query_BTD: torch.Tensor
+    objects_BTND: torch.Tensor
+    masks_BTN: torch.Tensor
+    appearance_BTNA: torch.Tensor
+    positions_BTN2: torch.Tensor
+    grasps_BTN2: torch.Tensor
+    prompt_BMD: torch.Tensor
+    prompt_masks_BM: torch.Tensor
+    prompt_appearance_BMA: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActionTargets:
+    """What the demonstrator did.
+
+    Args:
+        actions_BTC: Actions in metres and quaternions, in the order of `ACTION_PARTS`.
+        pick_BT: Slot of the picked object in view; -1 where it is not in view.
+        place_BT: Slot of the object relative to which it was placed; -1 where there is none.
+        steps_BT: Which steps exist.
+    """
+
+    actions_BTC: torch.Tensor
+    pick_BT: torch.Tensor
+    place_BT: torch.Tensor
+    steps_BT: torch.Tensor
+
+
+class ActionHead(nn.Module):
+    """Base of the heads: a loss for training, a decision for acting."""
+
+    def loss(
+        self, inputs: HeadInputs, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the mean loss over existing steps, and metrics by name."""
+        raise NotImplementedError
+
+    def decide(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return the best action of every step, shape (B, T, 12), metres and quaternions, within bounds."""
+        raise NotImplementedError
+
+    def as_history(self, unit_actions: torch.Tensor) -> torch.Tensor:
+        """Return actions in unit range as the head would have expressed them, for the history."""
+        return unit_actions
+
+
+def to_unit_range(actions: torch.Tensor) -> torch.Tensor:
+    """Map actions (..., 12) from metres and quaternion components to 0 … 1."""
+    low, high = _bounds(actions)
+    return (actions - low) / (high - low)
+
+
+def from_unit_range(values: torch.Tensor) -> torch.Tensor:
+    """Undo `to_unit_range`; values outside 0 … 1 are clipped to the bounds."""
+    low, high = _bounds(values)
+    return torch.minimum(torch.maximum(low + values * (high - low), low), high)
+
+
+def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Mean of the values where the mask is true; 0 where it is true nowhere."""
+    weights = mask.to(values.dtype)
+    return (values * weights).sum() / weights.sum().clamp(min=1)
+
+
+def _bounds(like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    low = torch.tensor(_LOW + _LOW, dtype=like.dtype, device=like.device)
+    return low, torch.tensor(_HIGH + _HIGH, dtype=like.dtype, device=like.device)

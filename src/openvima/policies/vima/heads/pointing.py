@@ -1,0 +1,180 @@
+"""A head that points: at the object to pick, at the object to place it by, and a small offset from there.
+
+Shape suffixes as in `base.py`; H hidden width.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+from openvima.policies.layers.mlp import mlp
+from openvima.policies.vima.heads.base import (
+    ActionHead,
+    ActionTargets,
+    HeadInputs,
+    from_unit_range,
+    masked_mean,
+    to_unit_range,
+)
+
+_OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
+
+
+@dataclass(frozen=True, slots=True)
+class PointingConfig:
+    """Sizes of the pointing head and weights of its losses.
+
+    Args:
+        hidden_width: Width of the hidden layers that give offset and yaw.
+        num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 is centred at no turn.
+        offset_weight: Weight of the offset's loss against the pointers'.
+        yaw_weight: Weight of the yaw's loss.
+    """
+
+    hidden_width: int = 128
+    num_yaw_bins: int = 72
+    offset_weight: float = 2.0
+    yaw_weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.num_yaw_bins < 2 or self.hidden_width < 1:
+            raise ConfigError("pointing head: it needs at least 2 yaw bins and a hidden width of at least 1.")
+
+
+class PointingHead(ActionHead):
+    """Two pointers over the objects in view, then offset and yaw for what they point at.
+
+    A pointer scores each object by query · key, plus the similarity of its appearance with that of the prompt
+    object which the query attends to. "Put the A into the B": the pick's query attends to A in the prompt, and
+    whatever in the scene looks like A gets the score, whether or not that look occurred in training.
+    """
+
+    def __init__(self, config: PointingConfig, width: int) -> None:
+        super().__init__()
+        self.config = config
+        self.pick = Pointer(width)
+        self.place = Pointer(width)
+        self.same = nn.Linear(width, 1)  # how much the place wants to be the picked object itself
+        self.relation = mlp((3 * width + 6, config.hidden_width, config.hidden_width))
+        self.offset = nn.Linear(config.hidden_width, 2)
+        self.yaw = nn.Linear(config.hidden_width, config.num_yaw_bins)
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.offset.bias)
+
+    def loss(
+        self, inputs: HeadInputs, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Cross-entropy of both pointers and of the yaw, and Huber loss of the offset."""
+        has_pick = targets.steps_BT & (targets.pick_BT >= 0)
+        has_place = has_pick & (targets.place_BT >= 0)
+        pick, place = targets.pick_BT.clamp(min=0), targets.place_BT.clamp(min=0)
+        pick_scores = self.pick(inputs)
+        place_scores = self.place_scores(inputs, pick)
+        offset, yaw_scores = self.relate(inputs, pick, place)
+        actions = targets.actions_BTC
+        true_offset = actions[..., 6:8] - at(inputs.positions_BTN2, place)
+        yaw = yaw_bin(turn_of(actions), self.config.num_yaw_bins)
+        huber = F.smooth_l1_loss(offset / _OFFSET_UNIT_M, true_offset / _OFFSET_UNIT_M, reduction="none", beta=0.1)
+        losses = {
+            "pick": masked_mean(_cross_entropy(pick_scores, pick), has_pick),
+            "place": masked_mean(_cross_entropy(place_scores, place), has_place),
+            "offset": masked_mean(huber.sum(-1), has_place) * self.config.offset_weight,
+            "yaw": masked_mean(_cross_entropy(yaw_scores, yaw), has_place) * self.config.yaw_weight,
+        }
+        with torch.no_grad():
+            metrics = {
+                "pick_accuracy": _accuracy(pick_scores, pick, has_pick),
+                "place_accuracy": _accuracy(place_scores, place, has_place),
+                "yaw_accuracy": _accuracy(yaw_scores, yaw, has_place),
+                "offset_error_m": masked_mean((offset - true_offset).norm(dim=-1), has_place),
+            }
+        return torch.stack(list(losses.values())).sum(), metrics
+
+    def decide(self, inputs: HeadInputs) -> torch.Tensor:
+        """Point, then place: at the grasp point of the picked object, and by the offset from the other."""
+        pick = self.pick(inputs).argmax(-1)
+        place = self.place_scores(inputs, pick).argmax(-1)
+        offset, yaw_scores = self.relate(inputs, pick, place)
+        turn = yaw_scores.argmax(-1).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
+        zero, one = torch.zeros_like(turn), torch.ones_like(turn)
+        pose0 = [at(inputs.grasps_BTN2, pick), torch.stack([zero, zero, zero, one], dim=-1)]
+        pose1 = [at(inputs.positions_BTN2, place) + offset]
+        pose1.append(torch.stack([zero, zero, torch.sin(turn / 2), torch.cos(turn / 2)], dim=-1))
+        return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
+
+    def place_scores(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Scores (B, T, N) of the place, given the slot of the picked object."""
+        picked_BTN = F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).to(inputs.query_BTD.dtype)
+        return self.place(inputs) + self.same(inputs.query_BTD) * picked_BTN
+
+    def relate(
+        self, inputs: HeadInputs, pick_BT: torch.Tensor, place_BT: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Offset from the place object in metres, (B, T, 2), and scores of yaw bins, (B, T, bins)."""
+        grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
+        goal = at(inputs.positions_BTN2, place_BT)
+        tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), at(inputs.objects_BTND, place_BT)]
+        metric = torch.cat([grasp - start, start - 0.5, goal - 0.5], dim=-1) / _OFFSET_UNIT_M
+        hidden_BTH = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
+        return self.offset(hidden_BTH) * _OFFSET_UNIT_M, self.yaw(hidden_BTH)
+
+
+class Pointer(nn.Module):
+    """Scores the objects in view for one role."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width)
+        self.prompt_query = nn.Linear(width, width)
+        self.prompt_key = nn.Linear(width, width)
+        self.sharpness = nn.Linear(width, 1)  # how much the look counts in this situation
+        nn.init.zeros_(self.sharpness.weight)
+        nn.init.constant_(self.sharpness.bias, 10.0)
+
+    def forward(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return scores, shape (B, T, N); objects that do not exist score the most negative number."""
+        scale = inputs.query_BTD.shape[-1] ** -0.5
+        query_BTD, key_BTND = self.query(inputs.query_BTD), self.key(inputs.objects_BTND)
+        scores_BTN = torch.einsum("btd,btnd->btn", query_BTD, key_BTND) * scale
+        hidden = torch.finfo(scores_BTN.dtype).min
+        if inputs.prompt_BMD.shape[1]:
+            asked_BTM = self.prompt_query(inputs.query_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
+            asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
+            look_BTA = asked_BTM @ inputs.prompt_appearance_BMA
+            similarity_BTN = torch.einsum("btna,bta->btn", inputs.appearance_BTNA, look_BTA)
+            scores_BTN = scores_BTN + F.softplus(self.sharpness(inputs.query_BTD)) * similarity_BTN
+        return scores_BTN.masked_fill(~inputs.masks_BTN, hidden)
+
+
+def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
+    """Take the row of one slot at every step: (B, T, N, X) and (B, T) give (B, T, X)."""
+    index = slot_BT[..., None, None].expand(*slot_BT.shape, 1, values_BTNX.shape[-1])
+    return values_BTNX.gather(2, index).squeeze(2)
+
+
+def turn_of(actions_BTC: torch.Tensor) -> torch.Tensor:
+    """Yaw of pose1 against pose0 in radians, shape (B, T)."""
+    yaws = []
+    for start in (2, 8):
+        x, y, z, w = actions_BTC[..., start : start + 4].unbind(-1)
+        yaws.append(torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    return yaws[1] - yaws[0]
+
+
+def yaw_bin(turn: torch.Tensor, num_bins: int) -> torch.Tensor:
+    """Nearest of `num_bins` equal steps around the circle, int64."""
+    return torch.round(turn / (2 * math.pi / num_bins)).to(torch.int64) % num_bins
+
+
+def _cross_entropy(scores_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:
+    loss = F.cross_entropy(scores_BTN.flatten(0, 1), target_BT.flatten(), reduction="none")
+    return loss.view_as(target_BT)
+
+
+def _accuracy(scores_BTN: torch.Tensor, target_BT: torch.Tensor, mask_BT: torch.Tensor) -> torch.Tensor:
+    return masked_mean((scores_BTN.argmax(-1) == target_BT).to(scores_BTN.dtype), mask_BT)
