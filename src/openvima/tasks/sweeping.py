@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from openvima.catalog import Vector3
 from openvima.scene import InZone, Placement, Pose, Problem, Scene, Zone, in_workspace
 from openvima.tasks.footprints import Rectangle
 
