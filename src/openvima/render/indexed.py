@@ -61,6 +61,22 @@ def magnified(mesh: TriangleMesh, factor: float) -> TriangleMesh:
     return TriangleMesh(mesh.vertices * factor, mesh.normals, mesh.uvs)
 
 
+class Scratch:
+    """Working memory of the kernels, grown to the largest mesh seen; one thread at a time."""
+
+    def __init__(self) -> None:
+        self._points = np.empty((0, 4))
+        self._selected = np.empty(0, dtype=np.int32)
+
+    def arrays(self, mesh: IndexedMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Return room for all projected vertices, (≥ V, 4) float64, and triangle indices, (≥ F + 1,) int32."""
+        if len(mesh.vertices) > len(self._points):
+            self._points = np.empty((len(mesh.vertices), 4))
+        if len(mesh.corners) >= len(self._selected):
+            self._selected = np.empty(len(mesh.corners) + 1, dtype=np.int32)
+        return self._points, self._selected
+
+
 def matrix_3x4(pose: Pose) -> np.ndarray:
     """Return a pose as rotation and translation, shape (3, 4), float64."""
     x, y, z, w = pose.quaternion

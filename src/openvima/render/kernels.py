@@ -22,49 +22,27 @@ def light_intensity(nx: float, ny: float, nz: float) -> float:
     The highlight depends on the height to which light is reflected, not on the viewer: all views agree on it.
     """
     facing = nx * _LIGHT_X + ny * _LIGHT_Y + nz * _LIGHT_Z
-    # Reflected direction 2(n·l)n − l.
-    rx = 2.0 * facing * nx - _LIGHT_X
-    ry = 2.0 * facing * ny - _LIGHT_Y
-    rz = 2.0 * facing * nz - _LIGHT_Z
-    length = math.sqrt(rx * rx + ry * ry + rz * rz)
-    highlight = max(0.0, rz / length) if length > 0.0 else 0.0
-    return AMBIENT + DIFFUSE * max(0.0, facing) + SPECULAR * highlight * highlight
+    reflected_z = max(0.0, 2.0 * facing * nz - _LIGHT_Z)  # of 2(n·l)n − l, a unit vector as n and l are
+    return AMBIENT + DIFFUSE * max(0.0, facing) + SPECULAR * reflected_z * reflected_z
 
 
 @njit(cache=True)
 def texel_index(u: float, v: float, height: int, width: int) -> tuple[int, int]:
     """Row and column of the texel nearest to (u, v); v = 0 is the bottom row, both coordinates wrap at 1."""
-    column = int((u - math.floor(u)) * width)
-    row = height - 1 - int((v - math.floor(v)) * height)
-    # u − floor(u) of a tiny negative u rounds to 1.
-    return max(row, 0), min(column, width - 1)
+    column = int((u - np.floor(u)) * width)
+    row = height - 1 - int((v - np.floor(v)) * height)
+    return max(row, 0), min(column, width - 1)  # u − floor(u) of a tiny negative u rounds to 1
 
 
 @njit(cache=True)
-def draw_triangles(
+def project_vertices(
     vertices: np.ndarray,  # (V, 3) float64, body frame
-    corners: np.ndarray,  # (F, 3) int32, indices into vertices
-    normals: np.ndarray,  # (F, 3, 3) float64, body frame
-    uvs: np.ndarray,  # (F, 3, 2) float64
-    is_flat: np.ndarray,  # (F,) bool: the corners' normals are equal
     pose: np.ndarray,  # (3, 4) float64, world from body
     camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
-    texture: np.ndarray,  # (h, w, 3) uint8
-    object_id: int,
-    screen: np.ndarray,  # (≥ V, 4) float64, scratch: X, Y up, distance without its constant, world z
-    depth: np.ndarray,  # (H, W) float32, smaller is nearer
-    rgb: np.ndarray,  # (3, H, W) uint8
-    segm: np.ndarray,  # (H, W) uint8
-    heights: np.ndarray,  # (H, W) float32, or (0, 0) if not wanted
+    screen: np.ndarray,  # (≥ V, 4) float64, result: X, Y up, distance without its constant, world z
 ) -> None:
-    """Draw one body into one image, over what is there already.
-
-    A pixel belongs to a triangle if its sampling point lies inside or on the border; among triangles of equal
-    depth the later one shows. Back faces and triangles of next to no area are left out.
-    """
-    image_height, image_width = segm.shape
-    texture_height, texture_width = texture.shape[0], texture.shape[1]
-    focal, half_width, half_height, min_area = camera[3, 0], camera[3, 1], camera[3, 2], camera[3, 3]
+    """Move vertices to their place in the world and onto the image plane."""
+    focal, half_width, half_height = camera[3, 0], camera[3, 1], camera[3, 2]
     for i in range(vertices.shape[0]):
         vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
         x = pose[0, 0] * vx + pose[0, 1] * vy + pose[0, 2] * vz + pose[0, 3]
@@ -81,33 +59,95 @@ def draw_triangles(
         screen[i, 2] = away
         screen[i, 3] = z
 
+
+@njit(cache=True)
+def select_triangles(
+    corners: np.ndarray,  # (F, 3) int32, indices into points
+    points: np.ndarray,  # (V, ≥ 2) float64: horizontal and vertical coordinate, the front of triangles turns left
+    min_area: float,  # smaller doubled areas are left out
+    selected: np.ndarray,  # (≥ F + 1) int32, result: indices of the triangles, in order
+) -> int:
+    """List the triangles that show their front and may cover a whole-numbered point; return how many.
+
+    Most triangles of a fine mesh do neither. The list is built without branches, which could not be predicted:
+    that halves the time of the largest meshes.
+    """
+    count = 0
     for f in range(corners.shape[0]):
+        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        ax, ay = points[a, 0], points[a, 1]
+        bx, by = points[b, 0], points[b, 1]
+        cx, cy = points[c, 0], points[c, 1]
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        low_x, high_x = _range_of(ax, bx, cx)
+        low_y, high_y = _range_of(ay, by, cy)
+        selected[count] = f
+        count += (area > min_area) & (np.ceil(low_x) <= high_x) & (np.ceil(low_y) <= high_y)
+    return count
+
+
+@njit(cache=True)
+def _range_of(a: float, b: float, c: float) -> tuple[float, float]:
+    """Smallest and largest of three numbers."""
+    low = a if a < b else b
+    high = b if a < b else a
+    return (c if c < low else low), (c if c > high else high)
+
+
+@njit(cache=True)
+def _whole_numbers_between(a: float, b: float, c: float, last: int) -> tuple[int, int]:
+    """Smallest and largest whole number from 0 to `last` in the range of a, b, c; the first is larger if none."""
+    low, high = _range_of(a, b, c)
+    return int(min(max(np.ceil(low), 0.0), last + 1.0)), int(max(min(np.floor(high), float(last)), -1.0))
+
+
+@njit(cache=True)
+def draw_triangles(
+    vertices: np.ndarray,  # (V, 3) float64, body frame
+    corners: np.ndarray,  # (F, 3) int32, indices into vertices
+    normals: np.ndarray,  # (F, 3, 3) float64, body frame
+    uvs: np.ndarray,  # (F, 3, 2) float64
+    is_flat: np.ndarray,  # (F,) bool: the corners' normals are equal
+    pose: np.ndarray,  # (3, 4) float64, world from body
+    camera: np.ndarray,  # (4, 4) float64, see Camera.matrix
+    texture: np.ndarray,  # (h, w, 3) uint8
+    object_id: int,
+    screen: np.ndarray,  # (≥ V, 4) float64, scratch
+    selected: np.ndarray,  # (≥ F + 1) int32, scratch
+    depth: np.ndarray,  # (H, W) float32, smaller is nearer
+    rgb: np.ndarray,  # (3, H, W) uint8
+    segm: np.ndarray,  # (H, W) uint8
+    heights: np.ndarray,  # (H, W) float32, or (0, 0) if not wanted
+) -> None:
+    """Draw one body into one image, over what is there already.
+
+    A pixel belongs to a triangle if its sampling point lies inside or on the border; among triangles of equal
+    depth the later one shows. Back faces and triangles of next to no area are left out.
+    """
+    image_height, image_width = segm.shape
+    texture_height, texture_width = texture.shape[0], texture.shape[1]
+    project_vertices(vertices, pose, camera, screen)
+    for k in range(select_triangles(corners, screen, camera[3, 3], selected)):
+        f = selected[k]
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         ax, ay = screen[a, 0], screen[a, 1]
         bx, by = screen[b, 0], screen[b, 1]
         cx, cy = screen[c, 0], screen[c, 1]
-        # Positive exactly when the front faces the camera: perspective keeps the turning sense.
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if not area > min_area:
-            continue
-        low_x = max(math.ceil(min(ax, bx, cx)), 0.0)
-        high_x = min(math.floor(max(ax, bx, cx)), image_width - 1.0)
-        low_y = max(math.ceil(min(ay, by, cy)), 0.0)
-        high_y = min(math.floor(max(ay, by, cy)), image_height - 1.0)
-        if low_x > high_x or low_y > high_y:
-            continue
+        inverse_area = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+        low_x, high_x = _whole_numbers_between(ax, bx, cx, image_width - 1)
+        low_y, high_y = _whole_numbers_between(ay, by, cy, image_height - 1)
         intensity = -1.0
-        for j in range(int(low_y), int(high_y) + 1):
+        for j in range(low_y, high_y + 1):
             row = image_height - 1 - j
-            for column in range(int(low_x), int(high_x) + 1):
+            for column in range(low_x, high_x + 1):
                 weight_a = (bx - column) * (cy - j) - (cx - column) * (by - j)
                 weight_b = (cx - column) * (ay - j) - (ax - column) * (cy - j)
                 weight_c = (ax - column) * (by - j) - (bx - column) * (ay - j)
-                if weight_a < 0.0 or weight_b < 0.0 or weight_c < 0.0:
+                if (weight_a < 0.0) | (weight_b < 0.0) | (weight_c < 0.0):
                     continue
-                weight_a /= area
-                weight_b /= area
-                weight_c /= area
+                weight_a *= inverse_area
+                weight_b *= inverse_area
+                weight_c *= inverse_area
                 pixel_depth = np.float32(
                     weight_a * screen[a, 2] + weight_b * screen[b, 2] + weight_c * screen[c, 2]
                 )
@@ -162,6 +202,7 @@ def stamp_triangles(
     cell: float,  # m
     ceiling: float,  # surfaces at this height or above are left out, m
     points: np.ndarray,  # (≥ V, 3) float64, scratch: column, row, height
+    selected: np.ndarray,  # (≥ F + 1) int32, scratch
     labels: np.ndarray,  # (rows, columns) int16
     heights: np.ndarray,  # (rows, columns) float32
 ) -> None:
@@ -178,28 +219,25 @@ def stamp_triangles(
         points[i, 1] = (y - origin_y) / cell
         points[i, 2] = pose[2, 0] * vx + pose[2, 1] * vy + pose[2, 2] * vz + pose[2, 3]
 
-    for f in range(corners.shape[0]):
+    for k in range(select_triangles(corners, points, 0.0, selected)):
+        f = selected[k]
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
         ax, ay = points[a, 0], points[a, 1]
         bx, by = points[b, 0], points[b, 1]
         cx, cy = points[c, 0], points[c, 1]
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if not area > 0.0:  # columns and rows run along x and y, so what turns left faces up
-            continue
-        low_x = max(math.ceil(min(ax, bx, cx)), 0.0)
-        high_x = min(math.floor(max(ax, bx, cx)), num_columns - 1.0)
-        low_y = max(math.ceil(min(ay, by, cy)), 0.0)
-        high_y = min(math.floor(max(ay, by, cy)), num_rows - 1.0)
-        if low_x > high_x or low_y > high_y:
-            continue
-        for row in range(int(low_y), int(high_y) + 1):
-            for column in range(int(low_x), int(high_x) + 1):
+        inverse_area = 1.0 / ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+        low_x, high_x = _whole_numbers_between(ax, bx, cx, num_columns - 1)
+        low_y, high_y = _whole_numbers_between(ay, by, cy, num_rows - 1)
+        for row in range(low_y, high_y + 1):
+            for column in range(low_x, high_x + 1):
                 weight_a = (bx - column) * (cy - row) - (cx - column) * (by - row)
                 weight_b = (cx - column) * (ay - row) - (ax - column) * (cy - row)
                 weight_c = (ax - column) * (by - row) - (bx - column) * (ay - row)
-                if weight_a < 0.0 or weight_b < 0.0 or weight_c < 0.0:
+                if (weight_a < 0.0) | (weight_b < 0.0) | (weight_c < 0.0):
                     continue
-                z = (weight_a * points[a, 2] + weight_b * points[b, 2] + weight_c * points[c, 2]) / area
+                z = (
+                    weight_a * points[a, 2] + weight_b * points[b, 2] + weight_c * points[c, 2]
+                ) * inverse_area
                 height = np.float32(z)
                 if z < ceiling and height >= heights[row, column]:
                     heights[row, column] = height

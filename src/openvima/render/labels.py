@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from openvima.catalog.geometry import Assets
-from openvima.render.indexed import indexed, matrix_3x4
+from openvima.render.indexed import Scratch, indexed, matrix_3x4
 from openvima.render.kernels import stamp_triangles
 from openvima.scene import WORKSPACE_LOW, Placement, Scene
 
@@ -41,6 +41,7 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
     mesh = indexed(assets.geometry(placement.object, placement.size, placement.scale).visual)
     x, y, _, _ = placement.pose.quaternion
     is_level = x == 0 and y == 0
+    points, selected = Scratch().arrays(mesh)
     stamp_triangles(
         mesh.vertices,
         mesh.upward if is_level else mesh.corners,
@@ -50,7 +51,8 @@ def stamp(raster: np.ndarray, heights: np.ndarray, placement: Placement, assets:
         _ORIGIN[1],
         CELL_M,
         CEILING_M,
-        np.empty((len(mesh.vertices), 3)),
+        points,
+        selected,
         raster,
         heights,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View
-from openvima.render.indexed import indexed, magnified, matrix_3x4
+from openvima.render.indexed import Scratch, indexed, magnified, matrix_3x4
 from openvima.render.kernels import draw_triangles
 from openvima.scene import (
     BACKGROUND_ID,
@@ -82,7 +82,7 @@ class Rasteriser:
 
     def __init__(self, assets: Assets) -> None:
         self.assets = assets
-        self._screen = np.empty((4096, 4))  # scratch of the kernel, one row a vertex; grows as needed
+        self._scratch = Scratch()
         self._depth: dict[tuple[int, int], np.ndarray] = {}
 
     def scene(
@@ -173,9 +173,6 @@ class Rasteriser:
             (indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id))
             for body in bodies
         ]
-        most_vertices = max((len(mesh.vertices) for mesh, *_ in prepared), default=0)
-        if most_vertices > len(self._screen):
-            self._screen = np.empty((most_vertices, 4))
         images: dict[View, Image] = {}
         for view in views:
             ground = _ground(CAMERAS[view].enlarged(enlarge), table)
@@ -184,6 +181,7 @@ class Rasteriser:
             depth = self._depth.setdefault(segm.shape, np.empty(segm.shape, dtype=np.float32))
             np.copyto(depth, ground.depth)
             for mesh, pose, texture, object_id in prepared:
+                screen, selected = self._scratch.arrays(mesh)
                 draw_triangles(
                     mesh.vertices,
                     mesh.corners,
@@ -194,7 +192,8 @@ class Rasteriser:
                     ground.camera,
                     texture,
                     object_id,
-                    self._screen,
+                    screen,
+                    selected,
                     depth,
                     rgb,
                     segm,
@@ -233,6 +232,7 @@ def _ground(camera: Camera, table: bool) -> _Ground:
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
             mesh = indexed(body.mesh)
+            screen, selected = Scratch().arrays(mesh)
             draw_triangles(
                 mesh.vertices,
                 mesh.corners,
@@ -243,7 +243,8 @@ def _ground(camera: Camera, table: bool) -> _Ground:
                 ground.camera,
                 _texture_array(body.texture),
                 body.id,
-                np.empty((len(mesh.vertices), 4)),
+                screen,
+                selected,
                 ground.depth,
                 ground.rgb,
                 ground.segm,
