@@ -9,6 +9,9 @@ MuJoCo takes the larger one: floor and blade (coefficient 1) are given 0 here, s
 slipperier of two bodies has priority; pairs of two slippery bodies are listed with their product.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's names come from a compiled module without type stubs.)
+
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,6 +4,9 @@ The distance of two convex shapes is a convex function of the way that one of th
 from the free side, therefore never goes past the touching point, and reaches it in a few evaluations.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's names come from a compiled module without type stubs.)
+
 from collections.abc import Iterable
 
 import mujoco
