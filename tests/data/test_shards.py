@@ -140,9 +140,7 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path: Path, made_up: MadeUp, inf
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_has_its_name_only_when_it_is_whole(
-    tmp_path: Path, made_up: MadeUp, info: ShardInfo
-) -> None:
+def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
     with ShardWriter(tmp_path / "a.arrow", info) as writer:
         writer.write(made_up())
         assert not (tmp_path / "a.arrow").exists()

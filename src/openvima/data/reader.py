@@ -15,6 +15,8 @@ from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError, ShardError, unknown_name
 
+_REPAIR = "repeating its `openvima generate` command writes what is missing"
+
 
 class Shard:
     """One file of demonstrations; rows are read on demand.
@@ -88,7 +90,7 @@ class Dataset:
         if index.num_rows != self.manifest["counts"]["episodes"]:
             raise DatasetError(
                 f"{self.path / INDEX_NAME} lists {index.num_rows} episodes, {MANIFEST_NAME} "
-                f"{self.manifest['counts']['episodes']}; the same `openvima generate` command repairs them."
+                f"{self.manifest['counts']['episodes']}; delete both; {_REPAIR}."
             )
         self.index = index if self.tasks is None else _of_tasks(index, self.tasks, self.path)
         self._shard_names = self.index.column("shard").to_pylist()
@@ -134,7 +136,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         written_as = manifest["schema"]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
         raise DatasetError(
-            f"{path} is damaged; repeating the `openvima generate` command renews it."
+            f"{path} is damaged; {_REPAIR}."
         ) from None
     if written_as != SCHEMA_VERSION:
         raise DatasetError(f"{path} has schema {written_as}; this package reads {SCHEMA_VERSION}.")
@@ -151,7 +153,7 @@ def _opened(path: Path, columns: list[int] | None = None) -> pa.RecordBatchFileR
         return pa.ipc.open_file(pa.memory_map(str(path)), options=options)
     except FileNotFoundError:
         raise ShardError(
-            f"there is no file {path}; repeating the `openvima generate` command writes it."
+            f"there is no file {path}; {_REPAIR}."
         ) from None
     except (pa.ArrowInvalid, OSError) as error:
         raise ShardError(_damaged(path, "it", error)) from None
@@ -161,7 +163,7 @@ def _damaged(path: Path, what: str, error: Exception) -> str:
     reason = str(error).splitlines()[0]
     return (
         f"{path}: {what} cannot be read, so it is truncated or no shard ({reason}). "
-        "Delete it and repeat the `openvima generate` command, which writes what is missing."
+        f"Delete it; {_REPAIR}."
     )
 
 
@@ -171,11 +173,11 @@ def _read_index(folder: Path) -> pa.Table:
         return pq.read_table(BytesIO(path.read_bytes()), use_threads=False)
     except FileNotFoundError:
         raise DatasetError(
-            f"{path} is missing; repeating the `openvima generate` command renews it."
+            f"{path} is missing; {_REPAIR}."
         ) from None
     except (pa.ArrowInvalid, OSError):
         raise DatasetError(
-            f"{path} is damaged; repeating the `openvima generate` command renews it."
+            f"{path} is damaged; {_REPAIR}."
         ) from None
 
 
@@ -192,5 +194,5 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
     if missing:
         raise DatasetError(
             f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}; "
-            "repeating its `openvima generate` command writes them again."
+            f"{_REPAIR}."
         )

@@ -4,13 +4,25 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from openvima import __version__
-from openvima.env import TabletopEnv
-from openvima.scene import ACTION_SHAPES, Action, EndEffector, Outcome, RenderedPrompt, Scene
+from openvima.scene import (
+    ACTION_SHAPES,
+    END_EFFECTORS,
+    Action,
+    EndEffector,
+    Outcome,
+    RenderedPrompt,
+    Scene,
+)
+
+if TYPE_CHECKING:  # reading needs no simulation
+    from openvima.env import TabletopEnv
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +42,8 @@ class Demonstration:
         end_effector: "suction" or "spatula".
         actions: The T actions.
         pick_ids: Id of the object that each action picks or sweeps.
-        place_ids: Id of the object relative to which it is placed; 0 where the table itself is meant.
+        place_ids: Id of the object relative to which it is placed; -1 where it is tied
+            to the table itself.
         joint_paths: Waypoints of the arm for each action, shape (W, 6), float32, radians.
         scenes: Where all objects were, T + 1 scenes.
         outcome: How the episode ended.
@@ -67,7 +80,7 @@ class Demonstration:
         return {
             "rgb": {view: images[step] for view, images in self.rgb.items()},
             "segm": {view: images[step] for view, images in self.segm.items()},
-            "ee": ("suction", "spatula").index(self.end_effector),
+            "ee": END_EFFECTORS.index(self.end_effector),
         }
 
     def content_hash(self) -> str:
@@ -83,7 +96,7 @@ class Demonstration:
         return digest.hexdigest()
 
 
-def rollout_oracle(env: TabletopEnv, seed: int) -> Demonstration:
+def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
     """Let the oracle play one episode.
 
     Args:
@@ -131,6 +144,11 @@ def rollout_oracle(env: TabletopEnv, seed: int) -> Demonstration:
 
 def package_versions() -> dict[str, str]:
     """Return the versions of all packages that decide the bytes of a demonstration."""
+    return dict(_versions())
+
+
+@lru_cache(maxsize=1)
+def _versions() -> dict[str, str]:
     others = {name: version(name) for name in ("mujoco", "numba", "numpy", "pyarrow")}
     return {"openvima": __version__, **others}
 

@@ -23,7 +23,7 @@ _counters: Any = (
 class Job(Protocol):
     """Work on one item, which calls `count` with the number of things done so far."""
 
-    def __call__(self, item: Any, count: Callable[[int], None]) -> None:
+    def __call__(self, item: Any, count: Callable[[int], None], /) -> None:
         """Do it."""
 
 
@@ -93,7 +93,7 @@ def _wait_for_all(futures: Sequence[Future], tick: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let processes that start inside the block use one thread each; they read this before any code of ours."""
+    """Let processes that start inside the block use one thread each; it is read before our code is."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:

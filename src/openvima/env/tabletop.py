@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any  # observations and infos are nested dictionaries
 
 import gymnasium
 import numpy as np
@@ -75,7 +75,7 @@ class _Run:
         self.progress, self.outcome = goals.advance(self.episode.problem, self.progress, self.world.scene)
 
 
-class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
+class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     """A UR5 arm at a table: read a prompt, look from two cameras, pick and place or sweep.
 
     **Observation** — a dictionary; the cameras `front` and `top` are fixed, the arm is not shown.
@@ -117,7 +117,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
         task: Name of the task, such as "rotate".
         level: "train", "L1", "L2", "L3" or "L4": which objects, textures and tasks may occur.
         domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
-        assets: "procedural", the folder of the original asset pack, or an object that has shapes and textures.
+        assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
         compat: Follow the original benchmark also where it is odd: objects hover at the start, ids follow
             the order of spawning, the oracle picks any visible point.
         realtime: Record `frames`, 30 a second, while a step runs.
@@ -129,7 +129,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
         LevelError: The task is not defined at the level.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
 
     def __init__(
         self,
@@ -328,8 +328,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Mapping[str, np.ndarray]]):
 
 
 def _observation_space() -> spaces.Dict:
-    rgb = {view: spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8) for view in VIEWS}
-    segm = {view: spaces.Box(0, 255, IMAGE_SHAPE, np.uint8) for view in VIEWS}
+    rgb: dict[str, spaces.Space] = {view: spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8) for view in VIEWS}
+    segm: dict[str, spaces.Space] = {view: spaces.Box(0, 255, IMAGE_SHAPE, np.uint8) for view in VIEWS}
     ee = spaces.Discrete(len(END_EFFECTORS))
     return spaces.Dict({"rgb": spaces.Dict(rgb), "segm": spaces.Dict(segm), "ee": ee})
 

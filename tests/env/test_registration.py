@@ -1,0 +1,30 @@
+"""Names for Gymnasium appear whatever is imported first."""
+
+import subprocess
+import sys
+
+import pytest
+
+from openvima.env import register_environments
+from openvima.env.registration import environment_id
+from openvima.tasks import list_tasks
+
+
+@pytest.mark.parametrize("imports", ["import gymnasium, openvima", "import openvima, gymnasium"])
+def test_the_order_of_imports_does_not_matter(imports: str) -> None:
+    code = f"{imports}; print(*(name for name in gymnasium.registry if name.startswith('openvima/')))"
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.split() == [environment_id(task) for task in list_tasks()]
+
+
+def test_openvima_alone_does_not_import_gymnasium() -> None:
+    code = "import openvima, sys; print('gymnasium' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
+def test_registering_twice_changes_nothing() -> None:
+    register_environments()  # Gymnasium warns when a name is overridden, and warnings are errors here
+    register_environments()

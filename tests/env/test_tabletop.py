@@ -1,0 +1,270 @@
+"""The environment: what it accepts, what it refuses, and how episodes end."""
+
+import dataclasses
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import openvima
+from openvima.env import TabletopEnv
+from openvima.errors import ActionError, ConfigError, EpisodeError, LevelError, UnknownTaskError
+from openvima.scene import Action, Outcome
+from openvima.tasks import list_tasks, sample_episode, task_spec
+
+TASKS = list_tasks()
+
+
+def frozen(value: object) -> object:
+    """A nested observation, info or result as something that `==` compares byte by byte."""
+    if isinstance(value, dict):
+        return {key: frozen(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [frozen(entry) for entry in value]
+    return (value.shape, value.dtype.str, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+
+def idle_action() -> dict[str, np.ndarray]:
+    """An action that picks in an empty corner and therefore moves nothing."""
+    return Action.planar((0.25, -0.5), (0.25, -0.5)).to_arrays()
+
+
+@pytest.fixture(scope="module")
+def rotate() -> TabletopEnv:
+    return TabletopEnv("rotate")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_finds_nothing_to_complain_about(task: str) -> None:
+    env = gymnasium.make(f"openvima/{task}-v0", level="L1").unwrapped
+    with warnings.catch_warnings():
+        # Positions are in metres, as published actions are, and so lie in 0.25 … 0.75 rather than -1 … 1.
+        warnings.filterwarnings("ignore", message=".*we recommend using a symmetric and normalized space")
+        check_env(env)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_oracle_solves_episodes_within_its_steps(task: str) -> None:
+    env = TabletopEnv(task, level="L1")
+    num_solved = 0
+    for seed in range(5):
+        env.reset(seed=seed)
+        for _ in range(env.episode.oracle_max_steps):
+            observation, reward, terminated, truncated, info = env.step(env.oracle_decision().action)
+            assert env.observation_space.contains(observation)
+            assert not truncated
+            if terminated:
+                break
+        assert info["success"] == (reward == 1.0)
+        num_solved += info["success"]
+    assert num_solved >= 4
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_doing_nothing_useful_is_cut_off_after_the_last_step(task: str) -> None:
+    env = TabletopEnv(task)
+    env.reset(seed=1)
+    ends = []
+    for _ in range(env.episode.max_steps):
+        _, reward, terminated, truncated, info = env.step(idle_action())
+        ends.append((reward, terminated, truncated, info["success"], info["failure"]))
+    assert ends[:-1] == [(0.0, False, False, False, False)] * (env.episode.max_steps - 1)
+    assert ends[-1] == (0.0, False, True, False, False)
+    assert env.episode.max_steps == task_spec(task).oracle_max_steps + 2
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_environment_that_was_used_gives_the_same_bytes_as_a_fresh_one(task: str) -> None:
+    def play(env: TabletopEnv) -> object:
+        result = [env.reset(seed=3)]
+        result.append(env.step(env.oracle_decision().action))
+        images = {name: (image.rgb, image.segm) for name, image in env.prompt.images.items()}
+        return frozen([result, images, env.joint_path])
+
+    used = TabletopEnv(task)
+    used.reset(seed=8)
+    used.render()
+    used.step(idle_action())
+    assert play(used) == play(TabletopEnv(task))
+
+
+def test_it_can_be_made_by_name_in_two_ways() -> None:
+    wrapped = gymnasium.make("openvima/rotate-v0", level="L1")
+    bare = openvima.make("rotate", level="L1")
+    assert isinstance(wrapped.unwrapped, TabletopEnv)
+    assert frozen(wrapped.reset(seed=2)) == frozen(bare.reset(seed=2))
+
+
+def test_names_and_levels_are_checked_when_it_is_made() -> None:
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        TabletopEnv("rotat")
+    with pytest.raises(LevelError, match="L9"):
+        TabletopEnv("rotate", level="L9")
+    with pytest.raises(ConfigError, match="rgb_array"):
+        TabletopEnv("rotate", render_mode="human")
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    env = TabletopEnv("rotate")
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step(idle_action())
+    with pytest.raises(EpisodeError, match="reset"):
+        _ = env.prompt
+
+
+def test_a_step_after_the_end_is_refused(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=0)
+    while not rotate.outcome.is_over:
+        rotate.step(rotate.oracle_decision().action)
+    with pytest.raises(EpisodeError, match=r"ended after \d+ steps; reset"):
+        rotate.step(idle_action())
+
+
+def wrong(**changes: object) -> dict[str, object]:
+    return {**idle_action(), **changes}
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (wrong(pose0_position=np.float32([0.8, 0.1])), r"pose0_position is \(0.8, 0.1\)"),
+        (wrong(pose0_position=np.float32([np.nan, 0.1])), "finite"),
+        (wrong(pose1_rotation=np.float32([0, 0, 1])), r"shape \(3,\)"),
+        (wrong(pose1_position=np.array([1, 0])), "dtype int64"),
+        ({"pose0_position": np.float32([0.5, 0])}, "missing"),
+        (wrong(extra=1), "unknown keys extra"),
+    ],
+)
+def test_an_action_that_does_not_fit_changes_nothing(action: dict, message: str) -> None:
+    untouched, env = TabletopEnv("rotate"), TabletopEnv("rotate")
+    untouched.reset(seed=4)
+    env.reset(seed=4)
+    before = env.scene
+    with pytest.raises(ActionError, match=message):
+        env.step(action)
+    assert env.scene == before
+    expected = untouched.step(untouched.oracle_decision().action)
+    assert frozen(env.step(env.oracle_decision().action)) == frozen(expected)
+
+
+def test_episodes_are_numbered_by_the_seed(rotate: TabletopEnv) -> None:
+    first = frozen(rotate.reset(seed=1))
+    assert frozen(rotate.reset(seed=2)) != first
+    assert frozen(rotate.reset(seed=1)) == first
+
+
+def test_resets_without_a_seed_give_a_series_that_the_last_seed_decides(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=1)
+    series = [rotate.reset()[1]["seed"] for _ in range(3)]
+    rotate.reset(seed=1)
+    assert [rotate.reset()[1]["seed"] for _ in range(3)] == series
+    assert len(set(series)) == 3
+
+
+def test_domains_and_levels_have_different_episodes() -> None:
+    kinds = [("train", "user"), ("train", "eval"), ("L1", "user")]
+    observations = [
+        TabletopEnv("rotate", level=level, domain=domain).reset(seed=0)[0]["rgb"]["top"].tobytes()
+        for level, domain in kinds
+    ]
+    assert len(set(observations)) == len(kinds)
+
+
+def test_a_given_episode_is_loaded(rotate: TabletopEnv) -> None:
+    episode = sample_episode("rotate", level="L2", seed=11, domain="eval")
+    observation, info = rotate.reset(options={"episode": episode})
+    expected, _ = TabletopEnv("rotate", level="L2", domain="eval").reset(seed=11)
+    assert frozen(observation) == frozen(expected)
+    assert (info["level"], info["domain"], info["seed"]) == ("L2", "eval", 11)
+
+
+def test_unknown_reset_options_are_refused(rotate: TabletopEnv) -> None:
+    with pytest.raises(ConfigError, match="no option sede"):
+        rotate.reset(options={"sede": 1})
+    with pytest.raises(ConfigError, match="give an Episode"):
+        rotate.reset(options={"episode": 3})
+
+
+def test_info_names_what_is_on_the_table(rotate: TabletopEnv) -> None:
+    observation, info = rotate.reset(seed=5)
+    assert info["prompt"] == rotate.prompt.text == rotate.episode.problem.prompt.text
+    assert set(info["objects"]) == {placement.id for placement in rotate.scene.placements}
+    seen = set(np.unique(observation["segm"]["top"]).tolist())
+    assert set(info["objects"]) <= seen <= set(info["objects"]) | {0, 1, 255}
+    assert info["reason"] == ""
+    assert info["grasped"] is None
+
+
+def test_the_object_that_was_lifted_is_reported(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=5)
+    decision = rotate.oracle_decision()
+    assert rotate.step(decision.action)[4]["grasped"] == decision.pick_id
+
+
+def test_an_object_thrown_out_of_the_game_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = TabletopEnv("rotate")
+    env.reset(seed=5)
+    lost = Outcome(failure=True, reason="object 5 (red swirl flower) left the workspace")
+    progress = env.progress
+    monkeypatch.setattr("openvima.env.tabletop.goals.advance", lambda *_: (progress, lost))
+    _, reward, terminated, truncated, info = env.step(idle_action())
+    assert (reward, terminated, truncated) == (0.0, True, False)
+    assert info["reason"] == lost.reason
+
+
+def test_prompts_are_interleaved_and_objects_recorded(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=0)
+    parts = rotate.prompt.sequence()
+    images = [part for part in parts if not isinstance(part, str)]
+    assert images
+    for image in images:
+        assert image.rgb["front"].shape == (3, 128, 256)
+        shown = set(np.unique(image.segm["top"]).tolist()) - {0, 1, 255}
+        assert shown <= {record.object_id for record in image.objects}
+
+
+def test_frames_are_recorded_only_in_real_time(rotate: TabletopEnv) -> None:
+    realtime = TabletopEnv("rotate", realtime=True)
+    results = []
+    for env in (rotate, realtime):
+        env.reset(seed=6)
+        results.append(frozen(env.step(env.oracle_decision().action)))
+    assert results[0] == results[1]
+    assert rotate.frames == ()
+    assert len(realtime.frames) > 10
+    assert realtime.frames[0].joints.shape == (6,)
+    assert not np.array_equal(realtime.frames[0].joints, realtime.frames[5].joints)
+
+
+def test_rendering_shows_both_views() -> None:
+    env = TabletopEnv("rotate", render_mode="rgb_array")
+    observation, _ = env.reset(seed=0)
+    image = env.render()
+    assert np.array_equal(np.moveaxis(image[:128], -1, 0), observation["rgb"]["front"])
+    assert np.array_equal(np.moveaxis(image[128:], -1, 0), observation["rgb"]["top"])
+
+
+def test_closing_twice_is_fine_and_a_reset_opens_again() -> None:
+    env = TabletopEnv("rotate")
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    assert env.reset(seed=0)[1]["seed"] == 0
+
+
+def test_compat_starts_hovering() -> None:
+    settled, hovering = (TabletopEnv("visual_manipulation", compat=compat) for compat in (False, True))
+    for env in (settled, hovering):
+        env.reset(seed=0)
+    heights = [[p.pose.z for p in env.episode.problem.scene.placements] for env in (settled, hovering)]
+    assert max(heights[1]) > max(heights[0])
+
+
+def test_episodes_are_data() -> None:
+    env = TabletopEnv("rotate")
+    env.reset(seed=0)
+    assert dataclasses.is_dataclass(env.episode)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        env.episode.seed = 1  # type: ignore[misc]
