@@ -10,6 +10,7 @@ from openvima.catalog.geometry import (
     Vector3,
 )
 from openvima.catalog.objects import OBJECTS, ObjectKind, ObjectSpec, object_spec
+from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import (
     LEVEL_TITLES,
     LEVELS,
@@ -44,6 +45,7 @@ __all__ = [
     "TriangleMesh",
     "Vector3",
     "levels_of",
+    "load_assets",
     "object_spec",
     "pool",
     "tasks_at",

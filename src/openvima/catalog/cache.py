@@ -1,0 +1,62 @@
+"""Decoded and drawn images on disk, so that each is made once per machine."""
+
+import contextlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+_logger = logging.getLogger(__name__)
+
+
+def cache_dir() -> Path:
+    """Return the folder for derived files: $OPENVIMA_CACHE, else openvima in the user's cache folder.
+
+    The folder may not exist yet. Everything in it can be deleted at any time.
+    """
+    if own := os.environ.get("OPENVIMA_CACHE"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "openvima"
+
+
+def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.ndarray:
+    """Read an array from the cache, or build and store it.
+
+    A damaged file is replaced. Where the cache cannot be written the array is built each time.
+
+    Args:
+        group: Folder within the cache; it names the kind and version of its files.
+        key: File name without extension, unique in the group.
+        build: Makes the array.
+    """
+    path = cache_dir() / group / f"{key}.npy"
+    try:
+        return np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, EOFError) as error:
+        _logger.warning("%s is damaged (%s) and will be replaced", path, error)
+    array = build()
+    try:
+        _write(path, array)
+    except OSError as error:
+        _logger.info("%s was not cached: %s", path, error)
+    return array
+
+
+def _write(path: Path, array: np.ndarray) -> None:
+    """Write under another name, then rename: readers see a whole file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".part")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            np.save(file, array, allow_pickle=False)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise

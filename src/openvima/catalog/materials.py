@@ -1,0 +1,133 @@
+"""Pictures of materials: brick, tiles, wood, granite, plastic, tiger fur and magma."""
+
+import numpy as np
+
+from openvima.catalog.noise import hashed, layered_noise, value_noise
+
+_SIDE_PX = 256
+
+
+def brick() -> np.ndarray:
+    """Eighteen courses of seven salmon bricks in running bond, with beige mortar."""
+    course_px, brick_px, mortar_px = 14, 36, 2
+    row, column = np.indices((18 * course_px, 7 * brick_px))
+    course = row // course_px
+    along = (column + course % 2 * (brick_px // 2)) % (7 * brick_px)
+    mortar = (row % course_px < mortar_px) | (along % brick_px < mortar_px)
+    shade = hashed(course, along // brick_px, seed=11)
+    bricks = _blend((190, 121, 103), (174, 106, 88), shade)
+    grain = 14 * hashed(row, column, seed=12) - 7
+    return _to_image(np.where(mortar[..., None], (187, 152, 135), bricks) + grain[..., None])
+
+
+def tiles() -> np.ndarray:
+    """Round tiles in three pale colours, packed in sixteen rows of fourteen on dark grout."""
+    pitch, row_px, radius = 18, 16, 8.35
+    height, width = 16 * row_px, 14 * pitch
+    row, column = np.indices((height, width))
+    band = row // row_px
+    along = (column + band % 2 * (pitch // 2)) % width
+    tile = along // pitch
+    dx, dy = along % pitch + 0.5 - pitch / 2, row % row_px + 0.5 - row_px / 2
+    # A disc that is taller than its row is cut off at the border, as tiles that touch are.
+    inside = dx * dx + dy * dy < radius * radius
+    palette = np.array([(174, 183, 172), (125, 142, 150), (165, 138, 130)])
+    colour = palette[(3 * hashed(band, tile, seed=21)).astype(np.int64)]
+    tone = 20 * hashed(band, tile, seed=22) - 10 + 8 * hashed(row, column, seed=23) - 4
+    return _to_image(np.where(inside[..., None], colour + tone[..., None], (72, 67, 61)))
+
+
+def wooden() -> np.ndarray:
+    """A parquet of sixteen vertical strips in tans, with staggered joints and fine grain."""
+    strip_px, board_px = 16, 100
+    row, column = np.indices((_SIDE_PX, _SIDE_PX))
+    strip = column // strip_px
+    offset = (board_px * hashed(strip, seed=31)).astype(np.int64)
+    board = (row + offset) // board_px
+    tone = _blend((203, 155, 103), (231, 194, 150), hashed(strip, board, seed=32))
+    fibres = hashed(column, board, seed=33) + value_noise((_SIDE_PX, _SIDE_PX), (8, 128), seed=34) - 1
+    joint = (column % strip_px == 0) | ((row + offset) % board_px < 1)
+    return _to_image(tone + 14 * fibres[..., None] - np.where(joint, 30, 0)[..., None])
+
+
+def granite() -> np.ndarray:
+    """Pale grey-green stone, mottled, with irregular dark specks."""
+    shape = (_SIDE_PX, _SIDE_PX)
+    mottle = layered_noise(shape, (20, 20), seed=41, num_layers=2)
+    specks = layered_noise(shape, (44, 44), seed=42, num_layers=2)
+    dark = layered_noise(shape, (30, 30), seed=43, num_layers=2)
+    stone = np.array((196.0, 209.0, 203.0)) + 30 * (mottle[..., None] - 0.5)
+    stone = np.where(specks[..., None] > 0.64, (133.0, 144.0, 147.0), stone)
+    stone = np.where(dark[..., None] > 0.77, (60.0, 56.0, 66.0), stone)
+    return _to_image(stone + 10 * hashed(*np.indices(shape), seed=44)[..., None] - 5)
+
+
+def plastic() -> np.ndarray:
+    """Light grey film, crumpled: facets with bright and dark straight creases between them."""
+    row, column = np.indices((_SIDE_PX, _SIDE_PX))
+    x, y = 2.0 * column / _SIDE_PX - 1, 2.0 * row / _SIDE_PX - 1
+    tone = np.zeros((_SIDE_PX, _SIDE_PX))
+    for i in range(34):
+        a, b, c, d, e = (2 * float(hashed(i, k, seed=51)) - 1 for k in range(5))
+        side = a * x + b * y - 0.9 * c * (abs(a) + abs(b))
+        across = b * x - a * y - 0.8 * d * (abs(a) + abs(b))
+        short = np.abs(across) < 0.45 * (abs(a) + abs(b))  # creases end somewhere
+        distance = np.abs(side) / (abs(a) + abs(b))
+        tone += np.where(side > 0, 3.0, -3.0) * e
+        tone += np.where(short & (distance < 0.008), 16.0 if i % 2 else -13.0, 0.0)
+    return _to_image(np.array((224.0, 222.5, 222.0)) + np.clip(tone, -24, 26)[..., None])
+
+
+def tiger() -> np.ndarray:
+    """Orange fur with about twelve black, wavy, forking, roughly vertical stripes."""
+    shape = (_SIDE_PX, _SIDE_PX)
+    column = np.arange(_SIDE_PX)[None, :] / _SIDE_PX
+    wave = layered_noise(shape, (5, 3), seed=61, num_layers=3)
+    phase = (12 * column + 3.4 * wave) % 1.0
+    ridge = 2 * np.abs(phase - 0.5)  # 1 in the middle of a stripe, 0 between two
+    width = 0.06 + 0.60 * layered_noise(shape, (9, 6), seed=62, num_layers=2)
+    black = ridge > 1 - width
+    fur = _blend((205, 124, 22), (236, 172, 46), layered_noise(shape, (6, 6), seed=63, num_layers=2))
+    hair = 22 * value_noise(shape, (24, 128), seed=64) - 11
+    return _to_image(np.where(black[..., None], (9, 4, 4), fur + hair[..., None]))
+
+
+def magma() -> np.ndarray:
+    """Black crust broken by a net of glowing veins in a dark red haze."""
+    shape = (_SIDE_PX, _SIDE_PX)
+    gap = _distance_between_nearest(cells=9, seed=66)
+    gap = gap + 0.10 * (layered_noise(shape, (16, 16), seed=67, num_layers=2) - 0.5)
+    colours = np.array([(215, 92, 24), (168, 56, 13), (62, 12, 4), (10, 1, 1)], dtype=np.float64)
+    places = (0.0, 0.06, 0.20, 0.42)
+    channels = [np.interp(gap, places, colours[:, c]) for c in range(3)]
+    return _to_image(np.stack(channels, axis=-1))
+
+
+def _distance_between_nearest(*, cells: int, seed: int) -> np.ndarray:
+    """How much farther the second nearest of scattered points is than the nearest, in cells; 0 half-way."""
+    row, column = (np.indices((_SIDE_PX, _SIDE_PX)) + 0.5) * cells / _SIDE_PX
+    nearest = np.full((_SIDE_PX, _SIDE_PX), 9.0)
+    second = nearest.copy()
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            cell_row, cell_column = (
+                np.floor(row).astype(np.int64) + dr,
+                np.floor(column).astype(np.int64) + dc,
+            )
+            key = (cell_row % cells, cell_column % cells)
+            y, x = cell_row + hashed(*key, seed=seed), cell_column + hashed(*key, seed=seed + 100)
+            distance = np.sqrt((row - y) ** 2 + (column - x) ** 2)
+            second = np.minimum(second, np.maximum(nearest, distance))
+            nearest = np.minimum(nearest, distance)
+    return second - nearest
+
+
+def _blend(first: tuple[int, int, int], second: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
+    """Mix two colours; a share of 1 gives the second."""
+    start, end = np.array(first, dtype=np.float64), np.array(second, dtype=np.float64)
+    return start + (end - start) * share[..., None]
+
+
+def _to_image(colours: np.ndarray) -> np.ndarray:
+    # The small offset keeps whole numbers that arithmetic missed by a rounding error on their side.
+    return np.clip(np.floor(colours + 1e-6), 0, 255).astype(np.uint8)

@@ -1,0 +1,196 @@
+"""Building blocks of procedural shapes: prisms, bodies of revolution, and their collision hulls.
+
+All textures are laid on as if the image were draped over the shape from above: a top face shows it
+undistorted, a side face continues it downwards from its upper edge.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from openvima.catalog.geometry import CollisionHull, TriangleMesh, Vector3
+from openvima.catalog.triangulation import triangulate
+
+TEXTURE_PER_M = 3.5
+"""Texture widths per metre of surface, much as on the kit objects of the original pack."""
+
+
+def prism(
+    loops: Sequence[np.ndarray], z_low: float, z_high: float, *, texture_per_m: float = TEXTURE_PER_M
+) -> TriangleMesh:
+    """Extrude an outline upwards, with flat faces and sharp edges.
+
+    Args:
+        loops: Outer loop counter-clockwise, then holes clockwise; each shape (N, 2), metres.
+        z_low: Height of the lower face.
+        z_high: Height of the upper face.
+        texture_per_m: Texture widths per metre; the middle of the image lies over the origin.
+    """
+    points = np.concatenate(loops)
+    corners = triangulate(loops)
+    top = _at_height(points[corners], z_high)
+    bottom = _at_height(points[corners[:, ::-1]], z_low)
+    faces = [
+        TriangleMesh(top, _constant((0, 0, 1), top), _planar_uvs(points[corners], texture_per_m)),
+        TriangleMesh(
+            bottom, _constant((0, 0, -1), bottom), _planar_uvs(points[corners[:, ::-1]], texture_per_m)
+        ),
+    ]
+    faces += [_side_walls(loop, z_low, z_high, texture_per_m) for loop in loops]
+    return combined(faces)
+
+
+def revolved(
+    profile: Sequence[tuple[float, float]], num_sides: int, *, texture_radii: Sequence[float]
+) -> TriangleMesh:
+    """Turn a profile about the z axis, with normals that blend smoothly along and around it.
+
+    Args:
+        profile: Radius and height of successive points, metres; the outside is on the right-hand side of the
+            way, so an outer wall runs upwards and a floor seen from above runs inwards.
+        num_sides: Number of flat sides around.
+        texture_radii: Distance from the middle of the image, in texture widths, at each point of the profile.
+    """
+    points = np.array(profile, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    ring_normals = np.stack([steps[:, 1], -steps[:, 0]], axis=1)
+    ring_normals /= np.linalg.norm(ring_normals, axis=1, keepdims=True)
+    parts = []
+    for i in range(len(steps)):
+        start = ring_normals[max(i - 1, 0)] + ring_normals[i]
+        end = ring_normals[min(i + 1, len(steps) - 1)] + ring_normals[i]
+        ring = np.stack([points[i], points[i + 1]])
+        radii = np.array(texture_radii[i : i + 2], dtype=np.float64)
+        parts.append(_revolved_ring(ring, np.stack([start, end]), radii, num_sides))
+    return combined(parts)
+
+
+def combined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Put several meshes together, in order."""
+    return TriangleMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        np.concatenate([mesh.uvs for mesh in meshes]),
+    )
+
+
+def scaled(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
+    """Stretch a mesh along the axes; its texture stretches with it."""
+    if scale == (1.0, 1.0, 1.0):
+        return mesh
+    factors = np.array(scale)
+    normals = mesh.normals / factors
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    return TriangleMesh(mesh.vertices * factors, normals, mesh.uvs)
+
+
+def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
+    """Raise each point by `slope` metres per metre that it lies beyond `from_x`."""
+    vertices = mesh.vertices.copy()
+    vertices[..., 2] += slope * (vertices[..., 0] - from_x)
+    normals = mesh.normals.copy()
+    normals[..., 0] -= slope * normals[..., 2]
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    return TriangleMesh(vertices, normals, mesh.uvs)
+
+
+def convex_outline(points: np.ndarray) -> np.ndarray:
+    """Return the corners of the convex hull of points in the plane, counter-clockwise.
+
+    Args:
+        points: Shape (N, 2).
+
+    Source: Andrew, "Another efficient algorithm for convex hulls in two dimensions" (1979).
+    """
+    ordered = sorted({(float(x), float(y)) for x, y in points})
+
+    def half(sequence: list[tuple[float, float]]) -> list[tuple[float, float]]:
+        chain: list[tuple[float, float]] = []
+        for x, y in sequence:
+            while len(chain) > 1:
+                (ax, ay), (bx, by) = chain[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                chain.pop()
+            chain.append((x, y))
+        return chain[:-1]
+
+    return np.array(half(ordered) + half(ordered[::-1]))
+
+
+def slab_hull(points: np.ndarray, z_low: float, z_high: float) -> CollisionHull:
+    """Return the hull of an outline between two heights; holes and hollows are filled.
+
+    Args:
+        points: Shape (N, 2), metres.
+        z_low: Height of the lower face.
+        z_high: Height of the upper face.
+    """
+    corners = convex_outline(points)
+    return CollisionHull(np.concatenate([_at_height(corners, z_low), _at_height(corners, z_high)]))
+
+
+def _at_height(points: np.ndarray, z: float) -> np.ndarray:
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), z)], axis=-1)
+
+
+def _constant(normal: tuple[float, float, float], like: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(np.array(normal, dtype=np.float64), like.shape).copy()
+
+
+def _planar_uvs(points: np.ndarray, texture_per_m: float) -> np.ndarray:
+    return 0.5 + texture_per_m * points
+
+
+def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: float) -> TriangleMesh:
+    """Two triangles for each edge; the solid lies on the left of the loop."""
+    start, end = loop, np.roll(loop, -1, axis=0)
+    outward = np.stack([end[:, 1] - start[:, 1], start[:, 0] - end[:, 0]], axis=1)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    folded = outward * (z_high - z_low)  # where the lower edge would be if the wall were folded up flat
+    corners = {
+        "low start": (_at_height(start, z_low), start + folded),
+        "low end": (_at_height(end, z_low), end + folded),
+        "high end": (_at_height(end, z_high), end),
+        "high start": (_at_height(start, z_high), start),
+    }
+    vertices, flat = [], []
+    for names in (("low start", "low end", "high end"), ("low start", "high end", "high start")):
+        vertices.append(np.stack([corners[name][0] for name in names], axis=1))
+        flat.append(np.stack([corners[name][1] for name in names], axis=1))
+    normal = np.repeat(np.concatenate([outward, outward])[:, None], 3, axis=1)
+    uvs = _planar_uvs(np.concatenate(flat), texture_per_m)
+    return TriangleMesh(np.concatenate(vertices), _at_height(normal, 0.0), uvs)
+
+
+def _revolved_ring(
+    ring: np.ndarray, normals: np.ndarray, texture_radii: np.ndarray, num_sides: int
+) -> TriangleMesh:
+    """Faces between two circles.
+
+    Args:
+        ring: Radius and height of the first and the second circle, shape (2, 2).
+        normals: Radial and upward part of the normal at both, shape (2, 2), any length.
+        texture_radii: Distance from the middle of the image at both, shape (2,).
+        num_sides: Number of flat sides.
+    """
+    angles = 2 * np.pi * np.arange(num_sides + 1) / num_sides
+    around = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)  # equal bits on any machine
+    around[-1] = around[0]
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit = normals / lengths
+
+    def corner(level: int, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        direction = around[side : side + num_sides]
+        position = np.concatenate(
+            [direction * ring[level, 0], np.full((num_sides, 1), ring[level, 1])], axis=1
+        )
+        normal = np.concatenate([direction * unit[level, 0], np.full((num_sides, 1), unit[level, 1])], axis=1)
+        return position, normal, 0.5 + texture_radii[level] * direction
+
+    faces = []
+    if ring[0, 0] > 0:
+        faces.append((corner(0, 0), corner(0, 1), corner(1, 1)))
+    if ring[1, 0] > 0:
+        faces.append((corner(0, 0), corner(1, 1), corner(1, 0)))
+    return combined([TriangleMesh(*(np.stack(part, axis=1) for part in zip(*f, strict=True))) for f in faces])

@@ -1,0 +1,48 @@
+"""Choosing an asset pack by name or folder."""
+
+from functools import lru_cache
+from pathlib import Path
+
+from openvima.catalog.geometry import Assets
+from openvima.catalog.procedural import ProceduralAssets
+from openvima.errors import AssetError, unknown_name
+
+ASSET_PACKS = ("procedural",)
+"""Packs that have a name; any other is the path of a checkout of the original benchmark."""
+
+
+def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
+    """Return an asset pack; each is loaded once per process.
+
+    Args:
+        assets: "procedural" for the shapes and textures made by code, the path of a checkout of the original
+            benchmark for its meshes and images, or a pack, which is returned as it is.
+
+    Raises:
+        AssetError: The name is unknown, or the folder holds no complete original pack.
+
+    Example:
+        >>> load_assets("procedural").texture("blue")
+        array([[[ 78, 121, 167]]], dtype=uint8)
+    """
+    if not isinstance(assets, str | Path):
+        return assets
+    if assets == "procedural":
+        return _procedural()
+    folder = Path(assets).expanduser()
+    if not folder.is_dir():
+        hint = "Allowed: 'procedural', or the folder of a checkout of the original benchmark."
+        raise AssetError(unknown_name("asset pack or folder", str(assets), ASSET_PACKS, hint))
+    return _original(folder.resolve())
+
+
+@lru_cache(maxsize=1)
+def _procedural() -> Assets:
+    return ProceduralAssets()
+
+
+@lru_cache(maxsize=4)
+def _original(checkout: Path) -> Assets:
+    from openvima.catalog.original import OriginalAssets  # reads image files, which the default pack does not
+
+    return OriginalAssets(checkout)

@@ -1,0 +1,55 @@
+"""The default asset pack: every shape and texture made by code."""
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from openvima.catalog import images, materials, noise, patterns
+from openvima.catalog.bodies import build_geometry, has_fixed_size
+from openvima.catalog.cache import cached_array
+from openvima.catalog.geometry import Geometry, Vector3
+from openvima.catalog.textures import texture_spec
+
+_DRAWING_MODULES = (images, materials, noise, patterns)
+_GEOMETRIES_KEPT = 1024  # containers come in any size, so the memory of shapes needs a bound
+
+
+class ProceduralAssets:
+    """Shapes and textures made by code; needs no files. Build one per process: it remembers what it made."""
+
+    name = "procedural"
+
+    def __init__(self) -> None:
+        self._textures: dict[str, np.ndarray] = {}
+        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(build_geometry)
+
+    def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
+        """Return the shape of a catalogue object; see `Assets.geometry`."""
+        if has_fixed_size(object_name):
+            size = (0.0, 0.0, 0.0)  # one entry for all sizes
+        return self._build(object_name, size, scale)
+
+    def texture(self, texture_name: str) -> np.ndarray:
+        """Return the texture's image; see `Assets.texture`."""
+        if texture_name not in self._textures:
+            self._textures[texture_name] = _load_texture(texture_name)
+        return self._textures[texture_name]
+
+
+def _load_texture(texture_name: str) -> np.ndarray:
+    spec = texture_spec(texture_name)
+    if spec.colour is not None:
+        return images.draw_texture(texture_name)
+    group = f"procedural-textures-{_drawing_version()}"
+    return cached_array(group, spec.id.lower(), lambda: images.draw_texture(texture_name))
+
+
+@lru_cache(maxsize=1)
+def _drawing_version() -> str:
+    """Digest of the drawing code: a change to it makes the cached images unused."""
+    digest = hashlib.sha256()
+    for module in _DRAWING_MODULES:
+        digest.update(Path(str(module.__file__)).read_bytes())
+    return digest.hexdigest()[:16]
