@@ -1,1 +1,40 @@
-"""Scoring policies."""
+"""Scoring policies on the four levels, and showing what came out."""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from openvima.evaluation.picture import save_episode_picture
+    from openvima.evaluation.protocol import EvaluationConfig
+    from openvima.evaluation.report import write_report
+    from openvima.evaluation.results import EpisodeOutcome, Results, Row
+    from openvima.evaluation.runner import evaluate
+    from openvima.evaluation.statistics import wilson_interval
+
+_HOMES = {
+    "EpisodeOutcome": "results",
+    "EvaluationConfig": "protocol",
+    "Results": "results",
+    "Row": "results",
+    "evaluate": "runner",
+    "save_episode_picture": "picture",
+    "wilson_interval": "statistics",
+    "write_report": "report",
+}
+
+__all__ = [
+    "EpisodeOutcome",
+    "EvaluationConfig",
+    "Results",
+    "Row",
+    "evaluate",
+    "save_episode_picture",
+    "wilson_interval",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> object:  # films and the simulator are loaded by what needs them
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"openvima.evaluation.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -88,7 +88,9 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
     try:
         return tuple(_clip(record, index.parent) for record in json.loads(index.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{index} is damaged ({error}); delete {index.parent} and evaluate again.") from error
+        raise DatasetError(
+            f"{index} is damaged ({error}); delete {index.parent} and evaluate again."
+        ) from error
 
 
 def _clip(record: dict[str, Any], folder: Path) -> Clip:  # Any: JSON

@@ -22,7 +22,7 @@ _ENLARGE = 4  # pictures are drawn at this multiple before they are scaled down 
 class _Piece:
     """A word or a picture, with its size and the space in front of it, in pixels."""
 
-    content: "str | Image.Image"
+    content: str | Image.Image
     width: int
     height: int
     space: int
@@ -132,7 +132,7 @@ def _fitting(pieces: list[_Piece], width: int) -> list[_Piece]:
     """Scale down pictures that are wider than a line."""
     fitting = []
     for piece in pieces:
-        if isinstance(piece.content, Image.Image) and piece.width > width:
+        if not isinstance(piece.content, str) and piece.width > width:
             height = max(1, piece.height * width // piece.width)
             picture = piece.content.resize((width, height), Image.Resampling.BOX)
             piece = _Piece(picture, width, height, piece.space)

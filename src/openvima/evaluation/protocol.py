@@ -1,7 +1,7 @@
 """The protocol of an evaluation: which policies play which tasks at which levels on which seeds.
 
-Episodes are grouped into batches before anything runs, in a way that depends on the protocol alone. Workers take
-whole batches, so their number changes neither the batches nor the results.
+Episodes are grouped into batches before anything runs, in a way that depends on the protocol alone. Workers
+take whole batches, so their number changes neither the batches nor the results.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from openvima.catalog.partitions import LEVELS
-from openvima.errors import ConfigError, LevelError, unknown_name
+from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
 from openvima.tasks.registry import list_tasks, task_spec
 
 ORACLE = "oracle"
@@ -35,6 +35,7 @@ class EvaluationConfig:
         assets: "procedural", or a checkout of the original benchmark.
         batch: Episodes that are played together, so that a policy decides for all of them at once.
         videos: Filmed episodes of each policy and task, for the report.
+        report: Whether to film and to write `report.html`; needs the extra `report`.
         force: Overwrite results of another evaluation in `out`.
     """
 
@@ -48,6 +49,7 @@ class EvaluationConfig:
     assets: str = "procedural"
     batch: int = 16
     videos: int = 1
+    report: bool = True
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -105,7 +107,8 @@ class PolicySource:
         """What the policy is; for a trained one with a hash of its weights.
 
         Raises:
-            ConfigError: There is no such run folder.
+            UnknownPolicyError: There is no such run folder.
+            CheckpointError: The run folder holds no weights.
         """
         if self.kind != "run":
             return {"kind": self.kind}
@@ -133,14 +136,17 @@ def weights_hash(path: Path) -> str:
     """SHA-256 over the files of weights in a run folder, or over one checkpoint file, as hexadecimal text.
 
     Raises:
-        ConfigError: There is no such file or folder, or the folder holds no weights.
+        UnknownPolicyError: There is no such file or folder.
+        CheckpointError: The folder holds no weights.
     """
     if not path.exists():
         hint = unknown_name("policy", str(path), NAMED_POLICIES)
-        raise ConfigError(f"{hint} Or give the folder of a training run.")
+        raise UnknownPolicyError(f"{hint} Or give the folder of a training run.")
     files = [path] if path.is_file() else sorted(f for f in path.rglob("*") if f.suffix in _WEIGHTS)
     if not files:
-        raise ConfigError(f"{path} holds no weights ({', '.join(_WEIGHTS)}); give the folder of a training run.")
+        raise CheckpointError(
+            f"{path} holds no weights ({', '.join(_WEIGHTS)}); give the folder of a training run."
+        )
     digest = hashlib.sha256()
     for file in files:
         with open(file, "rb") as stream:
@@ -186,37 +192,37 @@ class Batch:
 
 
 def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
-    """Pairs of task and level to play, levels first in order.
+    """Pairs of task and level to play, by level and then by task.
 
-    With "all", a level's tasks are those that it holds; a task named explicitly must be held by every level.
+    A task is left out at levels that do not hold it, as `sweep_without_exceeding` at L3.
 
     Raises:
         UnknownTaskError: There is no such task.
-        LevelError: There is no such level, or it does not hold a named task.
+        LevelError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: No level holds any of the tasks.
     """
     for level in config.levels:
         if level not in LEVELS:
             raise LevelError(unknown_name("level", level, LEVELS))
-    known = list_tasks()
-    if "all" in config.tasks:
-        pairs = [(task, level) for level in config.levels for task in known if level in task_spec(task).levels]
-        if not pairs:
-            raise ConfigError(f"levels {', '.join(config.levels)} hold none of the tasks {', '.join(known)}.")
-        return pairs
-    missing = [
-        f"{task} is not defined at {level} (only at {', '.join(task_spec(task).levels)})"
-        for level in config.levels
-        for task in config.tasks
-        if level not in task_spec(task).levels
+    tasks = dict.fromkeys(list_tasks() if "all" in config.tasks else config.tasks)
+    pairs = [
+        (task, level)
+        for level in dict.fromkeys(config.levels)
+        for task in tasks
+        if level in task_spec(task).levels
     ]
-    if missing:
-        raise LevelError(f"{'; '.join(missing)}. Leave it out, or give --tasks all to take what each level holds.")
-    return [(task, level) for level in config.levels for task in config.tasks]
+    asked = ", ".join(config.levels)
+    stranded = [task for task in tasks if task not in {task for task, _ in pairs}]
+    if stranded and "all" not in config.tasks:
+        where = "; ".join(f"{task} exists at {', '.join(task_spec(task).levels)}" for task in stranded)
+        raise LevelError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
+    if not pairs:
+        raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
+    return pairs
 
 
 def plan(config: EvaluationConfig) -> list[Batch]:
-    """Divide an evaluation into batches: by policy, level and task, then by seed in steps of `config.batch`."""
+    """Divide an evaluation into batches: by policy, level and task, then by `config.batch` seeds."""
     return [
         Batch(
             policy=policy.name,

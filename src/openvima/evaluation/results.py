@@ -64,6 +64,11 @@ class Row:
         return sum(outcome.success for outcome in self.outcomes)
 
     @property
+    def rate(self) -> float:
+        """Share of solved episodes."""
+        return self.successes / self.episodes
+
+    @property
     def successes_strict(self) -> int:
         """Number of episodes solved in no more steps than the oracle may take."""
         return sum(outcome.success and outcome.steps <= self.oracle_max_steps for outcome in self.outcomes)
@@ -215,7 +220,7 @@ def _row_record(row: Row) -> dict[str, object]:
         "level": row.level,
         "successes": row.successes,
         "episodes": row.episodes,
-        "rate": _rounded(row.successes / row.episodes),
+        "rate": _rounded(row.rate),
         "interval": [_rounded(end) for end in row.interval],
         "successes_strict": row.successes_strict,
         "oracle_max_steps": row.oracle_max_steps,

@@ -11,7 +11,7 @@ from openvima.evaluation.results import Results
 # Stand-ins that matplotlib draws with; the page's colours replace them, see `_themed`.
 _INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
 _PANEL_WIDTH_IN = 3.9
-_STYLE = {
+_STYLE: Any = {  # Any: the type of matplotlib's settings is not public
     "svg.hashsalt": "openvima",  # element names in the file are the same in every run
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -43,22 +43,23 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
         An `<svg>` element.
     """
     tasks, policies = results.tasks(level), results.policy_names()
-    height_in = 0.55 + len(tasks) * (0.16 + 0.13 * len(policies))
-    figure, axes = _panel(height_in, margins_in=(0.08, 0.3, 0.1, 0.05))
-    spread = 0.62 / max(1, len(policies) - 1) if len(policies) > 1 else 0.0
+    lines_a_task = len(policies) + 1.6  # the task's name stands above its dots
+    num_lines = lines_a_task * len(tasks)
+    figure, axes = _panel(0.45 + 0.155 * num_lines, margins_in=(0.12, 0.3, 0.22, 0.05))
     for task_index, task in enumerate(tasks):
-        axes.text(0, task_index - 0.47, task, fontsize=9.5, color=_INK, va="center")
+        top = task_index * lines_a_task
+        axes.text(0, top + 0.55, task, fontsize=9.5, color=_INK, va="center")
         for index, policy in enumerate(policies):
             row = results.row(policy, task, level)
             if row is None:
                 continue
-            y = task_index + (index - (len(policies) - 1) / 2) * spread + 0.08
+            y = top + 1.55 + index
             low, high = (100 * end for end in row.interval)
             colour = _series(colours[policy])
-            axes.plot([low, high], [y, y], color=colour, linewidth=2.2, alpha=0.45, solid_capstyle="round")
-            axes.plot([100 * row.successes / row.episodes], [y], "o", color=colour, markersize=5.5)
+            axes.plot([low, high], [y, y], color=colour, linewidth=2.4, alpha=0.45, solid_capstyle="round")
+            axes.plot([100 * row.rate], [y], "o", color=colour, markersize=5)
     axes.set_xlim(-2, 102)
-    axes.set_ylim(len(tasks) - 0.4, -0.65)
+    axes.set_ylim(num_lines, -0.2)
     axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
     axes.set_yticks([])
     axes.tick_params(length=0)
@@ -85,7 +86,9 @@ def curve_chart(
         steps = [step for step, _ in points]
         values = [100 * value if percent else value for _, value in points]
         marker = "o" if len(points) < 30 else ""
-        axes.plot(steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=name)
+        axes.plot(
+            steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=name
+        )
     if percent:
         axes.set_ylim(-2, 102)
         axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
@@ -93,7 +96,7 @@ def curve_chart(
     axes.set_xlabel("step")
     axes.tick_params(length=0)
     if len(curves) > 1:
-        axes.legend(frameon=False, fontsize=9)
+        axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
     return _themed(figure, f"curve-{re.sub(r'[^a-z]+', '-', title.lower())}", title, variables)
 
 

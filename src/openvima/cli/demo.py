@@ -1,0 +1,46 @@
+"""`openvima demo`: film the oracle or a policy at work on one task."""
+
+from pathlib import Path
+
+import tyro
+
+
+def main(
+    task: tyro.conf.Positional[str],
+    *,
+    out: Path = Path("demo.mp4"),
+    seed: int = 0,
+    level: str = "train",
+    policy: str = "oracle",
+    assets: str = "procedural",
+) -> int:
+    """Film one episode: the prompt above, the table and the arm below.
+
+    Example: openvima demo rotate --seed 3 --out rotate.mp4
+
+    Args:
+        task: Name of the task; `openvima tasks` lists them.
+        out: MP4 file to write.
+        seed: Number of the episode.
+        level: train, L1, L2, L3 or L4.
+        policy: oracle, random, untrained, or the folder of a training run.
+        assets: procedural, or the folder of a checkout of the original benchmark.
+
+    Returns:
+        Exit status; it does not tell whether the task was solved.
+    """
+    from openvima.tasks import task_spec
+
+    task_spec(task).pool(level)  # before what takes a second to load
+    from openvima.env.tabletop import TabletopEnv
+    from openvima.evaluation.film import film_episode
+    from openvima.evaluation.players import load_player
+    from openvima.evaluation.protocol import Batch
+
+    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, assets=assets)
+    env = TabletopEnv(task, level=level, domain="user", assets=assets, realtime=True)
+    title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
+    outcome = film_episode(env, load_player(batch), seed, out, title=title)
+    ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
+    print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {outcome.steps} steps")
+    return 0

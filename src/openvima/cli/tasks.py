@@ -1,0 +1,58 @@
+"""`openvima tasks`: list the tasks."""
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from openvima.tasks import TaskSpec
+
+
+def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """List the tasks: what the robot is told, its tool, the levels, the steps.
+
+    Example: openvima tasks
+
+    Args:
+        as_json: Print JSON instead of a table.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.tasks import list_tasks, task_spec
+
+    specs = [task_spec(name) for name in list_tasks()]
+    if as_json:
+        print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    if not console.is_terminal:  # a file or a pipe takes long lines
+        console = Console(width=150)
+    table = Table(title=f"{len(specs)} tasks", show_lines=True)
+    for name in ("task", "family", "prompt", "tool", "levels", "steps"):
+        table.add_column(name, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
+    for spec in specs:
+        family, steps = spec.family.replace("_", " "), f"{spec.oracle_max_steps} + 2"
+        # prompts hold braces and brackets that rich would read as markup
+        table.add_row(spec.name, family, Text(spec.template), spec.end_effector, " ".join(spec.levels), steps)
+    console.print(table)
+    console.print("steps: those that the oracle may take, and what a policy is given on top")
+    return 0
+
+
+def _record(spec: "TaskSpec") -> dict[str, object]:
+    return {
+        "name": spec.name,
+        "family": spec.family,
+        "summary": spec.summary,
+        "prompt": spec.template,
+        "end_effector": spec.end_effector,
+        "levels": list(spec.levels),
+        "oracle_max_steps": spec.oracle_max_steps,
+        "max_steps": spec.max_steps,
+    }

@@ -1,0 +1,87 @@
+"""Playing a batch of episodes: all environments step together, the policy decides for all of them at once."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import ActionError, OracleError, PolicyError
+from openvima.evaluation.players import Decision, Player
+from openvima.evaluation.results import EpisodeOutcome, failure_kind
+
+NOTHING_PICKED = "nothing was picked up within the step limit"
+OUT_OF_STEPS = "not done within the step limit"
+BAD_ACTION = "invalid action"
+NO_ORACLE_ACTION = "the oracle has no action"
+
+
+class _Seat:
+    """One environment of a batch, with what is known of its episode."""
+
+    def __init__(self, env: TabletopEnv, seed: int) -> None:
+        self.env = env
+        self.seed = seed
+        self.steps = 0
+        self.has_grasped = False
+        self.outcome: EpisodeOutcome | None = None
+        self.observation: dict[str, Any] | None = env.reset(seed=seed)[0]  # None once the episode is over
+
+    def step(self, decision: Decision) -> None:
+        """Take one step, unless there is no usable action; then the episode has failed."""
+        if isinstance(decision, OracleError):
+            return self._end(str(decision), NO_ORACLE_ACTION)
+        if decision is None:
+            raise PolicyError(f"the policy gave no action for seed {self.seed}, whose episode is not over.")
+        try:
+            self.observation, _, terminated, truncated, info = self.env.step(decision)
+        except ActionError as error:
+            return self._end(str(error), BAD_ACTION)
+        self.steps += 1
+        self.has_grasped |= info["grasped"] is not None
+        if info["success"]:
+            self.observation, self.outcome = None, EpisodeOutcome(self.seed, True, self.steps)
+        elif terminated:
+            self._end(info["reason"], failure_kind(info["reason"]))
+        elif truncated:
+            picks = info["end_effector"] == "suction"
+            reason = NOTHING_PICKED if picks and not self.has_grasped else OUT_OF_STEPS
+            self._end(reason, reason)
+        return None
+
+    def _end(self, reason: str, kind: str) -> None:
+        self.observation = None
+        self.outcome = EpisodeOutcome(self.seed, False, self.steps, reason, kind)
+
+
+def play(
+    envs: Sequence[TabletopEnv],
+    seeds: Sequence[int],
+    player: Player,
+    *,
+    after_step: Callable[[TabletopEnv], None] | None = None,
+) -> list[EpisodeOutcome]:
+    """Play one episode in each environment.
+
+    Args:
+        envs: Environments of one task and level.
+        seeds: Seed of the episode of each.
+        player: Who decides.
+        after_step: Called with an environment after each of its steps, for filming.
+
+    Returns:
+        How each episode ended, in the order of `seeds`.
+
+    Raises:
+        PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
+    """
+    seats = [_Seat(env, seed) for env, seed in zip(envs, seeds, strict=True)]
+    player.begin(envs)
+    while any(seat.outcome is None for seat in seats):
+        decisions = player.decide([seat.observation for seat in seats])
+        if len(decisions) != len(seats):
+            raise PolicyError(f"the policy gave {len(decisions)} actions for {len(seats)} observations.")
+        for seat, decision in zip(seats, decisions, strict=True):
+            if seat.outcome is None:
+                seat.step(decision)
+                if after_step is not None:
+                    after_step(seat.env)
+    return [seat.outcome for seat in seats if seat.outcome is not None]
