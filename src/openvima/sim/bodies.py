@@ -129,9 +129,9 @@ def _compile(bodies: Sequence[BodyShape], with_blade: bool) -> mujoco.MjModel:
     spec.memory = _MEMORY_BYTES
     spec.option.timestep = TICK_S
     spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
-    spec.option.tolerance = (
-        1e-10  # MuJoCo before 4.0 relates it to the mean inertia, which the blade dominates
-    )
+    spec.option.tolerance = 1e-10  # before 4.0 relative to the mean inertia, which the blade dominates
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would turn friction towards its edges
+    spec.option.impratio = 10.0  # friction as stiff as this against creeping
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [5.0, 5.0, 1.0], "pos": [0.0, 0.0, FLOOR_Z_M]}
     spec.worldbody.add_geom(**floor, **_contact(friction=0.0))
     assets: dict[str, bytes] = {}
