@@ -38,8 +38,8 @@ def tiles() -> np.ndarray:
 
 
 def wooden() -> np.ndarray:
-    """A parquet of sixteen vertical strips in tans, with staggered joints and fine grain."""
-    strip_px, board_px = 16, 100
+    """A parquet of narrow vertical strips in tans, with staggered joints and fine grain."""
+    strip_px, board_px = 8, 128
     row, column = np.indices((_SIDE_PX, _SIDE_PX))
     strip = column // strip_px
     offset = (board_px * hashed(strip, seed=31)).astype(np.int64)
@@ -47,35 +47,38 @@ def wooden() -> np.ndarray:
     tone = _blend((203, 155, 103), (231, 194, 150), hashed(strip, board, seed=32))
     fibres = hashed(column, board, seed=33) + value_noise((_SIDE_PX, _SIDE_PX), (8, 128), seed=34) - 1
     joint = (column % strip_px == 0) | ((row + offset) % board_px < 1)
-    return _to_image(tone + 14 * fibres[..., None] - np.where(joint, 30, 0)[..., None])
+    return _to_image(tone + 14 * fibres[..., None] - np.where(joint, 16, 0)[..., None])
 
 
 def granite() -> np.ndarray:
     """Pale grey-green stone, mottled, with irregular dark specks."""
     shape = (_SIDE_PX, _SIDE_PX)
-    mottle = layered_noise(shape, (20, 20), seed=41, num_layers=2)
-    specks = layered_noise(shape, (44, 44), seed=42, num_layers=2)
-    dark = layered_noise(shape, (30, 30), seed=43, num_layers=2)
-    stone = np.array((196.0, 209.0, 203.0)) + 30 * (mottle[..., None] - 0.5)
-    stone = np.where(specks[..., None] > 0.64, (133.0, 144.0, 147.0), stone)
-    stone = np.where(dark[..., None] > 0.77, (60.0, 56.0, 66.0), stone)
+    mottle = layered_noise(shape, (16, 16), seed=41, num_layers=3)
+    cloud = 0.22 * layered_noise(shape, (12, 12), seed=45, num_layers=1)
+    specks = layered_noise(shape, (64, 48), seed=42, num_layers=2) + cloud
+    dark = layered_noise(shape, (48, 40), seed=43, num_layers=2) + cloud
+    stone = np.array((197.0, 210.0, 204.0)) + 44 * (mottle[..., None] - 0.5)
+    stone = np.where(specks[..., None] > 0.75, (136.0, 147.0, 150.0), stone)
+    stone = np.where(dark[..., None] > 0.86, (62.0, 58.0, 74.0), stone)
     return _to_image(stone + 10 * hashed(*np.indices(shape), seed=44)[..., None] - 5)
 
 
 def plastic() -> np.ndarray:
-    """Light grey film, crumpled: facets with bright and dark straight creases between them."""
+    """Light grey film, crumpled: faint facets with short bright and dark creases in all directions."""
     row, column = np.indices((_SIDE_PX, _SIDE_PX))
-    x, y = 2.0 * column / _SIDE_PX - 1, 2.0 * row / _SIDE_PX - 1
+    x, y = column / _SIDE_PX, row / _SIDE_PX
     tone = np.zeros((_SIDE_PX, _SIDE_PX))
-    for i in range(34):
-        a, b, c, d, e = (2 * float(hashed(i, k, seed=51)) - 1 for k in range(5))
-        side = a * x + b * y - 0.9 * c * (abs(a) + abs(b))
-        across = b * x - a * y - 0.8 * d * (abs(a) + abs(b))
-        short = np.abs(across) < 0.45 * (abs(a) + abs(b))  # creases end somewhere
-        distance = np.abs(side) / (abs(a) + abs(b))
-        tone += np.where(side > 0, 3.0, -3.0) * e
-        tone += np.where(short & (distance < 0.008), 16.0 if i % 2 else -13.0, 0.0)
-    return _to_image(np.array((224.0, 222.5, 222.0)) + np.clip(tone, -24, 26)[..., None])
+    for i in range(90):
+        px, py, dx, dy, length = (float(hashed(i, k, seed=51)) for k in range(5))
+        dx, dy = dx - 0.5, dy - 0.5
+        norm = max(abs(dx), abs(dy), 0.05)
+        along = ((x - px) * dx + (y - py) * dy) / norm
+        across = ((x - px) * dy - (y - py) * dx) / norm
+        reach = 0.05 + 0.13 * length
+        near = 1 - np.abs(along) / reach  # the crease ends in a point
+        tone += np.where((near > 0) & (across > 0) & (across < 0.05), 3.0 if i % 3 else -4.0, 0.0)
+        tone += np.where((near > 0) & (np.abs(across) < 0.011 * near), 19.0 if i % 3 else -16.0, 0.0)
+    return _to_image(np.array((221.8, 220.3, 219.8)) + np.clip(tone, -30, 30)[..., None])
 
 
 def tiger() -> np.ndarray:
@@ -93,33 +96,16 @@ def tiger() -> np.ndarray:
 
 
 def magma() -> np.ndarray:
-    """Black crust broken by a net of glowing veins in a dark red haze."""
+    """Black crust broken by a net of thin glowing veins in a dark red haze."""
     shape = (_SIDE_PX, _SIDE_PX)
-    gap = _distance_between_nearest(cells=9, seed=66)
-    gap = gap + 0.10 * (layered_noise(shape, (16, 16), seed=67, num_layers=2) - 0.5)
-    colours = np.array([(215, 92, 24), (168, 56, 13), (62, 12, 4), (10, 1, 1)], dtype=np.float64)
-    places = (0.0, 0.06, 0.20, 0.42)
-    channels = [np.interp(gap, places, colours[:, c]) for c in range(3)]
+    # Veins run where a noise crosses its middle value; where it is steep they are thin.
+    wide = np.abs(layered_noise(shape, (7, 7), seed=66, num_layers=3) - 0.5)
+    fine = np.abs(layered_noise(shape, (12, 12), seed=67, num_layers=2) - 0.5)
+    distance = np.minimum(wide, 0.014 + 0.7 * fine)
+    colours = np.array([(240, 110, 32), (186, 66, 16), (70, 13, 4), (8, 1, 1)], dtype=np.float64)
+    places = (0.0, 0.016, 0.045, 0.085)
+    channels = [np.interp(distance, places, colours[:, c]) for c in range(3)]
     return _to_image(np.stack(channels, axis=-1))
-
-
-def _distance_between_nearest(*, cells: int, seed: int) -> np.ndarray:
-    """How much farther the second nearest of scattered points is than the nearest, in cells; 0 half-way."""
-    row, column = (np.indices((_SIDE_PX, _SIDE_PX)) + 0.5) * cells / _SIDE_PX
-    nearest = np.full((_SIDE_PX, _SIDE_PX), 9.0)
-    second = nearest.copy()
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            cell_row, cell_column = (
-                np.floor(row).astype(np.int64) + dr,
-                np.floor(column).astype(np.int64) + dc,
-            )
-            key = (cell_row % cells, cell_column % cells)
-            y, x = cell_row + hashed(*key, seed=seed), cell_column + hashed(*key, seed=seed + 100)
-            distance = np.sqrt((row - y) ** 2 + (column - x) ** 2)
-            second = np.minimum(second, np.maximum(nearest, distance))
-            nearest = np.minimum(nearest, distance)
-    return second - nearest
 
 
 def _blend(first: tuple[int, int, int], second: tuple[int, int, int], share: np.ndarray) -> np.ndarray:

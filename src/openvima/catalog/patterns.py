@@ -38,7 +38,7 @@ _RAINBOW = (
     (130, (254, 0, 0)),
     (149, (254, 0, 0)),
 )
-_PAISLEY_PX = 256
+_PAISLEY_PX, _PAISLEY_GRID = 256, 6
 _PAISLEY_WHITE: Colour = (254, 247, 240)
 
 
@@ -97,9 +97,9 @@ def rainbow() -> np.ndarray:
 def paisley(ground: Colour) -> np.ndarray:
     """Off-white drops with a curl and an inner ornament, flowers and dots; continues across its borders."""
     canvas = np.zeros((_PAISLEY_PX, _PAISLEY_PX), dtype=bool)
-    for i in range(25):
+    for i in range(_PAISLEY_GRID**2):
         _paint_drop(canvas, i)
-    for i in range(400):
+    for i in range(1500):
         _paint_filler(canvas, i)
     return two_colours(canvas, _PAISLEY_WHITE, ground)
 
@@ -129,20 +129,16 @@ _HEADINGS = tuple(
 
 
 def _paint_drop(canvas: np.ndarray, index: int) -> None:
-    """Paint one drop, in a jittered cell of a 5 × 5 grid."""
-    cell = _PAISLEY_PX * 16 // 5  # in sixteenths of a pixel, like all lengths here
+    """Paint one drop, in a jittered cell of a square grid whose rows are shifted alternately."""
+    cell = _PAISLEY_PX * 16 // _PAISLEY_GRID  # in sixteenths of a pixel, like all lengths here
+    row, column = divmod(index, _PAISLEY_GRID)
     dice = [float(hashed(index, k, seed=80)) for k in range(5)]
-    x = (
-        (index % 5) * cell
-        + cell // 2
-        + int((dice[0] - 0.5) * 0.35 * cell)
-        + (cell // 2 if index // 5 % 2 else 0)
-    )
-    y = (index // 5) * cell + cell // 2 + int((dice[1] - 0.5) * 0.35 * cell)
+    x = column * cell + int((0.5 + 0.3 * (dice[0] - 0.5)) * cell) + (cell // 2 if row % 2 else 0)
+    y = row * cell + int((0.5 + 0.3 * (dice[1] - 0.5)) * cell)
     heading, bend = int(16 * dice[2]), 1 if dice[3] < 0.5 else -1
-    size = 170 + int(50 * dice[4])  # radius of the round end
-    for shrink, value in ((256, True), (186, False), (116, True), (50, False)):
-        _paint_tapered(canvas, (x, y), heading, bend, size * shrink // 256, value)
+    size = 160 + int(60 * dice[4])  # radius of the round end
+    for share, value in ((272, False), (256, True), (172, False), (124, True), (44, False)):
+        _paint_tapered(canvas, (x, y), heading, bend, size * share // 256, value)
 
 
 def _paint_tapered(
@@ -152,35 +148,41 @@ def _paint_tapered(
     x, y = centre
     steps = 14
     for step in range(steps):
-        disc = radius * (steps - step) // steps
-        _paint_disc(canvas, (x, y), disc, value)
+        _paint_disc(canvas, (x, y), radius * (steps - step) // steps, value)
         dx, dy = _HEADINGS[(heading + bend * (step // 3)) % 16]
-        stride = radius * 2 // 10
+        stride = radius // 6
         x, y = x + dx * stride // 1000, y + dy * stride // 1000
 
 
 def _paint_filler(canvas: np.ndarray, index: int) -> None:
-    """Paint a flower or a dot where there is still room for it."""
-    x, y, kind = (float(hashed(index, k, seed=81)) for k in range(3))
+    """Paint a flower, a small drop or a dot where there is still room for it."""
+    x, y, kind, turn = (float(hashed(index, k, seed=81)) for k in range(4))
     centre = (int(x * _PAISLEY_PX) * 16 + 8, int(y * _PAISLEY_PX) * 16 + 8)
-    reach = 152 if index < 150 else 56
-    if canvas[_disc_mask(centre, reach)].any():
+    reach = 160 if index < 300 else 110 if index < 700 else 54
+    rows, columns, inside = _disc(centre, reach)
+    if (canvas[np.ix_(rows, columns)] & inside).any():
         return
-    if reach < 100:
-        _paint_disc(canvas, centre, 30 if kind < 0.5 else 22, True)
-        return
-    for dx, dy in _HEADINGS[::3]:
-        _paint_disc(canvas, (centre[0] + dx * 66 // 1000, centre[1] + dy * 66 // 1000), 38, True)
-    _paint_disc(canvas, centre, 28, False)
+    if reach == 160:
+        for dx, dy in _HEADINGS[::2]:
+            _paint_disc(canvas, (centre[0] + dx * 88 // 1000, centre[1] + dy * 88 // 1000), 38, True)
+        _paint_disc(canvas, centre, 42, True)
+    elif reach == 110:
+        _paint_tapered(canvas, centre, int(16 * turn), 1 if kind < 0.5 else -1, 60, True)
+    else:
+        _paint_disc(canvas, centre, 34 if kind < 0.5 else 26, True)
 
 
 def _paint_disc(canvas: np.ndarray, centre: tuple[int, int], radius: int, value: bool) -> None:
-    canvas[_disc_mask(centre, radius)] = value
+    rows, columns, inside = _disc(centre, radius)
+    place = np.ix_(rows, columns)
+    canvas[place] = np.where(inside, value, canvas[place])
 
 
-def _disc_mask(centre: tuple[int, int], radius: int) -> np.ndarray:
-    """Pixels whose middle lies in a disc, across the borders; lengths in sixteenths of a pixel."""
-    period = _PAISLEY_PX * 16
-    places = np.arange(_PAISLEY_PX) * 16 + 8
-    dx, dy = ((places - c + period // 2) % period - period // 2 for c in centre)
-    return dx[None, :] ** 2 + dy[:, None] ** 2 <= radius * radius
+def _disc(centre: tuple[int, int], radius: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns and mask of a disc that goes on across the borders; lengths in sixteenths of a pixel."""
+    (columns, dx), (rows, dy) = (
+        (span % _PAISLEY_PX, span * 16 + 8 - c)
+        for c in centre
+        for span in (np.arange((c - radius) // 16, (c + radius) // 16 + 1),)
+    )
+    return rows, columns, dx[None, :] ** 2 + dy[:, None] ** 2 <= radius * radius
