@@ -334,6 +334,11 @@ class Bodies:
         self.data.qvel[:] = 0.0
         self.data.qacc_warmstart[:] = 0.0
 
+    def limit_speed(self, top_speed: float) -> None:
+        """Slow down bodies whose horizontal velocity has a component above `top_speed`, m/s."""
+        horizontal = self._velocities[:, :2]
+        np.clip(horizontal, -top_speed, top_speed, out=horizontal)
+
     def speeds(self, *, apart_from: int | None = None) -> tuple[float, float]:
         """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies.
 
@@ -349,12 +354,22 @@ class Bodies:
 
     def lowest_z(self, index: int, quaternion: Quaternion) -> float:
         """Height of a body's lowest touching point above its link frame, in metres, in a given attitude."""
-        x, y, z, w = quaternion
-        up = np.array(
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]
-        )  # world z, in the body
         points = self.shapes[index].points
-        return float((points[:, :3] @ up - points[:, 3]).min(initial=np.inf))
+        heights = points[:, :3] @ _up(quaternion) - points[:, 3]
+        return float(heights.min(initial=np.inf))
+
+    def highest_z(self, index: int) -> float:
+        """Present height of a body's highest touching point, in metres."""
+        pose = self.pose(index)
+        points = self.shapes[index].points
+        heights = points[:, :3] @ _up(pose.quaternion) + points[:, 3]
+        return pose.z + float(heights.max(initial=-np.inf))
+
+
+def _up(quaternion: Quaternion) -> np.ndarray:
+    """The world's z axis in the frame of a body with that attitude, shape (3,)."""
+    x, y, z, w = quaternion
+    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
 
 
 def _numbers(pose: Pose) -> tuple[float, ...]:

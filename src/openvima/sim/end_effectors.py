@@ -11,7 +11,8 @@ REACH_RESERVE_M = 0.005  # kept below the highest point that the arm can reach
 # Suction: a thin needle that ends below the arm's tip.
 NEEDLE_BELOW_TIP_M = 0.003
 NEEDLE_RADIUS_M = 1e-4  # of the shape that is lowered; the axis itself, nearly
-CAPTURE_RADIUS_M = 0.003  # a body this near to the axis is still caught: 2–4 mm measured in VIMA-Bench
+TOUCH_RADIUS_M = 0.001  # the needle's true radius: a body this near to the axis is hit from above
+CAPTURE_RADIUS_M = 0.003  # … and one this near is still caught if only floor is below: 2–4 mm measured in VIMA-Bench
 
 # Spatula: an upright blade, its width across the direction of travel.
 BLADE_HALF_SIZE_M: Vector3 = (0.0025, 0.025, 0.0575)  # along the travel, across it, up

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.scene import Action, Placement, Pose, Scene
+from openvima.scene.pose import rotate
 from openvima.sim import end_effectors as tools
 from openvima.sim import settling, ur5
 from openvima.sim.arm_path import SWEEP_SPEED, ArmPath, reachable_joints
@@ -18,7 +19,6 @@ from openvima.sim.bodies import FLOOR_Z_M, TICK_S, Bodies
 from openvima.sim.touch import body_gap, gap, way_to_touch
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
-BLADE_DESCENT_M_S = 0.77  # VIMA-Bench lowers its tool by 0.29 m in about 90 ticks
 RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
 STILL_M = 5e-5  # a body that physics moved by less than this, and turned by less than …
 STILL_RAD = 5e-4  # … this, keeps its pose: nothing creeps, however many steps an episode has
@@ -67,14 +67,19 @@ class Stage:
             self._unwatched_ticks = 0
             self._watch(self.scene(held))
 
-    def settle(self, held: tuple[int, Pose] | None = None) -> None:
+    def settle(
+        self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None
+    ) -> None:
         """Run physics until all is at rest; the arm's next move happens meanwhile."""
 
         def each(num_ticks: int) -> None:
             self.count_ticks(num_ticks, held)
             self.path.store(num_ticks, scene=lambda: self.scene(held))
 
-        _, completed = settling.settle(self.bodies, apart_from=held[0] if held else None, each=each)
+        held_index = held[0] if held else None
+        _, completed = settling.settle(
+            self.bodies, apart_from=held_index, top_speed=top_speed, each=each
+        )
         self.completed = self.completed and completed
 
     def finish(self) -> Scene:
@@ -146,42 +151,44 @@ def pick_place(stage: Stage, action: Action) -> int | None:
 def body_under_needle(bodies: Bodies, x: float, y: float) -> tuple[int | None, float]:
     """Which body a needle meets that is lowered at (x, y), in metres, and at what height.
 
-    The body whose surface is highest at the point; where there is none, the one nearest to it within the capture
-    radius. The radius counts from where a body touches, so hulls are caught up to 4 mm beside their edge.
+    Of the bodies that the needle hits, the highest; if it hits none, the nearest within the capture radius.
+    Distances count from where a body touches, so hulls are caught up to 4 mm beside their edge.
 
     Returns:
         Index of the body, or None for the floor; height of its surface in metres.
     """
-    bodies.place_needle(x, y, _ABOVE_ALL_M)
-    bodies.refresh()
-    near = [
-        index
-        for index, shape in enumerate(bodies.shapes)
-        if math.hypot(bodies.pose(index).x - x, bodies.pose(index).y - y)
-        < shape.radius_m + tools.CAPTURE_RADIUS_M
-    ]
-    deepest = _ABOVE_ALL_M - FLOOR_Z_M
-    ways = {index: _needle_way(bodies, index, deepest) for index in near}
-    hit = {index: way for index, way in ways.items() if way is not None}
-    if hit:
-        index = min(hit, key=hit.__getitem__)
-        return index, _ABOVE_ALL_M - hit[index]
-    bodies.place_needle(x, y, FLOOR_Z_M)
-    bodies.refresh()
-    gaps = {index: _needle_gap(bodies, index) for index in near}
+    gaps = _gaps_to_axis(bodies, x, y)
     nearest = min(gaps, key=gaps.__getitem__, default=None)
     if nearest is None or gaps[nearest] > tools.CAPTURE_RADIUS_M:
         return None, FLOOR_Z_M
-    return nearest, max(FLOOR_Z_M, bodies.pose(nearest).z)
+    tops = {
+        index: _surface_z(bodies, index, x, y) for index in gaps if gaps[index] <= tools.TOUCH_RADIUS_M
+    } or {nearest: _surface_z(bodies, nearest, x, y)}
+    highest = max(tops, key=tops.__getitem__)
+    return highest, tops[highest]
 
 
-def _needle_way(bodies: Bodies, index: int, deepest: float) -> float | None:
+def _gaps_to_axis(bodies: Bodies, x: float, y: float) -> dict[int, float]:
+    """Distances in metres of the bodies near a vertical line to it; negative where it pierces one."""
+    bodies.place_needle(x, y, FLOOR_Z_M)
+    bodies.refresh()
+    needle = bodies.needle_geom
+    return {
+        index: min((gap(bodies, needle, geom) for geom in bodies.geoms(index)), default=math.inf)
+        for index, shape in enumerate(bodies.shapes)
+        if math.hypot(bodies.pose(index).x - x, bodies.pose(index).y - y)
+        < shape.radius_m + tools.CAPTURE_RADIUS_M
+    }
+
+
+def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
+    """Height at which a needle lowered at (x, y) meets a body; of the body's top if it goes down beside it."""
+    bodies.place_needle(x, y, _ABOVE_ALL_M)
+    bodies.refresh()
     needle = (bodies.needle_geom,)
-    return way_to_touch(bodies, needle, bodies.geoms(index), direction=_DOWN, length_m=deepest)
-
-
-def _needle_gap(bodies: Bodies, index: int) -> float:
-    return min((gap(bodies, bodies.needle_geom, geom) for geom in bodies.geoms(index)), default=math.inf)
+    depth = _ABOVE_ALL_M - FLOOR_Z_M
+    way = way_to_touch(bodies, needle, bodies.geoms(index), direction=_DOWN, length_m=depth)
+    return bodies.highest_z(index) if way is None else _ABOVE_ALL_M - way
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,17 +322,10 @@ class _Blade:
         path, scene = self._stage.path, self._stage.start
         path.move(self._joints(), scene=lambda _: scene)
         down = reachable_joints(x, y, tools.SWEEP_TIP_Z_M, self._yaw_rad)
-        depth = self._tip_z - tools.SWEEP_TIP_Z_M
-        self._bodies.place_blade(self._pose())
-        self._bodies.refresh()
-        free = way_to_touch(
-            self._bodies, (self._bodies.blade_geom,), self._pushed, direction=_DOWN, length_m=depth
-        )
         path.move(down, scene=lambda _: scene)
-        self._tip_z -= depth if free is None else free
-        if free is not None:
-            self._press(_DOWN, depth - free, BLADE_DESCENT_M_S)
         self._tip_z = tools.SWEEP_TIP_Z_M
+        if any([self._make_room(index) for index in self._bodies.rigid]):
+            self._wait()
 
     def push(self, x: float, y: float) -> None:
         """Move the lowered blade to a point in a straight line."""
@@ -350,6 +350,31 @@ class _Blade:
         self._tip_z = tools.SWEEP_HOVER_TIP_Z_M
         stage.path.move(self._joints(), scene=lambda _: after)
 
+    def _make_room(self, index: int) -> bool:
+        """Shift a body that stands where the blade comes down to the nearest side of it; whether it was there.
+
+        Squeezing a body between blade and floor in the physics would fling it away; in VIMA-Bench, it is nudged.
+        """
+        pose = self._bodies.pose(index)
+        blade = self._pose()
+        corners = blade.inverse().transform(pose.transform(self._bodies.shapes[index].points[:, :3]))
+        half = np.array(tools.BLADE_HALF_SIZE_M)
+        low, high = corners.min(axis=0) - half, corners.max(axis=0) + half  # body grown by the blade
+        if not len(corners) or (low >= 0).any() or (high <= 0).any():
+            return False
+        shifts = [(-low[0], 0.0), (-high[0], 0.0), (0.0, -low[1]), (0.0, -high[1])]
+        along, across = min(shifts, key=lambda shift: abs(shift[0]) + abs(shift[1]))
+        dx, dy, _ = rotate(blade.quaternion, (along, across, 0.0))
+        self._bodies.place(index, pose.moved(dx, dy))
+        return True
+
+    def _wait(self) -> None:
+        """Run physics with the blade at rest until all others are, too."""
+        for _ in range(settling.SETTLE_LIMIT_TICKS // _STRIDE_TICKS):
+            self._run(_STRIDE_TICKS, (0.0, 0.0, 0.0))
+            if self._is_calm():
+                return
+
     def _slide(self, direction: tuple[float, float, float], length: float) -> float:
         """Move on, without physics, to just before the first body; return the way that is left."""
         self._bodies.stop()
@@ -368,17 +393,19 @@ class _Blade:
         """Move on by a length under physics, at constant speed whatever stands in the way."""
         left = max(1, round(length / (speed * TICK_S)))
         step = length / left
-        velocity = (direction[0] * speed, direction[1] * speed, direction[2] * speed)
+        velocity = (direction[0] * speed, direction[1] * speed, 0.0)
         while left:
             ticks = min(_STRIDE_TICKS, left)
-            self._bodies.place_blade(self._pose(), velocity)
-            self._bodies.tick(ticks)
+            self._run(ticks, velocity)
             left -= ticks
             self._x += direction[0] * step * ticks
             self._y += direction[1] * step * ticks
-            self._tip_z += direction[2] * step * ticks
-            self._stage.count_ticks(ticks)
-            self._stage.path.stay(ticks, scene=self._stage.scene, joints=self._joints)
+
+    def _run(self, num_ticks: int, velocity: tuple[float, float, float]) -> None:
+        self._bodies.place_blade(self._pose(), velocity)
+        self._bodies.tick(num_ticks)
+        self._stage.count_ticks(num_ticks)
+        self._stage.path.stay(num_ticks, scene=self._stage.scene, joints=self._joints)
 
     def _film(self, direction: tuple[float, float, float], length: float) -> None:
         """Record the frames of a stretch in which nothing is touched."""

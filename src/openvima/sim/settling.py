@@ -13,13 +13,19 @@ _QUIET_STRIDES = 2  # in a row, so that a body at the turning point of its motio
 
 
 def settle(
-    bodies: Bodies, *, apart_from: int | None = None, each: Callable[[int], None] | None = None
+    bodies: Bodies,
+    *,
+    apart_from: int | None = None,
+    top_speed: float | None = None,
+    each: Callable[[int], None] | None = None,
 ) -> tuple[int, bool]:
     """Run until every free body has been slow for 10 ticks, or the limit is reached; then stop all.
 
     Args:
         bodies: The bodies; their velocities are zero afterwards.
         apart_from: A body whose motion does not count, such as a parked one.
+        top_speed: Bound of the horizontal speed in m/s, for bodies that begin inside one another: they shall
+            part, not fly apart.
         each: Called after every 5 ticks with that number.
 
     Returns:
@@ -28,6 +34,8 @@ def settle(
     num_ticks = quiet = 0
     while quiet < _QUIET_STRIDES and num_ticks < SETTLE_LIMIT_TICKS:
         bodies.tick(_STRIDE_TICKS)
+        if top_speed is not None:
+            bodies.limit_speed(top_speed)
         num_ticks += _STRIDE_TICKS
         speed, turning = bodies.speeds(apart_from=apart_from)
         quiet = quiet + 1 if speed < SETTLED_SPEED and turning < SETTLED_TURNING else 0

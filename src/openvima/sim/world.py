@@ -12,6 +12,9 @@ from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
 
 
+_PARTING_SPEED = 0.1  # m/s, with which bodies that were loaded overlapping part; like the benchmark's, they stop
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Execution:
     """What one primitive did.
@@ -91,7 +94,7 @@ class World:
         path = ArmPath(self._joints, record, frames_per_second)
         stage = primitives.Stage(self._scene, self._bodies, path, watch)
         if not self._is_settled:
-            stage.settle()
+            stage.settle(top_speed=_PARTING_SPEED)
             self._is_settled = True
         grasped = self._perform(stage, action)
         self._scene = stage.finish()
