@@ -36,10 +36,10 @@ def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.nd
     path = cache_dir() / group / f"{key}.npy"
     try:
         return np.load(path, allow_pickle=False)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError, EOFError) as error:
-        _logger.warning("%s is damaged (%s) and will be replaced", path, error)
+        _logger.warning("%s cannot be read (%s); it will be made anew", path, error)
     array = build()
     try:
         _write(path, array)

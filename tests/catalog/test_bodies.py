@@ -1,0 +1,169 @@
+"""Procedural shapes: sound meshes, the benchmark's measures, and hulls that rest where they should."""
+
+import numpy as np
+import pytest
+
+from openvima.catalog.bodies import build_geometry
+from openvima.catalog.geometry import CollisionBox, CollisionHull
+from openvima.catalog.objects import OBJECTS, object_spec
+from openvima.catalog.outlines import outline
+from openvima.catalog.triangulation import signed_area
+from openvima.errors import AssetError, UnknownObjectError
+
+USED = [name for name in OBJECTS if name not in ("stand", "disk")]
+KIT = [name for name in USED if OBJECTS[name].kind == "kit"]
+FLOOR_Z = -0.001
+HULL_MARGIN = 0.001  # hulls touch the floor at this distance
+
+
+def build(name, scale=(1.0, 1.0, 1.0)):
+    return build_geometry(name, object_spec(name).size_max, scale)
+
+
+def face_normals(mesh):
+    """Normals of length twice the area."""
+    corners = mesh.vertices
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def collision_points(geometry):
+    points = []
+    for shape in geometry.collision:
+        if isinstance(shape, CollisionBox):
+            points += [np.array(shape.centre) + np.array(shape.half_size) * sign for sign in (-1, 1)]
+        else:
+            points += list(shape.points)
+    return np.array(points)
+
+
+@pytest.mark.parametrize("name", USED)
+def test_a_mesh_is_well_formed(name):
+    mesh = build(name).visual
+    assert mesh.vertices.shape == mesh.normals.shape == (*mesh.uvs.shape[:2], 3)
+    assert all(array.dtype == np.float64 for array in (mesh.vertices, mesh.normals, mesh.uvs))
+    assert np.linalg.norm(mesh.normals, axis=2) == pytest.approx(1.0)
+    assert mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
+    assert np.linalg.norm(face_normals(mesh), axis=1).min() > 0
+
+
+@pytest.mark.parametrize("name", USED)
+def test_corners_run_counter_clockwise_seen_from_outside(name):
+    mesh = build(name).visual
+    normals = face_normals(mesh)
+    assert np.einsum("fi,fki->fk", normals, mesh.normals).min() > 0
+    assert np.einsum("fi,fi->f", mesh.vertices[:, 0], normals).sum() / 6 > 0  # the enclosed volume
+
+
+@pytest.mark.parametrize("name", [*KIT, "frame", "bowl"])
+def test_a_mesh_has_no_gaps(name):
+    vertices = np.round(build(name).visual.vertices, 9)
+    edges = set()
+    for triangle in vertices:
+        corners = [tuple(corner) for corner in triangle.tolist()]
+        edges |= {(corners[k], corners[(k + 1) % 3]) for k in range(3)}
+    assert edges == {(end, start) for start, end in edges}
+
+
+@pytest.mark.parametrize("name", USED)
+def test_meshes_are_small_enough_to_draw_quickly(name):
+    assert len(build(name).visual.vertices) <= (600 if name in ("bowl", "pan") else 210)
+
+
+@pytest.mark.parametrize("name", USED)
+def test_hulls_and_boxes_touch_the_floor_at_the_rest_height(name):
+    geometry = build(name)
+    if not geometry.collision:
+        assert name in ("line", "three-sided rectangle")
+        return
+    margin = HULL_MARGIN if isinstance(geometry.collision[0], CollisionHull) else 0.0
+    lowest = geometry.rest_z_m + collision_points(geometry)[:, 2].min()
+    assert lowest == pytest.approx(FLOOR_Z + margin, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", KIT)
+def test_kit_objects_and_their_hulls_scale_together(name):
+    plain, tall = build(name), build(name, (1.2, 0.8, 2.0))
+    assert tall.visual.vertices == pytest.approx(plain.visual.vertices * (1.2, 0.8, 2.0))
+    assert collision_points(tall) == pytest.approx(collision_points(plain) * (1.2, 0.8, 2.0))
+    assert np.linalg.norm(tall.visual.normals, axis=2) == pytest.approx(1.0)
+
+
+def test_the_bowl_is_hollow_and_centred():
+    geometry = build("bowl")
+    vertices = geometry.visual.vertices.reshape(-1, 3)
+    assert np.abs(vertices.min(axis=0) + vertices.max(axis=0))[:2].max() < 0.002
+    inside = vertices[np.hypot(vertices[:, 0], vertices[:, 1]) < 0.05]
+    assert inside[:, 2].max() < 0.01
+    assert len(geometry.collision) == 14
+    walls = [part for part in geometry.collision[1:] if isinstance(part, CollisionHull)]
+    assert min(np.hypot(*part.points[:, :2].T).min() for part in walls) > 0.065
+
+
+def test_the_pan_has_one_hull_with_a_lid():
+    (hull,) = build("pan").collision
+    assert isinstance(hull, CollisionHull)
+    assert hull.points[:, 0].max() == pytest.approx(0.208, abs=1e-3)
+
+
+def test_holes_stay_open_in_what_is_drawn():
+    assert [len(outline(name)) for name in ("letter A", "letter R", "ring", "letter E")] == [2, 2, 2, 1]
+
+
+def test_a_small_block_shows_a_quarter_of_its_texture():
+    mesh = build("small block").visual
+    top = mesh.uvs[mesh.normals[:, 0, 2] == 1]
+    assert np.ptp(top.reshape(-1, 2), axis=0) == pytest.approx(0.25)
+
+
+def test_a_long_line_never_repeats_its_texture():
+    uvs = build_geometry("line", (0.9, 0.04, 0.001)).visual.uvs
+    assert uvs.min() >= 0 and uvs.max() <= 1
+
+
+def test_containers_follow_the_sampled_size():
+    vertices = build_geometry("container", (0.16, 0.15, 0.05)).visual.vertices
+    assert vertices[..., 0].max() == pytest.approx(0.081)
+    assert vertices[..., 1].max() == pytest.approx(0.076)
+
+
+def test_unusable_sizes_and_objects_are_refused():
+    with pytest.raises(AssetError, match="first 3 lengths must be above 0"):
+        build_geometry("block", (0.07, 0.07, 0.0))
+    with pytest.raises(AssetError, match="factors must be above 0"):
+        build_geometry("ring", (0.1, 0.1, 0.1), (1.0, 0.0, 1.0))
+    with pytest.raises(AssetError, match="no procedural shape for 'disk'"):
+        build("disk")
+    with pytest.raises(UnknownObjectError, match="Did you mean 'ring'"):
+        build_geometry("rign", (0.1, 0.1, 0.1))
+
+
+def records(catalogue):
+    return {record["name"]: record for record in catalogue["objects"]}
+
+
+@pytest.mark.parametrize("name", [name for name in USED if name != "container"])
+def test_measures_are_those_of_the_benchmark_within_3_mm(catalogue, name):
+    record = records(catalogue)[name]
+    ours = build(name).visual.vertices.reshape(-1, 3)
+    theirs_low, theirs_high = np.array(record["bounds_min"]), np.array(record["bounds_max"])
+    if name == "bowl":  # which the benchmark draws beside its origin
+        middle = (theirs_low + theirs_high)[:2] / 2
+        theirs_low[:2] -= middle
+        theirs_high[:2] -= middle
+    assert ours.min(axis=0) == pytest.approx(theirs_low, abs=0.003)
+    assert ours.max(axis=0) == pytest.approx(theirs_high, abs=0.003)
+
+
+@pytest.mark.parametrize("name", [*KIT, "frame", "pallet"])
+def test_top_areas_are_those_of_the_benchmark_within_5_percent(catalogue, name):
+    mesh = build(name).visual
+    normals = face_normals(mesh)
+    top = (mesh.vertices[..., 2] > mesh.vertices[..., 2].max() - 1e-6).all(axis=1) & (normals[:, 2] > 0)
+    area = normals[top, 2].sum() / 2
+    assert area == pytest.approx(records(catalogue)[name]["top_area"], rel=0.05)
+
+
+@pytest.mark.parametrize("name", KIT)
+def test_outlines_are_oriented(name):
+    areas = [signed_area(loop) for loop in outline(name)]
+    assert areas[0] > 0 and all(area < 0 for area in areas[1:])
