@@ -33,7 +33,7 @@ def _overview(folder: Path, manifest: dict[str, Any]) -> str:  # Any: JSON
     lines = [
         f"{folder}: {counts['episodes']} episodes, {counts['steps']} steps, "
         f"{counts['shards']} shards, {size_mb:.1f} MB",
-        f"level {config['level']}, domain {config['domain']}, seeds from {config['seed']}, "
+        f"level {config['level']}, domain {config['domain']}, seeds from {config['start_seed']}, "
         f"assets {config['assets']}",
         ", ".join(f"{name} {version}" for name, version in sorted(manifest["versions"].items())),
         "",

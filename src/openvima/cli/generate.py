@@ -32,19 +32,19 @@ def main(
         level: Which objects and textures may occur: train, L1, L2, L3 or L4.
         workers: Number of processes.
         seed: First seed.
-        shard_size: Episodes in a file; by default an eighth of the episodes, 1000 at most. Give it to be able
+        shard_size: Episodes in a file; by default an eighth of them, but 4 to 1000. Give it to be able
             to ask for more episodes later.
         assets: "procedural", or the folder of the original asset pack.
         force: Delete the data set that is in the folder.
     """
-    from openvima.data.generate import GenerateConfig, generate
+    from openvima.data import GenerateConfig, generate
 
     config = GenerateConfig(
         out=out,
         tasks=tuple(name.strip() for name in tasks.split(",") if name.strip()),
         episodes=episodes,
         level=level,
-        seed=seed,
+        start_seed=seed,
         shard_size=shard_size,
         workers=workers,
         assets=assets,

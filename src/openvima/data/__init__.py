@@ -4,7 +4,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from openvima.data.generate import GenerateConfig, generate
+    from openvima.data.generation import GenerateConfig, generate
     from openvima.data.reader import Dataset, Shard
     from openvima.data.records import Demonstration, rollout_oracle
     from openvima.data.writer import ShardWriter
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
-    "GenerateConfig": "generate",
+    "GenerateConfig": "generation",
     "Shard": "reader",
     "ShardWriter": "writer",
-    "generate": "generate",
+    "generate": "generation",
     "rollout_oracle": "records",
 }
 

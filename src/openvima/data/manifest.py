@@ -75,7 +75,7 @@ def manifest_bytes(rows: Sequence[Row], *, config: Mapping[str, Any], versions: 
 
 def _joint_hash(rows: Sequence[Row]) -> str:
     joined = "".join(row["content_hash"] for row in rows)
-    return hashlib.blake2b(joined.encode(), digest_size=16).hexdigest()
+    return hashlib.sha256(joined.encode()).hexdigest()[:32]
 
 
 def _task_counts(rows: Sequence[Row]) -> dict[str, object]:

@@ -135,9 +135,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         manifest = json.loads(path.read_text(encoding="utf-8"))
         written_as = manifest["schema"]
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
-        raise DatasetError(
-            f"{path} is damaged; {_REPAIR}."
-        ) from None
+        raise DatasetError(f"{path} is damaged; {_REPAIR}.") from None
     if written_as != SCHEMA_VERSION:
         raise DatasetError(f"{path} has schema {written_as}; this package reads {SCHEMA_VERSION}.")
     return manifest
@@ -152,19 +150,14 @@ def _opened(path: Path, columns: list[int] | None = None) -> pa.RecordBatchFileR
     try:
         return pa.ipc.open_file(pa.memory_map(str(path)), options=options)
     except FileNotFoundError:
-        raise ShardError(
-            f"there is no file {path}; {_REPAIR}."
-        ) from None
+        raise ShardError(f"there is no file {path}; {_REPAIR}.") from None
     except (pa.ArrowInvalid, OSError) as error:
         raise ShardError(_damaged(path, "it", error)) from None
 
 
 def _damaged(path: Path, what: str, error: Exception) -> str:
     reason = str(error).splitlines()[0]
-    return (
-        f"{path}: {what} cannot be read, so it is truncated or no shard ({reason}). "
-        f"Delete it; {_REPAIR}."
-    )
+    return f"{path}: {what} cannot be read, so it is truncated or no shard ({reason}). Delete it; {_REPAIR}."
 
 
 def _read_index(folder: Path) -> pa.Table:
@@ -172,13 +165,9 @@ def _read_index(folder: Path) -> pa.Table:
     try:
         return pq.read_table(BytesIO(path.read_bytes()), use_threads=False)
     except FileNotFoundError:
-        raise DatasetError(
-            f"{path} is missing; {_REPAIR}."
-        ) from None
+        raise DatasetError(f"{path} is missing; {_REPAIR}.") from None
     except (pa.ArrowInvalid, OSError):
-        raise DatasetError(
-            f"{path} is damaged; {_REPAIR}."
-        ) from None
+        raise DatasetError(f"{path} is damaged; {_REPAIR}.") from None
 
 
 def _of_tasks(index: pa.Table, tasks: Sequence[str], folder: Path) -> pa.Table:
@@ -193,6 +182,5 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         raise DatasetError(
-            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}; "
-            f"{_REPAIR}."
+            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}; {_REPAIR}."
         )

@@ -89,11 +89,11 @@ class Demonstration:
         Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
         versions of the packages do not count.
         """
-        digest = hashlib.blake2b(digest_size=16)
+        digest = hashlib.sha256()
         for part in _content(self):
-            digest.update(len(part).to_bytes(8, "little"))
+            digest.update(memoryview(part).nbytes.to_bytes(8, "little"))
             digest.update(part)
-        return digest.hexdigest()
+        return digest.hexdigest()[:32]
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
@@ -157,21 +157,21 @@ def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:
     return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
 
 
-def _content(demo: Demonstration) -> Iterator[bytes]:
+def _content(demo: Demonstration) -> Iterator[bytes | np.ndarray]:
     """All content in a fixed order: texts and small numbers as JSON, arrays as little-endian bytes."""
     yield json.dumps(_summary(demo), sort_keys=True).encode()
     for view in sorted(demo.rgb):
-        yield from (_array_bytes(demo.rgb[view], "u1"), _array_bytes(demo.segm[view], "u1"))
+        yield from (_plain(demo.rgb[view], "u1"), _plain(demo.segm[view], "u1"))
     for image in demo.prompt.images.values():
         for view in sorted(image.rgb):
-            yield from (_array_bytes(image.rgb[view], "u1"), _array_bytes(image.segm[view], "u1"))
+            yield from (_plain(image.rgb[view], "u1"), _plain(image.segm[view], "u1"))
     for action in demo.actions:
         for key in ACTION_SHAPES:
-            yield _array_bytes(np.array(getattr(action, key)), "<f4")
-    yield from (_array_bytes(path, "<f4") for path in demo.joint_paths)
+            yield _plain(np.array(getattr(action, key)), "<f4")
+    yield from (_plain(path, "<f4") for path in demo.joint_paths)
     for scene in demo.scenes:
         poses = [[*p.pose.position, *p.pose.quaternion] for p in scene.placements]
-        yield _array_bytes(np.array(poses), "<f8")
+        yield _plain(np.array(poses), "<f8")
 
 
 def _summary(demo: Demonstration) -> dict:
@@ -190,5 +190,6 @@ def _summary(demo: Demonstration) -> dict:
     }
 
 
-def _array_bytes(array: np.ndarray, dtype: str) -> bytes:
-    return np.ascontiguousarray(array, dtype=dtype).tobytes()
+def _plain(array: np.ndarray, dtype: str) -> np.ndarray:
+    """The array flat, in one piece and with little-endian values."""
+    return np.ascontiguousarray(array, dtype=dtype).reshape(-1)

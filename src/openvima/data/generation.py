@@ -19,6 +19,7 @@ from openvima.tasks import list_tasks, task_spec
 
 DOMAIN = "train"
 LARGEST_SHARD = 1000  # episodes, about 25 MB
+SMALLEST_SHARD = 4
 SHARDS_PER_TASK = 8  # of a small data set, so that several workers have something to do
 # A shard may try this many seeds for each episode that it needs, and some more; a task of which the oracle
 # solves so few needs repair rather than patience.
@@ -37,8 +38,8 @@ class GenerateConfig:
         tasks: Names of the tasks; ("all",) means all that the level has.
         episodes: Successful episodes of each task.
         level: "train" or "L1" to "L4".
-        seed: First seed.
-        shard_size: Episodes in a file; None chooses an eighth of `episodes`, 1,000 at most.
+        start_seed: First seed.
+        shard_size: Episodes in a file; None chooses an eighth of `episodes`, but 4 … 1,000.
         workers: Number of processes.
         assets: "procedural", or the folder of the original asset pack.
         force: Delete a data set that is in the folder.
@@ -48,7 +49,7 @@ class GenerateConfig:
     tasks: tuple[str, ...] = ("all",)
     episodes: int = 100
     level: str = "train"
-    seed: int = 0
+    start_seed: int = 0
     shard_size: int | None = None
     workers: int = 1
     assets: str = "procedural"
@@ -59,7 +60,7 @@ class GenerateConfig:
             f"{name} is {value}; it must be at least {least}."
             for name, value, least in (
                 ("episodes", self.episodes, 1),
-                ("seed", self.seed, 0),
+                ("start_seed", self.start_seed, 0),
                 ("shard_size", self.shard_size, 1),
                 ("workers", self.workers, 1),
             )
@@ -85,7 +86,8 @@ class GenerateConfig:
 
     def resolved_shard_size(self) -> int:
         """Return the number of episodes in a full shard."""
-        return self.shard_size or min(LARGEST_SHARD, -(-self.episodes // SHARDS_PER_TASK))
+        eighth = -(-self.episodes // SHARDS_PER_TASK)
+        return self.shard_size or min(LARGEST_SHARD, max(SMALLEST_SHARD, eighth))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +133,11 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     _check_folder(config, blocks)
     missing = [block for block in blocks if not _is_done(block)]
     num_done = sum(block.episodes for block in blocks) - sum(block.episodes for block in missing)
-    if missing or not (config.out / MANIFEST_NAME).is_file():
+    try:
         run_in_processes(write_block, missing, config.workers, report=_shifted(report, num_done, blocks))
+    finally:
+        remove_leftovers(config.out)
+    if missing or not (config.out / MANIFEST_NAME).is_file():
         finish(config, blocks)
     return config.out
 
@@ -145,11 +150,20 @@ def plan(config: GenerateConfig) -> list[Block]:
     blocks = []
     for task in config.resolved_tasks():
         for number, start in enumerate(range(0, config.episodes, size)):
-            first = config.seed + number * stride
+            first = config.start_seed + number * stride
             blocks.append(
                 Block(
                     path=config.out / f"{task}-{config.level}-{number:05d}.arrow",
-                    info=ShardInfo(task, config.level, DOMAIN, number, size, config.seed, assets, versions),
+                    info=ShardInfo(
+                        task=task,
+                        level=config.level,
+                        domain=DOMAIN,
+                        number=number,
+                        shard_size=size,
+                        first_seed=config.start_seed,
+                        assets=assets,
+                        versions=versions,
+                    ),
                     episodes=min(size, config.episodes - start),
                     seeds=range(first, first + stride),
                     assets=config.assets,
@@ -222,14 +236,13 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         "level": config.level,
         "domain": DOMAIN,
         "episodes": config.episodes,
-        "seed": config.seed,
+        "start_seed": config.start_seed,
         "shard_size": config.resolved_shard_size(),
         "assets": blocks[0].info.assets,
     }
     write_whole(config.out / INDEX_NAME, index_bytes(rows))
     manifest = manifest_bytes(rows, config=settings, versions=blocks[0].info.versions)
     write_whole(config.out / MANIFEST_NAME, manifest)
-    remove_leftovers(config.out)
 
 
 @lru_cache(maxsize=4)

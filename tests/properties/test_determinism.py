@@ -1,0 +1,50 @@
+"""The same seed gives the same bytes in every process."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from openvima.data import rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.errors import OracleError
+from openvima.tasks import list_tasks, task_spec
+
+SEEDS = range(3)
+
+
+def digests(task: str) -> list[str]:
+    """One digest for each level and seed, over everything that the oracle's run shows and does."""
+    found = []
+    for level in task_spec(task).levels:
+        env = TabletopEnv(task, level=level, domain="eval")
+        for seed in SEEDS:
+            try:
+                found.append(rollout_oracle(env, seed).content_hash())
+            except OracleError as error:
+                found.append(str(error))
+    return found
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_two_processes_give_the_same_bytes(task: str) -> None:
+    code = (
+        "import importlib.util, sys; "
+        f"spec = importlib.util.spec_from_file_location('test', {__file__!r}); "
+        "module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module); "
+        f"print(*module.digests({task!r}), sep='\\n')"
+    )
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": hash_seed, "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        for hash_seed in ("1", "2")
+    ]
+    expected = digests(task)
+    assert len(set(expected)) == len(expected)
+    assert [run.stdout.split("\n")[:-1] for run in runs] == [expected, expected]
