@@ -51,7 +51,7 @@ _PAN_TEXTURE_PER_M = 2.3  # the tip of the handle is just inside the image
 
 def bowl_mesh() -> TriangleMesh:
     """Draw the bowl; its axis is the z axis (in the original pack it stands beside it)."""
-    outside = [rim_distance(radius, z) for radius, z in _BOWL_WALL[:5]]
+    outside = [_rim_distance(radius, z) for radius, z in _BOWL_WALL[:5]]
     inside = [radius for radius, _ in _BOWL_WALL[5:]]
     wall_radii = [_BOWL_TEXTURE_PER_M * distance for distance in (*outside, *inside)]
     bottom_radii = [_BOWL_TEXTURE_PER_M * radius for radius, _ in _BOWL_BOTTOM]
@@ -63,7 +63,7 @@ def bowl_mesh() -> TriangleMesh:
     )
 
 
-def rim_distance(radius: float, z: float) -> float:
+def _rim_distance(radius: float, z: float) -> float:
     """Distance from the bowl's axis to a point of its outer wall along a cloth draped over it, in metres."""
     return radius + 0.7 * (_BOWL_RIM_Z - z)
 
