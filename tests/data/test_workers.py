@@ -69,7 +69,9 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(code)
     environment = {**os.environ, "PYTHONPATH": str(Path(worker_jobs.__file__).parent)}
-    parent = subprocess.Popen([sys.executable, str(script), *map(str, paths)], env=environment)
+    parent = subprocess.Popen(
+        [sys.executable, str(script), *map(str, paths)], env=environment, stderr=subprocess.DEVNULL
+    )
     wait_until(lambda: all(path.exists() for path in paths))
     parent.send_signal(signal.SIGKILL)
     parent.wait()

@@ -157,7 +157,7 @@ def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:
     return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
 
 
-def _content(demo: Demonstration) -> Iterator[bytes | np.ndarray]:
+def _content(demo: Demonstration) -> Iterator[bytes | memoryview]:
     """All content in a fixed order: texts and small numbers as JSON, arrays as little-endian bytes."""
     yield json.dumps(_summary(demo), sort_keys=True).encode()
     for view in sorted(demo.rgb):
@@ -190,6 +190,6 @@ def _summary(demo: Demonstration) -> dict:
     }
 
 
-def _plain(array: np.ndarray, dtype: str) -> np.ndarray:
-    """The array flat, in one piece and with little-endian values."""
-    return np.ascontiguousarray(array, dtype=dtype).reshape(-1)
+def _plain(array: np.ndarray, dtype: str) -> memoryview:
+    """The array's values in order, little-endian."""
+    return np.ascontiguousarray(array, dtype=dtype).reshape(-1).data
