@@ -32,13 +32,12 @@ FLOOR_Z_M = -0.001  # top of the floor; the visible sheet lies at 0
 HULL_MARGIN_M = 0.001  # hulls touch at this distance, as in the benchmark
 BOX_MARGIN_M = 1e-5  # at 0, a box that just touches the floor would fall freely for one tick
 
-_SOLREF = (
-    0.01,
-    1.0,
-)  # s, damping ratio: the stiffest critically damped contact that 1/240 s bears (2 ticks) + 20 %
+_SOLREF = (0.0125, 1.0)  # s, damping ratio: three ticks, critically damped; at two, round bodies gain energy
 _SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
 _INERTIA_FACTOR = 3.0  # the benchmark's bodies turn as if they were three times as heavy
 _INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, every side
+_TURNING_DAMPING_PER_S = 3.0  # else discs wobble on; its effect on straight motion is a hundred times smaller
+_SMALLEST_RADIUS_M = 0.015
 _BLADE_MASS_KG = 17.0  # so that stopping it within a tick takes about the 500 N of the benchmark's tool mount
 _PARKED_M = 1000.0  # height at which bodies are kept that must touch nothing
 _MODEL_CACHE_SIZE = 256
@@ -168,7 +167,8 @@ def _add_body(
     if body.fixed:
         added.mocap = True  # so that its pose, too, is data and not part of the model
     else:
-        added.add_freejoint()
+        moment = sum(body.inertia) / 3
+        added.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, damping=[_TURNING_DAMPING_PER_S * moment] * 3)
         added.explicitinertial = True
         added.mass, added.inertia = body.spec.mass_kg, list(body.inertia)
         added.ipos, added.iquat = list(body.spec.com_offset), [1.0, 0.0, 0.0, 0.0]
@@ -335,9 +335,17 @@ class Bodies:
         self.data.qacc_warmstart[:] = 0.0
 
     def limit_speed(self, top_speed: float) -> None:
-        """Slow down bodies whose horizontal velocity has a component above `top_speed`, m/s."""
-        horizontal = self._velocities[:, :2]
-        np.clip(horizontal, -top_speed, top_speed, out=horizontal)
+        """Slow down free bodies so that none flies off; falling stays free.
+
+        Args:
+            top_speed: Bound of every component of the velocity, downwards apart, in m/s; turning is bound to what
+                gives the smallest block's sides that speed.
+        """
+        velocities = self._velocities[: len(self.rigid)]
+        turning = top_speed / _SMALLEST_RADIUS_M
+        low = (-top_speed, -top_speed, -np.inf, -turning, -turning, -turning)
+        high = (top_speed, top_speed, top_speed, turning, turning, turning)
+        np.clip(velocities, low, high, out=velocities)
 
     def speeds(self, *, apart_from: int | None = None) -> tuple[float, float]:
         """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies.

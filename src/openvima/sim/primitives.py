@@ -19,6 +19,7 @@ from openvima.sim.bodies import FLOOR_Z_M, TICK_S, Bodies
 from openvima.sim.touch import body_gap, gap, way_to_touch
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
+TOP_SPEED = 0.5  # m/s, of bodies that slip out between the blade and something fixed
 RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
 STILL_M = 5e-5  # a body that physics moved by less than this, and turned by less than …
 STILL_RAD = 5e-4  # … this, keeps its pose: nothing creeps, however many steps an episode has
@@ -404,6 +405,7 @@ class _Blade:
     def _run(self, num_ticks: int, velocity: tuple[float, float, float]) -> None:
         self._bodies.place_blade(self._pose(), velocity)
         self._bodies.tick(num_ticks)
+        self._bodies.limit_speed(TOP_SPEED)
         self._stage.count_ticks(num_ticks)
         self._stage.path.stay(num_ticks, scene=self._stage.scene, joints=self._joints)
 
