@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.catalog import boxes
+from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
 from openvima.catalog.obj_file import ObjMesh, parse_obj
 from openvima.catalog.objects import ObjectSpec, object_spec
@@ -70,6 +71,7 @@ _SPECIAL_IMAGES = {
     "magma": "magma.jpg",
     "rainbow": "rainbow.jpg",
 }
+_DECODED_GROUP = "original-textures-1"
 _PATTERN_FOLDERS = {
     "stripe": ("stripes", "stripe"),
     "polka_dot_2": ("polka_dots", "polka_dot"),
@@ -192,16 +194,22 @@ def _texture(folder: Path, texture_name: str) -> np.ndarray:
     spec = texture_spec(texture_name)
     if spec.texel is not None:
         return np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
+    relative_path = image_file(spec)
+    content = _read(folder, relative_path)
+    # Decoders of JPEG files differ by a level or two: what was decoded once stays.
+    return cached_array(
+        _DECODED_GROUP, _known_hashes()[relative_path][:32], lambda: _decoded(content, folder / relative_path)
+    )
+
+
+def _decoded(content: bytes, path: Path) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
-    relative_path = image_file(spec)
     try:
-        with Image.open(io.BytesIO(_read(folder, relative_path))) as image:
+        with Image.open(io.BytesIO(content)) as image:
             return np.array(image.convert("RGB"))
     except (UnidentifiedImageError, OSError) as error:
-        raise AssetError(
-            f"{folder / relative_path} cannot be decoded ({error}); restore the file."
-        ) from error
+        raise AssetError(f"{path} cannot be decoded ({error}); restore the file.") from error
 
 
 def image_file(texture: TextureSpec) -> str:

@@ -69,7 +69,7 @@ class Scratch:
         self._selected = np.empty(0, dtype=np.int32)
 
     def arrays(self, mesh: IndexedMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return room for all projected vertices, (≥ V, 4) float64, and triangle indices, (≥ F + 1,) int32."""
+        """Return room for all vertices, (≥ V, 4) float64, and for triangle indices, (≥ F + 1,) int32."""
         if len(mesh.vertices) > len(self._points):
             self._points = np.empty((len(mesh.vertices), 4))
         if len(mesh.corners) >= len(self._selected):

@@ -178,7 +178,7 @@ class Rasteriser:
             ground = _ground(CAMERAS[view].enlarged(enlarge), table)
             rgb, segm = ground.rgb.copy(), ground.segm.copy()
             heights = ground.height.copy() if height else _NO_HEIGHTS
-            depth = self._depth.setdefault(segm.shape, np.empty(segm.shape, dtype=np.float32))
+            depth = self._depth.setdefault(segm.shape, np.empty(segm.shape))
             np.copyto(depth, ground.depth)
             for mesh, pose, texture, object_id in prepared:
                 screen, selected = self._scratch.arrays(mesh)
@@ -225,7 +225,7 @@ def _ground(camera: Camera, table: bool) -> _Ground:
         np.full((3, *shape), 255, dtype=np.uint8),
         np.full(shape, BACKGROUND_ID, dtype=np.uint8),
         np.full(shape, np.nan, dtype=np.float32),
-        np.full(shape, np.inf, dtype=np.float32),
+        np.full(shape, np.inf),
     )
     if table:
         floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)

@@ -1,0 +1,87 @@
+"""Images of recorded scenes of the public benchmark, drawn from their poses with the original asset pack.
+
+The recordings and the pack are no part of the project; OPENVIMA_GOLDEN and OPENVIMA_REFERENCE_ASSETS name their
+folders. Tolerances: shapes agree to the pixel except where the benchmark lets bodies overlap at equal heights (there
+rounding decides, and they count as one); colours differ by JPEG decoding and by rounding at borders of texels.
+"""
+
+import os
+from functools import cache, lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from golden_scenes import GoldenScene, interpenetrating, ious, mean_colour_error, read_scene
+from openvima.catalog.original import OriginalAssets
+from openvima.render import VIEWS, Rasteriser
+from openvima.scene import FIRST_OBJECT_ID
+
+SCENES = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "scenes"
+ASSETS = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
+MIN_IOU = 0.97
+MAX_COLOUR_ERROR = 0.5  # of 255, mean of an image
+NAMES = sorted(path.stem for path in SCENES.glob("*.json"))
+
+pytestmark = [
+    pytest.mark.skipif(
+        not NAMES, reason=f"{SCENES} holds no recorded scenes; OPENVIMA_GOLDEN names another folder"
+    ),
+    pytest.mark.skipif(
+        not ASSETS.is_dir(), reason=f"{ASSETS} is absent; OPENVIMA_REFERENCE_ASSETS names another"
+    ),
+]
+
+
+@lru_cache(maxsize=1)
+def rasteriser() -> Rasteriser:
+    return Rasteriser(OriginalAssets(ASSETS))
+
+
+@cache
+def golden(name: str) -> GoldenScene:
+    return read_scene(SCENES / f"{name}.json")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_scene_is_drawn_alike_in_both_views(name) -> None:
+    recorded = golden(name)
+    groups = interpenetrating(recorded.scene, rasteriser().assets)
+    first_id = FIRST_OBJECT_ID[recorded.scene.end_effector]
+    drawn = rasteriser().scene(recorded.scene)
+    for view in VIEWS:
+        agreement = ious(drawn[view].segm, recorded.image.segm[view], first_id=first_id, groups=groups)
+        assert min(agreement.values()) >= MIN_IOU, (view, agreement)
+        ours, theirs = drawn[view].segm, recorded.image.segm[view]
+        np.testing.assert_array_equal(ours == 0, theirs == 0)  # the floor
+        assert mean_colour_error(drawn[view].rgb, recorded.image.rgb[view]) <= MAX_COLOUR_ERROR
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_object_images_are_drawn_alike(name) -> None:
+    recorded = golden(name)
+    if not recorded.prompt.images:
+        pytest.skip("the prompt shows only scenes, whose poses are not recorded")
+    for image in rasteriser().prompt(recorded.prompt).images.values():
+        theirs = recorded.prompt_images[image.name]
+        for view in VIEWS:
+            agreement = ious(image.segm[view], theirs.segm[view], first_id=0, groups=[])
+            assert agreement[(0,)] >= MIN_IOU, (image.name, view)
+            assert mean_colour_error(image.rgb[view], theirs.rgb[view]) <= MAX_COLOUR_ERROR
+            np.testing.assert_array_equal(image.rgb[view][:, theirs.segm[view] == 255], 255)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_plain_colours_are_exact(name) -> None:
+    recorded = golden(name)
+    assets = rasteriser().assets
+    uncertain = set().union(*interpenetrating(recorded.scene, assets))
+    drawn = rasteriser().scene(recorded.scene)
+    for placement in recorded.scene.placements:
+        if assets.texture(placement.texture).shape != (1, 1, 3) or placement.id in uncertain:
+            continue
+        for view in VIEWS:
+            both = (drawn[view].segm == placement.id) & (recorded.image.segm[view] == placement.id)
+            wrong = (drawn[view].rgb[:, both] != recorded.image.rgb[view][:, both]).any(axis=0)
+            # Smoothly lit surfaces may differ by rounding where a colour is just about to step.
+            assert wrong.mean() <= 0.01

@@ -1,0 +1,58 @@
+"""Cameras: where points of the table appear, and back."""
+
+import numpy as np
+import pytest
+
+from openvima.errors import CameraError, ConfigError, ShapeError
+from openvima.render import CAMERAS, FRONT, TOP, VIEWS, project, unproject
+
+# Point; X and Y (upwards) in the top view; the same in the front view. From the benchmark's own matrices.
+KNOWN_POINTS = [
+    ((0.5, 0.0, 0.0), (128.0, 64.0), (128.0, 48.0001)),
+    ((0.25, -0.5, 0.0), (2.51, 126.745), (2.3024, 92.4429)),
+    ((0.75, 0.5, 0.0), (253.49, 1.255), (253.7290, 3.5462)),
+    ((0.5, 0.0, 0.1), (128.0, 64.0), (128.0, 65.7788)),
+    ((0.41, 0.0, 0.0), (128.0, 86.5882), (128.0, 64.0008)),
+]
+
+
+@pytest.mark.parametrize(("point", "top", "front"), KNOWN_POINTS)
+def test_points_land_on_the_pixels_that_the_benchmark_shows_them_at(point, top, front) -> None:
+    for camera, (x, y) in ((TOP, top), (FRONT, front)):
+        np.testing.assert_allclose(project(np.array(point), camera), (x, 127 - y), atol=1e-4)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("factor", [1, 3])
+def test_unproject_undoes_project(view, factor) -> None:
+    camera = CAMERAS[view].enlarged(factor)
+    rng = np.random.default_rng(1)
+    points = rng.uniform((0.2, -0.6, -0.01), (0.8, 0.6, 0.35), (50, 3))
+    found = unproject(project(points, camera), camera, z=points[:, 2])
+    np.testing.assert_allclose(found, points[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_pixel_of_the_plain_image_is_the_lower_left_one_of_its_enlarged_block(view) -> None:
+    point = np.array([0.43, -0.21, 0.02])
+    column, row = project(point, CAMERAS[view])
+    np.testing.assert_allclose(
+        project(point, CAMERAS[view].enlarged(4)), (4 * column, 4 * row + 3), rtol=0, atol=1e-9
+    )
+
+
+def test_a_point_behind_the_camera_is_refused_by_name() -> None:
+    with pytest.raises(CameraError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
+        project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
+
+
+def test_points_and_pixels_of_wrong_length_are_refused() -> None:
+    with pytest.raises(ShapeError, match="length 3"):
+        project(np.zeros((4, 2)), TOP)
+    with pytest.raises(ShapeError, match="length 2"):
+        unproject(np.zeros(3), TOP)
+
+
+def test_an_image_cannot_be_shrunk() -> None:
+    with pytest.raises(ConfigError, match="from 1"):
+        TOP.enlarged(0)

@@ -1,0 +1,189 @@
+"""Scenes and prompts: what is drawn where, with which id and colour."""
+
+import numpy as np
+import pytest
+
+from box_assets import COLOURS, BoxAssets
+from openvima.catalog import OBJECTS
+from openvima.catalog.boxes import block
+from openvima.catalog.procedural import ProceduralAssets
+from openvima.errors import ConfigError, ShapeError, UnknownObjectError
+from openvima.render import CAMERAS, VIEWS, Drawable, Rasteriser, project
+from openvima.scene import ObjectImage, Placement, Pose, Prompt, Scene, SceneImage
+
+BLOCK = (0.07, 0.07, 0.07)
+
+
+def boxed(object_id: int, x: float, y: float, yaw_rad: float = 0.0, texture: str = "red") -> Placement:
+    return Placement(object_id, "block", texture, BLOCK, Pose.planar(x, y, yaw_rad, z=0.034))
+
+
+@pytest.fixture
+def rasteriser() -> Rasteriser:
+    return Rasteriser(BoxAssets())
+
+
+def at(image: np.ndarray, view: str, point: tuple[float, float, float]) -> np.ndarray:
+    column, row = np.rint(project(np.array(point), CAMERAS[view])).astype(int)
+    return image[..., row, column]
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_bare_table_shows_floor_and_sheet(rasteriser, view) -> None:
+    image = rasteriser.scene(Scene(()), height=True)[view]
+    assert image.rgb.shape == (3, 128, 256)
+    assert image.segm.shape == (128, 256)
+    assert set(np.unique(image.segm)) == {0, 1}
+    assert set(np.unique(image.rgb[:, image.segm == 0])) == {239}
+    assert set(np.unique(image.rgb[:, image.segm == 1])) == {47}
+    np.testing.assert_allclose(image.height, np.where(image.segm == 1, 0.0, -0.001), atol=1e-7)
+
+
+def test_faces_of_a_red_box_are_lit_by_their_direction(rasteriser) -> None:
+    scene = Scene((boxed(5, 0.5, 0.1),))
+    images = rasteriser.scene(scene)
+    red = np.array(COLOURS["red"])
+    top, towards_viewer = (0.5, 0.1, 0.069), (0.535, 0.1, 0.034)
+    for view in VIEWS:
+        np.testing.assert_array_equal(at(images[view].rgb, view, top), np.floor(0.93967 * red))
+    np.testing.assert_array_equal(at(images["front"].rgb, "front", towards_viewer), np.floor(0.6 * red))
+
+
+def test_light_does_not_turn_with_the_body(rasteriser) -> None:
+    turned = Scene((boxed(5, 0.5, 0.1, np.pi / 2),))
+    image = rasteriser.scene(turned)["front"]
+    np.testing.assert_array_equal(
+        at(image.rgb, "front", (0.535, 0.1, 0.034)), np.floor(0.6 * np.array(COLOURS["red"]))
+    )
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_nearer_body_hides_the_farther_one_in_either_order(rasteriser, view) -> None:
+    low = boxed(5, 0.5, 0.0, texture="blue")
+    high = low.at(low.pose.moved(dz=0.07))
+    for first, second in ((5, 6), (6, 5)):
+        bodies = {first: low, second: high}
+        placements = tuple(
+            Placement(i, "block", bodies[i].texture, BLOCK, bodies[i].pose) for i in sorted(bodies)
+        )
+        segm = rasteriser.scene(Scene(placements))[view].segm
+        assert at(segm, view, (0.5, 0.0, 0.139)) == second
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_heights_are_those_of_the_surfaces_seen(rasteriser, view) -> None:
+    image = rasteriser.scene(Scene((boxed(5, 0.5, 0.1),)), height=True)[view]
+    assert image.height.dtype == np.float32
+    assert at(image.height, view, (0.5, 0.1, 0.069)) == pytest.approx(0.069, abs=1e-6)
+    assert image.height[image.segm == 5].max() <= 0.069 + 1e-6
+    assert rasteriser.scene(Scene(()))[view].height is None
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_an_enlarged_image_contains_the_plain_one(rasteriser, factor) -> None:
+    scene = Scene((boxed(5, 0.43, -0.21, 0.7), boxed(6, 0.6, 0.3, 2.0, "blue")))
+    plain, large = rasteriser.scene(scene), rasteriser.scene(scene, enlarge=factor)
+    for view in VIEWS:
+        assert large[view].rgb.shape == (3, 128 * factor, 256 * factor)
+        np.testing.assert_array_equal(
+            large[view].rgb[:, factor - 1 :: factor, ::factor], plain[view].rgb, strict=True
+        )
+        np.testing.assert_array_equal(large[view].segm[factor - 1 :: factor, ::factor], plain[view].segm)
+
+
+def test_further_bodies_are_drawn_with_their_own_id_and_colour(rasteriser) -> None:
+    mesh = block((0.1, 0.1, 0.02)).visual
+    tool = Drawable(mesh, Pose.planar(0.5, 0.0, z=0.2), 3, (204, 100, 50))
+    images = rasteriser.scene(Scene((boxed(5, 0.5, 0.0),)), extra=[tool], views=("top",))
+    assert list(images) == ["top"]
+    assert at(images["top"].segm, "top", (0.5, 0.0, 0.21)) == 3
+    np.testing.assert_array_equal(
+        at(images["top"].rgb, "top", (0.5, 0.0, 0.21)), np.floor(0.93967 * np.array([204, 100, 50]))
+    )
+
+
+def test_images_do_not_depend_on_what_was_drawn_before(rasteriser) -> None:
+    scene = Scene((boxed(5, 0.43, -0.21, 0.7), boxed(6, 0.6, 0.3, 2.0, "blue")))
+    first = rasteriser.scene(scene, height=True)
+    rasteriser.scene(Scene((boxed(5, 0.5, 0.0),)), height=True)
+    rasteriser.scene(scene, enlarge=2)
+    again = rasteriser.scene(scene, height=True)
+    for view in VIEWS:
+        for a, b in ((first[view].rgb, again[view].rgb), (first[view].segm, again[view].segm)):
+            np.testing.assert_array_equal(a, b)
+        assert not np.shares_memory(first[view].rgb, again[view].rgb)
+        np.testing.assert_array_equal(first[view].height, again[view].height)
+
+
+def test_an_object_image_shows_the_object_alone_on_white(rasteriser) -> None:
+    fill = ObjectImage(boxed(9, 0.3, 0.2, 1.0, "blue"))
+    rendered = rasteriser.prompt(Prompt("Take {a}.", (("a", fill),)))
+    image = rendered.images["a"]
+    assert (rendered.text, image.kind, image.name) == ("Take {a}.", "object", "a")
+    (record,) = image.objects
+    assert (record.object_id, record.object, record.texture) == (0, "block", "blue")
+    for view in VIEWS:
+        assert set(np.unique(image.segm[view])) == {0, 255}
+        assert (image.rgb[view][:, image.segm[view] == 255] == 255).all()
+    # The block is centred at (0.5, 0, 0): 0.07 m are 17.6 pixels.
+    rows, columns = np.nonzero(image.segm["top"] == 0)
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (120, 136, 55, 71)
+
+
+def test_prompt_objects_are_turned_by_a_quarter(rasteriser) -> None:
+    long_box = Placement(5, "block", "red", (0.2, 0.05, 0.02), Pose((0.0, 0.0, 0.0)))
+    segm = rasteriser.prompt(Prompt("{a}", (("a", ObjectImage(long_box)),))).images["a"].segm["top"]
+    rows, columns = np.nonzero(segm == 0)
+    assert np.ptp(columns) > 3 * np.ptp(rows)
+
+
+def test_magnification_enlarges_the_whole_object(rasteriser) -> None:
+    small = Placement(5, "block", "red", (0.03, 0.03, 0.03), Pose((0.0, 0.0, 0.0)))
+    sizes = [
+        (rasteriser.prompt(Prompt("{a}", (("a", ObjectImage(small, factor)),))).images["a"].segm["top"] == 0)
+        for factor in (1.0, 7.0)
+    ]
+    rows, columns = np.nonzero(sizes[1])
+    assert (np.ptp(rows) + 1, np.ptp(columns) + 1) == (53, 53)  # 0.21 m are 52.7 pixels
+    assert sizes[0].sum() < 70
+
+
+def test_a_scene_image_numbers_its_objects_from_2(rasteriser) -> None:
+    scene = Scene((boxed(5, 0.4, -0.2), boxed(8, 0.6, 0.2, texture="blue")))
+    prompt = Prompt(
+        "Make it {s}, not {a}.", (("s", SceneImage(scene)), ("a", ObjectImage(boxed(5, 0.4, 0.0))))
+    )
+    rendered = rasteriser.prompt(prompt)
+    image = rendered.images["s"]
+    assert list(rendered.images) == ["s", "a"]
+    assert image.kind == "scene"
+    assert [(r.object_id, r.texture) for r in image.objects] == [(2, "red"), (3, "blue")]
+    for view in VIEWS:
+        assert set(np.unique(image.segm[view])) == {0, 1, 2, 3}
+        np.testing.assert_array_equal(image.rgb[view], rasteriser.scene(scene)[view].rgb)
+
+
+def test_unfit_ids_textures_and_factors_are_refused(rasteriser) -> None:
+    mesh, pose = block(BLOCK).visual, Pose((0.5, 0.0, 0.0))
+    with pytest.raises(ShapeError, match="255"):
+        rasteriser.scene(Scene(()), extra=[Drawable(mesh, pose, 255, (1, 2, 3))])
+    with pytest.raises(ShapeError, match=r"uint8 \(H, W, 3\)"):
+        rasteriser.scene(Scene(()), extra=[Drawable(mesh, pose, 3, np.zeros((4, 4)))])
+    with pytest.raises(ConfigError):
+        rasteriser.scene(Scene(()), enlarge=0)
+
+
+def test_an_unknown_object_is_reported_as_such() -> None:
+    scene = Scene((Placement(5, "teapot", "red", BLOCK, Pose((0.5, 0.0, 0.0))),))
+    with pytest.raises(UnknownObjectError, match="teapot"):
+        Rasteriser(ProceduralAssets()).scene(scene)
+
+
+@pytest.mark.parametrize("name", [name for name in OBJECTS if name not in ("stand", "disk")])
+def test_every_object_of_the_default_pack_is_seen_in_both_views(name) -> None:
+    assets = ProceduralAssets()
+    size = OBJECTS[name].size_max
+    pose = Pose.planar(0.5, 0.0, 0.3, z=assets.geometry(name, size).rest_z_m)
+    images = Rasteriser(assets).scene(Scene((Placement(5, name, "red", size, pose),)))
+    for view in VIEWS:
+        assert (images[view].segm == 5).sum() > 20
