@@ -85,7 +85,7 @@ class ArmPath:
                 self._record(scene(), joints())
 
     def store(self, num_ticks: int, *, scene: Callable[[], Scene]) -> None:
-        """Keep the frames that fall into some ticks of physics for the arm's next move, which goes on meanwhile."""
+        """Keep the frames that fall into some ticks for the arm's next move, which goes on meanwhile."""
         for _ in self._frame_times(num_ticks * TICK_S):
             self._stored.append(scene())
 

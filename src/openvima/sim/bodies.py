@@ -1,12 +1,13 @@
 """The MuJoCo model of a scene: free and fixed bodies on a floor, and the tool's blade.
 
-A model depends on the shapes alone, not on where they stand, so that models and the convex hulls in them are shared
-between scenes; poses live in `MjData`.
+A model depends on the shapes alone, not on where they stand, so that models and the convex hulls in them are
+shared between scenes; poses live in `MjData`.
 
-Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s allows, so
-that a body at rest sinks in by micrometres. The benchmark multiplies the friction coefficients of a pair where
-MuJoCo takes the larger one: floor and blade (coefficient 1) are given 0 here, so that the other's holds; the
-slipperier of two bodies has priority; pairs of two slippery bodies are listed with their product.
+Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s
+allows, so that a body at rest sinks in by micrometres. The benchmark multiplies the friction coefficients of
+a pair where MuJoCo takes the larger one: floor and blade (coefficient 1) are given 0 here, so that the
+other's holds; the slipperier of two bodies has priority; pairs of two slippery bodies are listed with their
+product.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -53,8 +54,10 @@ class BodyShape:
     Args:
         key: Digest of all that the model needs.
         shapes: Convex parts in the link frame.
-        points: Corners of all parts with the margin that each is given, shape (N, 4): x, y, z, margin; metres.
-        radius_m: Greatest planar distance of a corner from the link frame, margin included, whatever the attitude.
+        points: Corners of all parts with the margin that each is given, shape (N, 4): x, y, z, margin;
+            metres.
+        radius_m: Greatest planar distance of a corner from the link frame, margin included, whatever the
+            attitude.
         spec: Catalogue entry.
         fixed: Welded to the floor.
         inertia: Principal moments in kg m².
@@ -114,8 +117,8 @@ def _model_cache(key: tuple[bytes, ...], with_blade: bool) -> list[mujoco.MjMode
 def build_model(bodies: Sequence[BodyShape], *, with_blade: bool) -> mujoco.MjModel:
     """Compile the model of some bodies, or return the one compiled before.
 
-    Body 0 is the world, the next ones are `bodies` in order, then needle and blade. Free joints stand in the same
-    order, the blade's last.
+    Body 0 is the world, the next ones are `bodies` in order, then needle and blade. Free joints stand in the
+    same order, the blade's last.
     """
     kept = _model_cache(tuple(body.key for body in bodies), with_blade)
     if not kept:
@@ -223,14 +226,14 @@ def _add_slippery_pairs(spec: mujoco.MjSpec, slippery: list[tuple[str, float, bo
 
 
 def _add_needle(spec: mujoco.MjSpec) -> None:
-    """A thin upright line that collides with nothing; distances to it tell what stands under the suction cup."""
+    """A thin upright line that collides with nothing; distances to it tell what is under the cup."""
     body = spec.worldbody.add_body(name="needle", mocap=True, pos=[0.0, 0.0, _PARKED_M])
     capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [NEEDLE_RADIUS_M, _NEEDLE_HALF_LENGTH_M, 0.0]}
     body.add_geom(name="needle", **capsule, contype=0, conaffinity=0)
 
 
 def _add_blade(spec: mujoco.MjSpec) -> None:
-    """A free body whose motion is prescribed; it pushes rigid bodies and passes through floor and fixed ones."""
+    """A free body whose motion is prescribed; it pushes free bodies and passes through all others."""
     body = spec.worldbody.add_body(name="blade", pos=[0.0, 0.0, _PARKED_M], gravcomp=1.0)
     body.add_freejoint()
     body.explicitinertial = True
@@ -338,8 +341,8 @@ class Bodies:
         """Slow down free bodies so that none flies off; falling stays free.
 
         Args:
-            top_speed: Bound of every component of the velocity, downwards apart, in m/s; turning is bound to what
-                gives the smallest block's sides that speed.
+            top_speed: Bound of every component of the velocity, downwards apart, in m/s; turning is bound to
+                what gives the smallest block's sides that speed.
         """
         velocities = self._velocities[: len(self.rigid)]
         turning = top_speed / _SMALLEST_RADIUS_M

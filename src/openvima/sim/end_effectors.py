@@ -12,7 +12,7 @@ REACH_RESERVE_M = 0.005  # kept below the highest point that the arm can reach
 NEEDLE_BELOW_TIP_M = 0.003
 NEEDLE_RADIUS_M = 1e-4  # of the shape that is lowered; the axis itself, nearly
 TOUCH_RADIUS_M = 0.001  # the needle's true radius: a body this near to the axis is hit from above
-CAPTURE_RADIUS_M = 0.003  # … and one this near is still caught if only floor is below: 2–4 mm measured in VIMA-Bench
+CAPTURE_RADIUS_M = 0.003  # one this near is still caught above bare floor; 2–4 mm measured in VIMA-Bench
 
 # Spatula: an upright blade, its width across the direction of travel.
 BLADE_HALF_SIZE_M: Vector3 = (0.0025, 0.025, 0.0575)  # along the travel, across it, up

@@ -1,7 +1,8 @@
 """The two primitives: pick and place with the suction cup, sweep with the spatula.
 
-Events, not time: while nothing can be touched, nothing is stepped. A lifted body moves rigidly with the arm; physics
-runs when it is let go onto something else than bare floor, while the blade pushes, and until all is at rest.
+Events, not time: while nothing can be touched, nothing is stepped. A lifted body moves rigidly with the arm;
+physics runs when it is let go onto something else than bare floor, while the blade pushes, and until all is
+at rest.
 """
 
 import math
@@ -68,9 +69,7 @@ class Stage:
             self._unwatched_ticks = 0
             self._watch(self.scene(held))
 
-    def settle(
-        self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None
-    ) -> None:
+    def settle(self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None) -> None:
         """Run physics until all is at rest; the arm's next move happens meanwhile."""
 
         def each(num_ticks: int) -> None:
@@ -78,13 +77,11 @@ class Stage:
             self.path.store(num_ticks, scene=lambda: self.scene(held))
 
         held_index = held[0] if held else None
-        _, completed = settling.settle(
-            self.bodies, apart_from=held_index, top_speed=top_speed, each=each
-        )
+        _, completed = settling.settle(self.bodies, apart_from=held_index, top_speed=top_speed, each=each)
         self.completed = self.completed and completed
 
     def finish(self) -> Scene:
-        """Put bodies that hardly moved back where they were; return the final scene, which is watched once."""
+        """Put bodies that hardly moved back where they were; return the final scene, watched once more."""
         poses = {}
         for index in self.bodies.rigid:
             before, after = self.placement(index).pose, self.bodies.pose(index)
@@ -107,7 +104,7 @@ def _is_still(before: Pose, after: Pose) -> bool:
 
 
 def is_at_rest(bodies: Bodies) -> bool:
-    """Whether every free body stands on the floor and overlaps no other, so that physics would change nothing."""
+    """Whether every free body stands on the floor and overlaps no other: nothing would move."""
     for index in bodies.rigid:
         pose = bodies.pose(index)
         if abs(pose.z + bodies.lowest_z(index, pose.quaternion) - FLOOR_Z_M) > RESTING_GAP_M:
@@ -183,7 +180,7 @@ def _gaps_to_axis(bodies: Bodies, x: float, y: float) -> dict[int, float]:
 
 
 def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
-    """Height at which a needle lowered at (x, y) meets a body; of the body's top if it goes down beside it."""
+    """Height at which a needle lowered at (x, y) meets a body; of the top if it goes down beside it."""
     bodies.place_needle(x, y, _ABOVE_ALL_M)
     bodies.refresh()
     needle = (bodies.needle_geom,)
@@ -255,7 +252,7 @@ def _set_down(stage: Stage, held: _HeldBody, *, stands_alone: bool) -> None:
 
 
 def _way_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
-    """How far a body can be lowered from `above` until it touches something, and whether that is bare floor."""
+    """How far a body can be lowered from `above` until it touches, and whether that is bare floor."""
     bodies.place(index, above)
     bodies.refresh()
     to_floor = above.z + bodies.lowest_z(index, above.quaternion) - FLOOR_Z_M
@@ -275,7 +272,8 @@ def _way_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
 def sweep(stage: Stage, action: Action, *, shortfall_m: float = tools.BLADE_SHORTFALL_M) -> None:
     """Push with the blade from just before pose0 towards pose1, in a straight line and at constant speed.
 
-    Rotations of the action do not matter. If the two points are the same there is no direction: nothing happens.
+    Rotations of the action do not matter. If the two points are the same there is no direction: nothing
+    happens.
 
     Args:
         stage: Bodies and arm; afterwards all is at rest.
@@ -289,7 +287,8 @@ def sweep(stage: Stage, action: Action, *, shortfall_m: float = tools.BLADE_SHOR
     vx, vy = (x1 - x0) / distance, (y1 - y0) / distance
     start = _within_reach(x0 - tools.BLADE_RUN_UP_M * vx, y0 - tools.BLADE_RUN_UP_M * vy)
     end = _within_reach(x1 - shortfall_m * vx, y1 - shortfall_m * vy)
-    # A sweep shorter than run-up and shortfall first goes forward by what is missing, then back, as VIMA-Bench does.
+    # A sweep shorter than run-up and shortfall first goes forward by what is missing, then back, as
+    # VIMA-Bench does.
     nudge = distance + tools.BLADE_RUN_UP_M - shortfall_m
     legs = [end] if nudge >= 0 else [_within_reach(start[0] - nudge * vx, start[1] - nudge * vy), end]
     blade = _Blade(stage, math.atan2(vy, vx))
@@ -325,7 +324,8 @@ class _Blade:
         down = reachable_joints(x, y, tools.SWEEP_TIP_Z_M, self._yaw_rad)
         path.move(down, scene=lambda _: scene)
         self._tip_z = tools.SWEEP_TIP_Z_M
-        if any([self._make_room(index) for index in self._bodies.rigid]):
+        in_the_way = [index for index in self._bodies.rigid if self._make_room(index)]
+        if in_the_way:
             self._wait()
 
     def push(self, x: float, y: float) -> None:
@@ -352,9 +352,10 @@ class _Blade:
         stage.path.move(self._joints(), scene=lambda _: after)
 
     def _make_room(self, index: int) -> bool:
-        """Shift a body that stands where the blade comes down to the nearest side of it; whether it was there.
+        """Shift a body that stands where the blade comes down to its nearest side; whether it did.
 
-        Squeezing a body between blade and floor in the physics would fling it away; in VIMA-Bench, it is nudged.
+        Squeezing a body between blade and floor in the physics would fling it away; in VIMA-Bench, it is
+        nudged.
         """
         pose = self._bodies.pose(index)
         blade = self._pose()

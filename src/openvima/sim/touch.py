@@ -1,7 +1,8 @@
 """Where a shape that moves along a straight line first touches another.
 
-The distance of two convex shapes is a convex function of the way that one of them has moved. Newton's method, started
-from the free side, therefore never goes past the touching point, and reaches it in a few evaluations.
+The distance of two convex shapes is a convex function of the way that one of them has moved. Newton's
+method, started from the free side, therefore never goes past the touching point, and reaches it in a few
+evaluations.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -21,7 +22,7 @@ _MOST_STEPS = 50
 
 
 def gap(bodies: Bodies, geom1: int, geom2: int) -> float:
-    """Distance of two convex parts in metres, less the margins within which they touch; negative if they overlap."""
+    """Distance of two convex parts in metres, less their margins; negative if they overlap."""
     reach = bodies.model.geom_margin[geom1] + bodies.model.geom_margin[geom2]
     return mujoco.mj_geomDistance(bodies.model, bodies.data, geom1, geom2, _FARTHEST_M, None) - float(reach)
 

@@ -1,7 +1,7 @@
-"""Exact kinematics of the UR5 arm with a vertical tool: forward by the chain of joints, inverse in closed form.
+"""Exact kinematics of the UR5 arm with a vertical tool: forward by the chain, inverse in closed form.
 
-The tip is the point 0.12 m beyond the flange along the tool axis. A tool yaw of 0 is the heading at which the tool
-frame is Rz(0) · B, where B turns by π about (−1, 1, 0)/√2: flange x along −y, y along −x, z down.
+The tip is the point 0.12 m beyond the flange along the tool axis. A tool yaw of 0 is the heading at which
+the tool frame is Rz(0) · B, where B turns by π about (−1, 1, 0)/√2: flange x along −y, y along −x, z down.
 
 Source: link lengths of the UR5 data sheet; derivation of the closed form beside `inverse`.
 """
@@ -54,8 +54,8 @@ def link_frames(joints: np.ndarray) -> tuple[Pose, ...]:
         joints: Angles from shoulder pan to wrist 3, shape (6,), radians.
 
     Returns:
-        Eight poses in the world: base, shoulder, upper arm, forearm, wrist 1, wrist 2, wrist 3, flange (z along
-        the tool).
+        Eight poses in the world: base, shoulder, upper arm, forearm, wrist 1, wrist 2, wrist 3, flange (z
+        along the tool).
 
     Raises:
         ShapeError: `joints` does not have shape (6,).
@@ -83,7 +83,7 @@ def forward(joints: np.ndarray) -> Pose:
 
 
 def tool_pose(x: float, y: float, z: float, yaw_rad: float) -> Pose:
-    """Pose of the tip of a vertical tool at a point in metres, turned by `yaw_rad` about the world's z axis."""
+    """Pose of the tip of a vertical tool at a point in metres, turned by `yaw_rad` about the vertical."""
     return Pose((x, y, z), multiply(yaw_quaternion(yaw_rad), _TOOL_DOWN))
 
 
@@ -108,8 +108,9 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
         >>> inverse(0.5, 0.0, 0.32, 0.0).round(5)[:3]
         array([-3.36166, -1.56815,  1.54739])
 
-    Source: the tool's axis runs in a vertical plane beside the shoulder, so joint 1 follows from the plan view and
-    joints 2 and 3 are a triangle of the two arm lengths; joint 4 keeps the tool vertical, joint 6 sets its heading.
+    Source: the tool's axis runs in a vertical plane beside the shoulder, so joint 1 follows from the plan
+    view and joints 2 and 3 are a triangle of the two arm lengths; joint 4 keeps the tool vertical, joint 6
+    sets its heading.
     """
     distance = math.hypot(x, y)
     reach, height = _plane_point(distance, z)
@@ -117,8 +118,8 @@ def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
     if not SHORTEST_REACH_M <= length <= LONGEST_REACH_M or reach <= 0:
         raise ReachError(
             f"tip ({x:.4f}, {y:.4f}, {z:.4f}) m needs an arm of {length:.4f} m; it must be "
-            f"{SHORTEST_REACH_M:.4f} … {LONGEST_REACH_M:.4f} m with the tool vertical. Lower it or move it nearer "
-            f"(`highest_tip_z` gives the limit of the height)."
+            f"{SHORTEST_REACH_M:.4f} … {LONGEST_REACH_M:.4f} m with the tool vertical. Lower it or move it "
+            f"nearer (`highest_tip_z` gives the limit of the height)."
         )
     pan = math.atan2(y, x) - math.asin(SIDE_OFFSET_M / distance) - math.pi
     pan = _wrapped(pan, -1.5 * math.pi)
@@ -143,7 +144,7 @@ def highest_tip_z(x: float, y: float) -> float:
 
 
 def farthest_tip_distance(z: float) -> float:
-    """Greatest distance from the base axis, in metres, at which the vertical tool reaches height `z` in metres.
+    """Greatest distance from the base axis at which the vertical tool reaches height `z`; both in metres.
 
     Raises:
         ReachError: The height is beyond the arm altogether.

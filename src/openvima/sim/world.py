@@ -11,8 +11,7 @@ from openvima.sim import end_effectors, primitives, ur5
 from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
 
-
-_PARTING_SPEED = 0.1  # m/s, with which bodies that were loaded overlapping part; like the benchmark's, they stop
+_PARTING_SPEED = 0.1  # m/s, with which bodies that were loaded overlapping part, as gently as in VIMA-Bench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,8 +20,8 @@ class Execution:
 
     Args:
         grasped: Id of the object that was lifted; None if there was none, and always for the spatula.
-        joint_path: Key positions of the arm from start to end, shape (W, 6), float32, radians; it moves in straight
-            lines in joint space between them (in a straight line of the tool while sweeping).
+        joint_path: Key positions of the arm from start to end, shape (W, 6), float32, radians; it moves in
+            straight lines in joint space between them (in a straight line of the tool while sweeping).
         num_ticks: Physics steps of 1/240 s that were computed.
         completed: Whether everything came to rest within the limit of 1000 ticks.
     """
@@ -36,10 +35,12 @@ class Execution:
 class World:
     """The table with its objects and the robot.
 
-    Deterministic: equal scenes, assets and actions give equal bytes. Nothing depends on time or on other worlds.
+    Deterministic: equal scenes, assets and actions give equal bytes. Nothing depends on time or on other
+    worlds.
 
     Args:
-        scene: The objects at their start. Those that hover or overlap come to rest during the first primitive.
+        scene: The objects at their start. Those that hover or overlap come to rest during the first
+            primitive.
         assets: Gives the shapes.
         compat: Reproduce the benchmark's inexact stop of the blade: it ends 3 mm earlier.
 
