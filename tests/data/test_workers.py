@@ -15,7 +15,7 @@ from openvima.data.workers import run_in_processes
 from openvima.errors import SceneError, WorkerError
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
+def wait_until(condition: Callable[[], bool], timeout_s: float = 30) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, "it did not happen"
@@ -68,7 +68,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     )
     script = tmp_path / "parent.py"
     script.write_text(code)
-    environment = {**os.environ, "PYTHONPATH": str(Path(worker_jobs.__file__).parent)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     parent = subprocess.Popen(
         [sys.executable, str(script), *map(str, paths)], env=environment, stderr=subprocess.DEVNULL
     )
@@ -76,4 +76,8 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     workers = [int(path.read_text()) for path in paths]
-    wait_until(lambda: not any(is_alive(pid) for pid in workers))
+    try:
+        wait_until(lambda: not any(is_alive(pid) for pid in workers))
+    finally:
+        for pid in filter(is_alive, workers):
+            os.kill(pid, signal.SIGKILL)
