@@ -23,7 +23,7 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets, CollisionBox, CollisionShape, Geometry, Vector3
 from openvima.catalog.objects import ObjectSpec, object_spec
-from openvima.scene import Placement, Pose, Scene
+from openvima.scene import Pose, Scene
 from openvima.scene.pose import Quaternion, normalised
 from openvima.sim.end_effectors import BLADE_HALF_SIZE_M, NEEDLE_RADIUS_M
 
@@ -72,10 +72,11 @@ class BodyShape:
     inertia: Vector3
 
 
-def body_shape(placement: Placement, geometry: Geometry) -> BodyShape:
-    """Prepare the body of a placement; one that nothing can touch counts as fixed."""
-    spec = object_spec(placement.object)
-    digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, placement.fixed)).encode())
+@lru_cache(maxsize=1024)
+def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
+    """Prepare the body of an object; one that nothing can touch counts as fixed."""
+    spec = object_spec(object_name)
+    digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, fixed)).encode())
     for shape in geometry.collision:
         digest.update(repr(shape).encode() if isinstance(shape, CollisionBox) else shape.points.tobytes())
     corners = [_corners(shape) for shape in geometry.collision]
@@ -87,7 +88,7 @@ def body_shape(placement: Placement, geometry: Geometry) -> BodyShape:
         points,
         float(reach.max(initial=0.0)),
         spec,
-        placement.fixed or not geometry.collision,
+        fixed or not geometry.collision,
         _inertia(points, spec.mass_kg),
     )
 
@@ -256,7 +257,8 @@ class Bodies:
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
         self.shapes = tuple(
-            body_shape(p, assets.geometry(p.object, p.size, p.scale)) for p in scene.placements
+            body_shape(p.object, assets.geometry(p.object, p.size, p.scale), p.fixed)
+            for p in scene.placements
         )
         with_blade = scene.end_effector == "spatula"
         self.model = build_model(self.shapes, with_blade=with_blade)

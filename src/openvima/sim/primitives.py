@@ -6,115 +6,24 @@ at rest.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from openvima.scene import Action, Placement, Pose, Scene
+from openvima.scene import Action, Pose
 from openvima.scene.pose import rotate
 from openvima.sim import end_effectors as tools
 from openvima.sim import settling, ur5
-from openvima.sim.arm_path import SWEEP_SPEED, ArmPath, reachable_joints
+from openvima.sim.arm_path import SWEEP_SPEED, reachable_joints
 from openvima.sim.bodies import FLOOR_Z_M, TICK_S, Bodies
+from openvima.sim.stage import RESTING_GAP_M, Stage
 from openvima.sim.touch import body_gap, gap, way_to_touch
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
 TOP_SPEED = 0.5  # m/s, of bodies that slip out between the blade and something fixed
-RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
-STILL_M = 5e-5  # a body that physics moved by less than this, and turned by less than …
-STILL_RAD = 5e-4  # … this, keeps its pose: nothing creeps, however many steps an episode has
 _DOWN = (0.0, 0.0, -1.0)
 _ABOVE_ALL_M = 1.0  # height from which tools and held bodies are lowered, above every stack
 _STRIDE_TICKS = 5
-
-
-class Stage:
-    """The bodies, the arm and the onlookers during one primitive.
-
-    Args:
-        scene: Poses at the start.
-        bodies: The same in physics.
-        path: The arm's way so far.
-        watch: Called with the scene at least every 25 ticks of physics, or None.
-    """
-
-    def __init__(
-        self, scene: Scene, bodies: Bodies, path: ArmPath, watch: Callable[[Scene], None] | None
-    ) -> None:
-        self.start = scene
-        self.bodies = bodies
-        self.path = path
-        self.num_ticks = 0
-        self.completed = True
-        self._watch = watch
-        self._unwatched_ticks = 0
-
-    def placement(self, index: int) -> Placement:
-        """One placement as it was at the start."""
-        return self.start.placements[index]
-
-    def scene(self, held: tuple[int, Pose] | None = None) -> Scene:
-        """The scene now; `held` gives the index and pose of a body that is out of the physics."""
-        poses = {self.placement(i).id: self.bodies.pose(i) for i in self.bodies.rigid}
-        if held is not None:
-            poses[self.placement(held[0]).id] = held[1]
-        return self.start.with_poses(poses)
-
-    def count_ticks(self, num_ticks: int, held: tuple[int, Pose] | None = None) -> None:
-        """Note that physics has run, and let the onlooker look if it is time."""
-        self.num_ticks += num_ticks
-        self._unwatched_ticks += num_ticks
-        if self._unwatched_ticks >= settling.WATCH_TICKS and self._watch is not None:
-            self._unwatched_ticks = 0
-            self._watch(self.scene(held))
-
-    def settle(self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None) -> None:
-        """Run physics until all is at rest; the arm's next move happens meanwhile."""
-
-        def each(num_ticks: int) -> None:
-            self.count_ticks(num_ticks, held)
-            self.path.store(num_ticks, scene=lambda: self.scene(held))
-
-        held_index = held[0] if held else None
-        _, completed = settling.settle(self.bodies, apart_from=held_index, top_speed=top_speed, each=each)
-        self.completed = self.completed and completed
-
-    def finish(self) -> Scene:
-        """Put bodies that hardly moved back where they were; return the final scene, watched once more."""
-        poses = {}
-        for index in self.bodies.rigid:
-            before, after = self.placement(index).pose, self.bodies.pose(index)
-            if _is_still(before, after):
-                self.bodies.place(index, before)
-            else:
-                poses[self.placement(index).id] = after
-        self.bodies.refresh()
-        final = self.start.with_poses(poses)
-        if self._watch is not None:
-            self._watch(final)
-        return final
-
-
-def _is_still(before: Pose, after: Pose) -> bool:
-    if math.dist(before.position, after.position) > STILL_M:
-        return False
-    cosine = abs(sum(a * b for a, b in zip(before.quaternion, after.quaternion, strict=True)))
-    return cosine > math.cos(STILL_RAD / 2)
-
-
-def is_at_rest(bodies: Bodies) -> bool:
-    """Whether every free body stands on the floor and overlaps no other: nothing would move."""
-    for index in bodies.rigid:
-        pose = bodies.pose(index)
-        if abs(pose.z + bodies.lowest_z(index, pose.quaternion) - FLOOR_Z_M) > RESTING_GAP_M:
-            return False
-    return not any(
-        body_gap(bodies, index, other) < -RESTING_GAP_M
-        for index in bodies.rigid
-        for other in range(len(bodies.shapes))
-        if other < index or other not in bodies.rigid
-    )
 
 
 def pick_place(stage: Stage, action: Action) -> int | None:
@@ -362,7 +271,7 @@ class _Blade:
         corners = blade.inverse().transform(pose.transform(self._bodies.shapes[index].points[:, :3]))
         half = np.array(tools.BLADE_HALF_SIZE_M)
         low, high = corners.min(axis=0) - half, corners.max(axis=0) + half  # body grown by the blade
-        if not len(corners) or (low >= 0).any() or (high <= 0).any():
+        if (low >= 0).any() or (high <= 0).any():
             return False
         shifts = [(-low[0], 0.0), (-high[0], 0.0), (0.0, -low[1]), (0.0, -high[1])]
         along, across = min(shifts, key=lambda shift: abs(shift[0]) + abs(shift[1]))

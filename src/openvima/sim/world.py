@@ -10,6 +10,7 @@ from openvima.scene import Action, Scene
 from openvima.sim import end_effectors, primitives, ur5
 from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
+from openvima.sim.stage import Stage, is_at_rest
 
 _PARTING_SPEED = 0.1  # m/s, with which bodies that were loaded overlapping part, as gently as in VIMA-Bench
 
@@ -59,7 +60,7 @@ class World:
         self._bodies = Bodies(scene, assets)
         self._compat = compat
         self._joints = ur5.HOME
-        self._is_settled = primitives.is_at_rest(self._bodies)
+        self._is_settled = is_at_rest(self._bodies)
 
     @property
     def scene(self) -> Scene:
@@ -93,7 +94,7 @@ class World:
             What happened; `scene` and `joints` hold the new state.
         """
         path = ArmPath(self._joints, record, frames_per_second)
-        stage = primitives.Stage(self._scene, self._bodies, path, watch)
+        stage = Stage(self._scene, self._bodies, path, watch)
         if not self._is_settled:
             stage.settle(top_speed=_PARTING_SPEED)
             self._is_settled = True
@@ -103,7 +104,7 @@ class World:
         grasped_id = None if grasped is None else stage.placement(grasped).id
         return Execution(grasped_id, path.array(), stage.num_ticks, stage.completed)
 
-    def _perform(self, stage: primitives.Stage, action: Action) -> int | None:
+    def _perform(self, stage: Stage, action: Action) -> int | None:
         if self._scene.end_effector == "suction":
             return primitives.pick_place(stage, action)
         shortfall_m = end_effectors.BLADE_SHORTFALL_M
