@@ -4,8 +4,11 @@ import base64
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from openvima.errors import DatasetError
 from openvima.evaluation.results import write_text
@@ -91,6 +94,13 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
         raise DatasetError(
             f"{index} is damaged ({error}); delete {index.parent} and evaluate again."
         ) from error
+
+
+def png(image: Image.Image) -> bytes:
+    """Encode a picture as a PNG file."""
+    stream = BytesIO()
+    image.save(stream, "PNG", optimize=True)
+    return stream.getvalue()
 
 
 def _clip(record: dict[str, Any], folder: Path) -> Clip:  # Any: JSON

@@ -1,7 +1,6 @@
 """Filming episodes: the front view with the arm at work, below the prompt as a strip."""
 
 import math
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -95,13 +94,6 @@ def film_episode(
             times=math.ceil(_STILL_END_S * FRAMES_PER_SECOND),
         )
     return outcome
-
-
-def png(image: Image.Image) -> bytes:
-    """Encode a picture as a PNG file."""
-    stream = BytesIO()
-    image.save(stream, "PNG", optimize=True)
-    return stream.getvalue()
 
 
 def _composed(strip: np.ndarray | None, picture: np.ndarray, caption: np.ndarray | None) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import MissingExtraError
-from openvima.evaluation.clips import Clip, load_clips, save_clips
+from openvima.evaluation.clips import Clip, load_clips, png, save_clips
 from openvima.evaluation.protocol import Batch, EvaluationConfig, PolicySource, policy_sources
 from openvima.evaluation.results import Results, Row
 
@@ -99,7 +99,7 @@ def film(job: FilmJob) -> Clip:
     from PIL import Image
 
     from openvima.env.tabletop import TabletopEnv
-    from openvima.evaluation.film import Artist, film_episode, png
+    from openvima.evaluation.film import Artist, film_episode
     from openvima.evaluation.players import load_player
     from openvima.evaluation.prompt_strip import thumbnail
     from openvima.evaluation.runner import one_thread

@@ -162,7 +162,7 @@ def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
     margin = 4
     height = int(rows[-1] - rows[0]) + 1 + 2 * margin
     width = max(int(columns[-1] - columns[0]) + 1 + 2 * margin, height)
-    height = max(height, width // 3)
+    height = max(height, width // 2)
     top = int(rows[0] + rows[-1] + 1 - height) // 2
     left = int(columns[0] + columns[-1] + 1 - width) // 2
     cut = np.full((height, width, 3), 255, dtype=np.uint8)

@@ -6,6 +6,7 @@ take whole batches, so their number changes neither the batches nor the results.
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -119,16 +120,18 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
 
     Raises:
-        ConfigError: Two policies bear the same name.
+        ConfigError: Two policies bear the same name, or a name could not be part of a file's.
     """
     sources = []
     for given in policies:
         name, equals, source = given.partition("=")
         sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
     names = [source.name for source in sources]
-    repeated = sorted({name for name in names if names.count(name) > 1 or not name})
-    if repeated:
-        raise ConfigError(f"policies need distinct names, got {', '.join(names)}; name them as NAME=PATH.")
+    if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
+        raise ConfigError(
+            f"policies need distinct names of letters, digits, dots and hyphens, got {', '.join(names)}; "
+            "name them as NAME=PATH."
+        )
     return tuple(sources)
 
 

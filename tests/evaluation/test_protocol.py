@@ -1,0 +1,100 @@
+"""What is played: tasks, levels, seeds, batches, and the names of policies."""
+
+import pytest
+
+from openvima.errors import (
+    CheckpointError,
+    ConfigError,
+    LevelError,
+    UnknownPolicyError,
+    UnknownTaskError,
+)
+from openvima.evaluation.protocol import EvaluationConfig, cells, plan, policy_sources, weights_hash
+
+
+def test_every_seed_is_played_once_in_batches_of_the_given_size():
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=37, seed=100, batch=16)
+    batches = plan(config)
+    assert [batch.episodes for batch in batches] == [16, 16, 5]
+    assert [seed for batch in batches for seed in batch.seeds] == list(range(100, 137))
+
+
+def test_batches_do_not_depend_on_the_number_of_workers():
+    one, three = (EvaluationConfig(("oracle", "random"), workers=workers) for workers in (1, 3))
+    assert plan(one) == plan(three)
+    assert one.record() == three.record()
+
+
+def test_all_takes_from_each_level_the_tasks_that_it_holds():
+    pairs = cells(EvaluationConfig(("oracle",), levels=("L1", "L3")))
+    assert ("sweep_without_exceeding", "L1") in pairs
+    assert ("sweep_without_exceeding", "L3") not in pairs
+    assert ("rotate", "L3") in pairs
+
+
+def test_a_named_task_is_left_out_only_at_levels_without_it():
+    tasks = ("rotate", "sweep_without_exceeding")
+    pairs = cells(EvaluationConfig(("oracle",), tasks, ("L2", "L3")))
+    assert pairs == [("rotate", "L2"), ("sweep_without_exceeding", "L2"), ("rotate", "L3")]
+
+
+def test_a_named_task_that_no_level_holds_is_an_error():
+    config = EvaluationConfig(("oracle",), ("rotate", "sweep_without_exceeding"), ("L3",))
+    with pytest.raises(LevelError, match="sweep_without_exceeding exists at train, L1, L2"):
+        cells(config)
+
+
+def test_an_unknown_level_is_refused_with_those_there_are():
+    with pytest.raises(LevelError, match="Allowed: train, L1"):
+        cells(EvaluationConfig(("oracle",), levels=("l1",)))
+
+
+def test_a_mistyped_task_gets_a_suggestion():
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        cells(EvaluationConfig(("oracle",), ("rotat",)))
+
+
+def test_all_problems_of_the_settings_are_named_together():
+    with pytest.raises(ConfigError, match=r"episodes is 0.*workers is -1.*policy is empty"):
+        EvaluationConfig((), episodes=0, workers=-1)
+
+
+def test_run_folders_are_named_after_themselves_or_as_asked():
+    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "runs/third/model.safetensors"))
+    assert [source.name for source in sources] == ["first", "best", "oracle", "third"]
+    assert [source.kind for source in sources] == ["run", "run", "oracle", "run"]
+
+
+def test_two_policies_of_one_name_are_refused():
+    with pytest.raises(ConfigError, match="distinct names"):
+        policy_sources(("a/run", "b/run"))
+
+
+@pytest.mark.parametrize("given", ["../up=run", "a/b=run", "=run", "a b,c=run", "/"])
+def test_names_that_are_no_file_names_are_refused(given):
+    with pytest.raises(ConfigError, match="NAME=PATH"):
+        policy_sources((given,))
+
+
+def test_an_unknown_policy_is_refused_with_the_names_there_are():
+    with pytest.raises(UnknownPolicyError, match="Did you mean 'oracle'"):
+        policy_sources(("oracel",))[0].record()
+
+
+def test_a_folder_without_weights_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="holds no weights"):
+        weights_hash(tmp_path)
+
+
+def test_the_hash_of_a_run_changes_with_its_weights_only(tmp_path):
+    (tmp_path / "model.safetensors").write_bytes(b"one")
+    first = weights_hash(tmp_path)
+    (tmp_path / "train.log").write_text("noise")
+    assert weights_hash(tmp_path) == first
+    (tmp_path / "model.safetensors").write_bytes(b"two")
+    assert weights_hash(tmp_path) != first
+
+
+def test_stored_batches_of_other_weights_or_seeds_have_other_names():
+    first, second = plan(EvaluationConfig(("random",), ("rotate",), ("L1",), episodes=2, batch=1))
+    assert len({first.key("a"), first.key("b"), second.key("a")}) == 3

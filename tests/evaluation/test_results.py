@@ -1,0 +1,83 @@
+"""Counting outcomes, and writing and reading them."""
+
+import json
+
+import pytest
+
+from openvima.errors import DatasetError
+from openvima.evaluation.results import EpisodeOutcome, Results, Row, failure_kind, write_text
+from openvima.evaluation.statistics import wilson_interval
+
+
+def test_rows_hold_what_scripts_rely_on(results):
+    content = json.loads(results.to_json())
+    row = content["rows"][0]
+    assert content["schema"] == 1
+    assert (row["policy"], row["task"], row["level"]) == ("mine", "rotate", "L1")
+    assert (row["successes"], row["episodes"]) == (9, 10)
+    assert row["interval"] == pytest.approx(wilson_interval(9, 10), abs=1e-6)
+    assert row["seeds"] == [0, 9]
+    assert row["failures"] == {"object left the workspace": 1}
+    assert row["mean_steps"] == 2.0
+    assert len(row["outcomes"]) == 10
+
+
+def test_strict_successes_leave_out_those_slower_than_the_oracle_may_be():
+    quick, slow = EpisodeOutcome(0, True, 1), EpisodeOutcome(1, True, 3)
+    row = Row("mine", "rotate", "L1", 1, (quick, slow))
+    assert (row.successes, row.successes_strict) == (2, 1)
+
+
+def test_level_means_weigh_the_tasks_of_a_level_alike(results):
+    means = {(mean.policy, mean.level): mean for mean in results.level_means()}
+    assert means["mine", "L1"].mean == pytest.approx(0.75)
+    assert means["mine", "L1"].tasks == ("rotate", "stack<b>")
+    assert means["mine", "L3"].mean == pytest.approx(0.3)
+
+
+def test_written_results_are_read_back_equal(results, tmp_path):
+    path = results.write(tmp_path / "new" / "results.json")
+    assert Results.read(path) == results
+    assert Results.read(path.parent) == results
+    assert path.read_text() == results.to_json()
+
+
+def test_missing_results_say_which_command_makes_them(tmp_path):
+    with pytest.raises(DatasetError, match="openvima evaluate --out"):
+        Results.read(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"schema": 1}', '{"schema": 1, "rows": [{}]}'])
+def test_damaged_results_are_refused(tmp_path, text):
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(DatasetError, match="is damaged"):
+        Results.read(tmp_path)
+
+
+def test_results_of_another_schema_are_refused(tmp_path):
+    (tmp_path / "results.json").write_text('{"schema": 2}')
+    with pytest.raises(DatasetError, match="schema 2"):
+        Results.read(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
+    path = write_text(tmp_path / "a.json", "old")
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "\ud800")
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    ("reason", "kind"),
+    [
+        ("object 6 (red letter A) left the workspace", "object left the workspace"),
+        (
+            "distractor object 7 (gold heart) is within 0.1 m of the target of object 5 (blue bowl)",
+            "distractor object is within 0.1 m of the target of object",
+        ),
+        ("", "unknown"),
+    ],
+)
+def test_equal_causes_of_different_objects_count_as_one(reason, kind):
+    assert failure_kind(reason) == kind

@@ -1,0 +1,127 @@
+"""Playing episodes: who is asked when, and how episodes end."""
+
+import pytest
+
+from openvima.errors import ActionError, OracleError, PolicyError
+from openvima.evaluation.players import PolicyPlayer
+from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, NOTHING_PICKED, OUT_OF_STEPS, play
+from openvima.scene import RenderedPrompt
+
+
+class Env:
+    """An environment that ends as its script says: for each step what it changes in the info."""
+
+    def __init__(self, *script, end_effector="suction"):
+        self.script = list(script)
+        self.end_effector = end_effector
+        self.prompt = RenderedPrompt("Wait.", {})
+        self.actions = []
+
+    def reset(self, seed):
+        self.steps = 0
+        return {"seed": seed, "step": 0}, {}
+
+    def step(self, action):
+        if action == "bad":
+            raise ActionError("pose0_position is (9, 9). Nothing was moved.")
+        self.actions.append(action)
+        info = {
+            "success": False,
+            "failure": False,
+            "reason": "",
+            "grasped": None,
+            "end_effector": self.end_effector,
+        }
+        info |= self.script[self.steps]
+        self.steps += 1
+        terminated = info["success"] or info["failure"]
+        truncated = self.steps == len(self.script) and not terminated
+        return {"seed": 0, "step": self.steps}, 0.0, terminated, truncated, info
+
+
+class Player:
+    """Gives numbered actions and notes whom it was asked for."""
+
+    def __init__(self, decision="go"):
+        self.decision = decision
+        self.asked = []
+
+    def begin(self, envs):
+        self.num_envs = len(envs)
+
+    def decide(self, observations):
+        self.asked.append([observation is not None for observation in observations])
+        return [None if observation is None else self.decision for observation in observations]
+
+
+def test_success_failure_and_step_limit_are_told_apart():
+    solved = Env({}, {"success": True})
+    failed = Env({"failure": True, "reason": "object 5 (red letter A) left the workspace"})
+    slow = Env({"grasped": 5}, {}, {})
+    outcomes = play([solved, failed, slow], [10, 11, 12], Player())
+    assert [(o.seed, o.success, o.steps) for o in outcomes] == [(10, True, 2), (11, False, 1), (12, False, 3)]
+    assert outcomes[1].reason == "object 5 (red letter A) left the workspace"
+    assert [o.kind for o in outcomes] == ["", "object left the workspace", OUT_OF_STEPS]
+
+
+def test_the_player_is_asked_for_running_episodes_only():
+    player = Player()
+    play([Env({"success": True}), Env({}, {}, {})], [0, 1], player)
+    assert player.num_envs == 2
+    assert player.asked == [[True, True], [False, True], [False, True]]
+
+
+def test_an_episode_without_any_pick_is_counted_apart_with_the_suction_cup_only():
+    cup, spatula = Env({}, {}), Env({}, {}, end_effector="spatula")
+    assert [o.kind for o in play([cup, spatula], [0, 1], Player())] == [NOTHING_PICKED, OUT_OF_STEPS]
+
+
+def test_an_impossible_action_fails_its_episode_alone():
+    class HalfBad(Player):
+        def decide(self, observations):
+            return ["bad", *super().decide(observations)[1:]]
+
+    outcomes = play([Env({}), Env({"success": True})], [0, 1], HalfBad())
+    assert [(o.success, o.steps) for o in outcomes] == [(False, 0), (True, 1)]
+    assert outcomes[0].kind == BAD_ACTION
+    assert "pose0_position" in outcomes[0].reason
+
+
+def test_an_oracle_without_an_action_fails_the_episode():
+    (outcome,) = play([Env({})], [0], Player(OracleError("object 5 cannot be seen")))
+    assert (outcome.kind, outcome.reason) == (NO_ORACLE_ACTION, "object 5 cannot be seen")
+
+
+def test_a_policy_that_leaves_out_a_running_episode_is_an_error():
+    with pytest.raises(PolicyError, match="no action for seed 7"):
+        play([Env({})], [7], Player(None))
+
+
+def test_a_policy_with_too_few_actions_is_an_error():
+    class Short(Player):
+        def decide(self, observations):
+            return ["go"]
+
+    with pytest.raises(PolicyError, match="1 actions for 2"):
+        play([Env({}), Env({})], [0, 1], Short())
+
+
+def test_policies_get_prompts_and_observations():
+    class Policy:
+        def reset(self, prompts):
+            self.texts = [prompt.text for prompt in prompts]
+
+        def act(self, observations):
+            self.seen = observations
+            return ["go"] * len(observations)
+
+    policy = Policy()
+    play([Env({"success": True})], [3], PolicyPlayer(policy))
+    assert policy.texts == ["Wait."]
+    assert policy.seen == [{"seed": 3, "step": 0}]
+
+
+def test_whoever_watches_sees_every_step():
+    env, seen = Env({}, {}, {"success": True}), []
+    play([env], [0], Player(), after_step=lambda env: seen.append(env.steps))
+    assert seen == [1, 2, 3]

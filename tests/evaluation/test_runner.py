@@ -1,0 +1,106 @@
+"""Whole evaluations: same bytes for any number of workers, resumed where they stopped."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from openvima.errors import ConfigError
+from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
+
+ORACLE = EvaluationConfig(
+    ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2, report=False
+)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """The oracle's results, played by one process."""
+    return evaluate(replace(ORACLE, out=tmp_path_factory.mktemp("first")))
+
+
+def test_the_oracle_solves_its_episodes(first):
+    results = Results.read(first)
+    assert [(row.task, row.successes, row.episodes) for row in results.rows] == [
+        ("rotate", 3, 3),
+        ("sweep_without_exceeding", 3, 3),
+    ]
+    assert [outcome.seed for outcome in results.rows[0].outcomes] == [40, 41, 42]
+    assert results.policies == {"oracle": {"kind": "oracle"}}
+    assert "torch" not in results.versions
+
+
+def test_two_workers_give_the_same_bytes(first, tmp_path):
+    assert evaluate(replace(ORACLE, out=tmp_path, workers=2)).read_bytes() == first.read_bytes()
+
+
+def test_results_hold_no_times_and_the_log_apart_does(first):
+    assert "seconds" not in first.read_text()
+    assert json.loads((first.parent / "evaluation_log.json").read_text())["workers"] == 1
+
+
+def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, monkeypatch):
+    played = []
+
+    def play_two(job):
+        if len(played) == 2:
+            raise KeyboardInterrupt
+        played.append(job.batch)
+        return play_batch(job)
+
+    play_batch = runner.play_batch
+    config = replace(ORACLE, out=tmp_path)
+    monkeypatch.setattr(runner, "play_batch", play_two)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config)
+    assert not (tmp_path / "results.json").exists()
+    rest = []
+    monkeypatch.setattr(runner, "play_batch", lambda job: rest.append(job.batch) or play_batch(job))
+    assert evaluate(config).read_bytes() == first.read_bytes()
+    assert len(rest) == 2
+    assert not set(rest) & set(played)
+    assert not (tmp_path / "parts").exists()
+
+
+def test_a_damaged_part_is_played_again(first, tmp_path, monkeypatch):
+    config = replace(ORACLE, out=tmp_path)
+    play_batch = runner.play_batch
+
+    def damage(job):
+        outcomes = play_batch(job)
+        job.part.write_text(job.part.read_text()[:-20])
+        if job.batch.first_seed == 42 and job.batch.task == "rotate":
+            raise KeyboardInterrupt
+        return outcomes
+
+    monkeypatch.setattr(runner, "play_batch", damage)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config)
+    monkeypatch.setattr(runner, "play_batch", play_batch)
+    assert evaluate(config).read_bytes() == first.read_bytes()
+
+
+def test_finished_results_are_kept_and_others_not_overwritten(first, monkeypatch):
+    monkeypatch.setattr(runner, "play_batch", lambda job: pytest.fail("nothing should be played"))
+    config = replace(ORACLE, out=first.parent)
+    before = first.read_bytes()
+    assert evaluate(config) == first
+    with pytest.raises(ConfigError, match="--force"):
+        evaluate(replace(config, seed=41))
+    assert first.read_bytes() == before
+
+
+def test_force_overwrites_other_results(tmp_path):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path, report=False)
+    evaluate(config)
+    path = evaluate(replace(config, seed=5, force=True))
+    assert [outcome.seed for outcome in Results.read(path).rows[0].outcomes] == [5]
+
+
+def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
+    calls = []
+    config = EvaluationConfig(
+        ("oracle",), ("rotate",), ("L1",), episodes=3, batch=2, out=tmp_path, report=False
+    )
+    evaluate(config, lambda *call: calls.append(call))
+    assert calls == [(0, 3, ""), (2, 3, "oracle rotate L1"), (3, 3, "oracle rotate L1")]
