@@ -2,8 +2,8 @@
 
     python benchmarks/render.py [--assets procedural|CHECKOUT] [--rounds R] [--json FILE]
 
-One observation is RGB and segmentation of both views. Scenes are objects at random places: few small ones, the
-bodies with most triangles, and so on. Compilation and the making of shapes and textures are not counted.
+One observation is RGB and segmentation of both views. Scenes are objects at random places: few small ones,
+the bodies with most triangles, and so on. Compilation and the making of shapes and textures are not counted.
 """
 
 import argparse
@@ -17,6 +17,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numba
 import numpy as np
 
 from openvima.catalog import TEXTURES, Assets, object_spec
@@ -85,12 +86,9 @@ def measure(assets: Assets, num_rounds: int) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     """Measure, print a table, and write it as JSON if asked."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--assets", default="procedural", help="procedural, or a checkout of the original benchmark"
-    )
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--assets", default="procedural", help="procedural, or a checkout of VIMABench")
     parser.add_argument("--rounds", type=int, default=15, help=f"rounds of {CALLS_PER_ROUND} calls each")
     parser.add_argument("--json", type=Path, help="file to write the result to")
     arguments = parser.parse_args()
@@ -104,11 +102,7 @@ def main() -> None:
     observation = statistics.geometric_mean(row["observation"] for row in scenes.values())
     print(f"one observation, geometric mean: {observation:.3f} ms")
     if arguments.json:
-        machine = {
-            "platform": platform.platform(),
-            "processor": platform.processor(),
-            "numpy": np.__version__,
-        }
+        machine = {"platform": platform.platform(), "numpy": np.__version__, "numba": numba.__version__}
         result = {"observation_ms": observation, "assets": assets.name, "scenes": scenes, "machine": machine}
         arguments.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

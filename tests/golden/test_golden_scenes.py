@@ -1,8 +1,9 @@
 """Images of recorded scenes of the public benchmark, drawn from their poses with the original asset pack.
 
-The recordings and the pack are no part of the project; OPENVIMA_GOLDEN and OPENVIMA_REFERENCE_ASSETS name their
-folders. Tolerances: shapes agree to the pixel except where the benchmark lets bodies overlap at equal heights (there
-rounding decides, and they count as one); colours differ by JPEG decoding and by rounding at borders of texels.
+The recordings and the pack are no part of the project; OPENVIMA_GOLDEN and OPENVIMA_REFERENCE_ASSETS name
+their folders. Tolerances: shapes agree to the pixel except where the benchmark lets bodies overlap at equal
+heights (rounding decides there, so they count as one); colours differ by JPEG decoding and by rounding at the
+borders of texels.
 """
 
 import os
@@ -24,12 +25,8 @@ MAX_COLOUR_ERROR = 0.5  # of 255, mean of an image
 NAMES = sorted(path.stem for path in SCENES.glob("*.json"))
 
 pytestmark = [
-    pytest.mark.skipif(
-        not NAMES, reason=f"{SCENES} holds no recorded scenes; OPENVIMA_GOLDEN names another folder"
-    ),
-    pytest.mark.skipif(
-        not ASSETS.is_dir(), reason=f"{ASSETS} is absent; OPENVIMA_REFERENCE_ASSETS names another"
-    ),
+    pytest.mark.skipif(not NAMES, reason=f"{SCENES} holds no recorded scenes; set OPENVIMA_GOLDEN"),
+    pytest.mark.skipif(not ASSETS.is_dir(), reason=f"{ASSETS} is absent; set OPENVIMA_REFERENCE_ASSETS"),
 ]
 
 

@@ -41,6 +41,10 @@ def test_a_pixel_of_the_plain_image_is_the_lower_left_one_of_its_enlarged_block(
     )
 
 
+def test_an_enlarged_image_leaves_out_the_same_triangles() -> None:
+    assert TOP.enlarged(3).min_doubled_area_px2 == pytest.approx(9 * TOP.min_doubled_area_px2)
+
+
 def test_a_point_behind_the_camera_is_refused_by_name() -> None:
     with pytest.raises(CameraError, match=r"\(0\.5, 0\.0, 1001\.0\)"):
         project(np.array([[0.5, 0.0, 0.0], [0.5, 0.0, 1001.0]]), TOP)
