@@ -94,7 +94,7 @@ def _outcome(problem: Problem, progress: Progress, scene: Scene) -> Outcome:
             success=True, reason="all goals are met" if not progress.open_goals else _count(num_met)
         )
     if num_met > num_required:
-        return Outcome(failure=True, reason=f"{_count(num_met)}, but {num_required} were asked for")
+        return Outcome(failure=True, reason=f"{_count(num_met)} instead of {num_required}")
     left = _left_workspace(problem, progress, scene)
     return Outcome(failure=True, reason=left) if left else Outcome()
 

@@ -1,0 +1,231 @@
+"""Progress and outcome, by scenes laid out by hand on both sides of every limit."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from openvima.scene import (
+    AtPose,
+    DistractorsApart,
+    InZone,
+    NeverTouches,
+    Outcome,
+    Placement,
+    Pose,
+    Problem,
+    Prompt,
+    Scene,
+    Tolerance,
+    Zone,
+    ZoneKeptClear,
+)
+from openvima.tasks import Progress, advance, begin, watch
+
+BASE, TARGET, DISTRACTOR, SECOND = 5, 6, 7, 8
+BASE_POSE = Pose.planar(0.5, 0.2)
+
+
+def placed(object_id: int, x: float, y: float, yaw: float = 0.0, *, fixed: bool = False) -> Placement:
+    return Placement(object_id, "block", "red", (0.07, 0.07, 0.07), Pose.planar(x, y, yaw), fixed)
+
+
+def put_problem(**changes: object) -> Problem:
+    scene = Scene(
+        (placed(BASE, 0.5, 0.2, fixed=True), placed(TARGET, 0.4, -0.2), placed(DISTRACTOR, 0.6, -0.4))
+    )
+    goal = AtPose(TARGET, BASE_POSE, Tolerance(0.1), relative_to=BASE)
+    problem = Problem(
+        scene, Prompt("", ()), (goal,), (DistractorsApart((DISTRACTOR,)),), goal_order="sequential"
+    )
+    return replace(problem, **changes)
+
+
+def judged(problem: Problem, poses: dict[int, Pose]) -> Outcome:
+    return advance(problem, begin(problem), problem.scene.with_poses(poses))[1]
+
+
+def test_nothing_is_decided_at_the_start() -> None:
+    assert judged(put_problem(), {}) == Outcome()
+
+
+@pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.099, True), (0.101, False)])
+def test_the_object_has_to_be_near_the_base(distance: float, success: bool) -> None:
+    outcome = judged(put_problem(), {TARGET: BASE_POSE.moved(dy=-distance)})
+    assert (outcome.success, outcome.failure) == (success, False)
+
+
+@pytest.mark.parametrize(("distance", "failure"), [(0.099, True), (0.101, False)])
+def test_a_distractor_at_the_target_is_a_failure(distance: float, failure: bool) -> None:
+    outcome = judged(put_problem(), {DISTRACTOR: BASE_POSE.moved(dy=distance)})
+    assert outcome.failure is failure
+    assert ("distractor object 7 (red block) is within 0.1 m" in outcome.reason) is failure
+
+
+def test_an_object_on_a_distractor_is_a_failure_even_when_it_is_in_the_base() -> None:
+    poses = {TARGET: BASE_POSE.moved(dy=0.09), DISTRACTOR: BASE_POSE.moved(dy=0.12)}
+    outcome = judged(put_problem(), poses)
+    assert (
+        outcome.failure
+        and outcome.reason == "object 6 (red block) is where distractor object 7 (red block) is"
+    )
+
+
+def test_a_lost_object_is_a_failure_and_the_reason_names_it() -> None:
+    outcome = judged(put_problem(), {TARGET: Pose.planar(0.76, 0.0)})
+    assert outcome == Outcome(failure=True, reason="object 6 (red block) left the workspace")
+
+
+def test_distractors_may_leave_the_workspace() -> None:
+    assert judged(put_problem(), {DISTRACTOR: Pose.planar(0.9, 0.0)}) == Outcome()
+
+
+def test_without_distractors_nothing_can_be_too_near() -> None:
+    problem = put_problem(constraints=(DistractorsApart(()),))
+    assert judged(problem, {DISTRACTOR: BASE_POSE}) == Outcome()
+
+
+def rotate_problem(start: Pose, angle_rad: float) -> Problem:
+    scene = Scene((replace(placed(TARGET, 0, 0), pose=start), placed(DISTRACTOR, 0.6, 0.4, 0.3)))
+    tolerance = Tolerance(0.1, math.radians(15))
+    goal = AtPose(TARGET, start.rotated(angle_rad), tolerance, relative_to=TARGET)
+    return Problem(scene, Prompt("", ()), (goal,), (DistractorsApart((DISTRACTOR,)),))
+
+
+@pytest.mark.parametrize("start_deg", [0, 100, -130])
+@pytest.mark.parametrize("angle_deg", [-30, -60, -90, -120, -150])
+def test_an_object_has_to_be_turned_by_the_angle(start_deg: int, angle_deg: int) -> None:
+    start, angle = Pose.planar(0.4, 0.0, math.radians(start_deg)), math.radians(angle_deg)
+    problem = rotate_problem(start, angle)
+    for error_deg, success in ((0, True), (14.5, True), (-14.5, True), (15.5, False), (-15.5, False)):
+        pose = start.rotated(angle + math.radians(error_deg))
+        assert judged(problem, {TARGET: pose}).success is success, error_deg
+    assert judged(problem, {TARGET: start.rotated(angle).moved(dx=0.099)}).success
+    assert judged(problem, {TARGET: start.rotated(angle).moved(dx=0.101)}) == Outcome()
+    assert judged(problem, {TARGET: start.rotated(-angle)}) == Outcome()
+
+
+@pytest.mark.parametrize(("yaw_off_deg", "failure"), [(0, True), (14, True), (20, False)])
+def test_a_turned_object_matches_a_distractor_only_with_its_heading(
+    yaw_off_deg: float, failure: bool
+) -> None:
+    problem = rotate_problem(Pose.planar(0.4, 0.0), -1.0)
+    pose = Pose.planar(0.6, 0.35, 0.3 + math.radians(yaw_off_deg))
+    assert judged(problem, {TARGET: pose}).failure is failure
+
+
+def two_goals(**changes: object) -> Problem:
+    scene = Scene((placed(BASE, 0.5, 0.2, fixed=True), placed(TARGET, 0.4, -0.2), placed(SECOND, 0.6, -0.2)))
+    goals = tuple(AtPose(object_id, BASE_POSE, Tolerance(0.1)) for object_id in (TARGET, SECOND))
+    return replace(Problem(scene, Prompt("", ()), goals), **changes)
+
+
+def test_in_any_order_all_goals_met_at_once_count() -> None:
+    assert judged(two_goals(), {TARGET: BASE_POSE, SECOND: BASE_POSE}).success
+
+
+def test_in_sequence_only_the_first_open_goal_counts_in_a_step() -> None:
+    problem = two_goals(goal_order="sequential")
+    both = problem.scene.with_poses({TARGET: BASE_POSE, SECOND: BASE_POSE})
+    progress, outcome = advance(problem, begin(problem), both)
+    assert progress.open_goals == (1,) and outcome == Outcome()
+    assert advance(problem, progress, both)[1].success
+
+
+def test_in_sequence_the_second_goal_does_not_count_first() -> None:
+    problem = two_goals(goal_order="sequential")
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses({SECOND: BASE_POSE}))
+    assert progress.open_goals == (0, 1)
+
+
+def test_a_goal_once_met_stays_met_and_its_object_may_leave() -> None:
+    problem = two_goals()
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses({TARGET: BASE_POSE}))
+    away = problem.scene.with_poses({TARGET: Pose.planar(0.9, 0.0), SECOND: BASE_POSE})
+    progress, outcome = advance(problem, progress, away)
+    assert progress == Progress(()) and outcome.success
+
+
+def test_in_sequence_only_the_awaited_object_must_stay() -> None:
+    lost_second = {SECOND: Pose.planar(0.9, 0.0)}
+    assert judged(two_goals(goal_order="sequential"), lost_second) == Outcome()
+    assert judged(two_goals(), lost_second).failure
+
+
+ZONE, LINE = Zone(0.5, 0.0, 0.1, 0.27), Zone(0.41, 0.0, 0.04, 0.34)
+FRONT = {4: (0.65, -0.1), 5: (0.65, 0.0), 6: (0.65, 0.1), 7: (0.7, 0.1)}
+
+
+def sweep_problem(num_required: int) -> Problem:
+    blocks = tuple(
+        Placement(object_id, "small block", "red", (0.03,) * 3, Pose.planar(x, y, z=0.014))
+        for object_id, (x, y) in FRONT.items()
+    )
+    return Problem(
+        Scene(blocks, "spatula"),
+        Prompt("", ()),
+        tuple(InZone(object_id, ZONE) for object_id in (4, 5, 6)),
+        (NeverTouches((4, 5, 6), LINE, "line"), ZoneKeptClear((7,), ZONE)),
+        num_required=num_required,
+    )
+
+
+def in_zone(*object_ids: int) -> dict[int, Pose]:
+    return {object_id: Pose.planar(0.5, 0.05 * (object_id - 5), z=0.014) for object_id in object_ids}
+
+
+@pytest.mark.parametrize("num_required", [1, 2, 3])
+@pytest.mark.parametrize("num_swept", [0, 1, 2, 3])
+def test_exactly_the_asked_number_has_to_be_swept(num_required: int, num_swept: int) -> None:
+    outcome = judged(sweep_problem(num_required), in_zone(*(4, 5, 6)[:num_swept]))
+    assert outcome.success is (num_swept == num_required)
+    assert outcome.failure is (num_swept > num_required)
+
+
+def test_swept_blocks_add_up_over_steps_and_stay_counted() -> None:
+    problem = sweep_problem(2)
+    progress, outcome = advance(problem, begin(problem), problem.scene.with_poses(in_zone(4)))
+    assert not outcome.is_over
+    out_again = problem.scene.with_poses(in_zone(5))
+    assert advance(problem, progress, out_again)[1].success
+
+
+def test_one_too_many_is_told_with_both_numbers() -> None:
+    assert judged(sweep_problem(1), in_zone(4, 5)).reason == "2 goals are met instead of 1"
+
+
+def test_touching_the_line_for_a_moment_is_a_failure_for_good() -> None:
+    problem = sweep_problem(1)
+    progress = watch(problem, begin(problem), problem.scene.with_poses({4: Pose.planar(0.42, 0, z=0.014)}))
+    assert progress.violation == "object 4 (red small block) touched the line"
+    back = problem.scene.with_poses(in_zone(4))
+    progress = watch(problem, progress, back)
+    progress, outcome = advance(problem, progress, back)
+    assert outcome.failure and outcome.reason == "object 4 (red small block) touched the line"
+
+
+def test_distractors_may_touch_the_line_but_not_end_in_the_zone() -> None:
+    problem = sweep_problem(1)
+    assert judged(problem, {7: Pose.planar(0.41, 0.0, z=0.014)}) == Outcome()
+    outcome = judged(problem, {**in_zone(4), 7: Pose.planar(0.5, 0.1, z=0.014)})
+    assert outcome.failure and outcome.reason == "distractor object 7 (red small block) is in the goal zone"
+
+
+@pytest.mark.parametrize(("x", "failure"), [(0.5649, True), (0.5651, False)])
+def test_one_point_of_a_distractor_in_the_zone_is_enough(x: float, failure: bool) -> None:
+    assert judged(sweep_problem(1), {7: Pose.planar(x, 0.0, z=0.014)}).failure is failure
+
+
+def test_a_lost_block_is_a_failure_unless_it_was_counted() -> None:
+    problem = sweep_problem(2)
+    assert judged(problem, {6: Pose.planar(0.76, 0.0)}).failure
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses(in_zone(6)))
+    assert not advance(problem, progress, problem.scene.with_poses({6: Pose.planar(0.76, 0)}))[1].is_over
+
+
+def test_judging_changes_nothing() -> None:
+    problem = sweep_problem(1)
+    progress = begin(problem)
+    scene = problem.scene.with_poses(in_zone(4))
+    assert advance(problem, progress, scene) == advance(problem, progress, scene)
+    assert progress == begin(problem)

@@ -1,0 +1,87 @@
+"""Every task file is on the list and agrees with the catalogue."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from openvima.catalog import Level, levels_of, pool
+from openvima.errors import LevelError, UnknownTaskError
+from openvima.tasks import list_tasks, register_task, sample_episode, task_spec
+
+TASKS = list_tasks()
+
+
+def test_the_list_holds_the_tasks_in_order() -> None:
+    assert {"visual_manipulation", "rotate", "sweep_without_exceeding"} <= set(TASKS)
+    assert list(TASKS) == sorted(TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_task_is_defined_where_the_catalogue_has_a_pool_for_it(task: str) -> None:
+    spec = task_spec(task)
+    assert spec.levels == levels_of(task)
+    assert all(spec.pool(level) == pool(task, level) for level in spec.levels)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_l1_draws_from_the_pool_of_training(task: str) -> None:
+    levels = task_spec(task).levels
+    assert ("train" in levels) == ("L1" in levels)
+    if "train" in levels:
+        assert task_spec(task).pool("L1") == task_spec(task).pool("train")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_task_describes_itself(task: str) -> None:
+    spec = task_spec(task)
+    assert spec.summary.endswith(".") and spec.template.endswith(".") and spec.family
+    assert spec.max_steps == spec.oracle_max_steps + 2
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_prompt_follows_the_template(task: str) -> None:
+    spec = task_spec(task)
+    pattern = re.escape(spec.template).replace(r"\{", "{").replace(r"\}", "}")
+    pattern = re.sub(r"\{(\w+)\}", r"(\\{\1\\}|[\\w-]+)", pattern)
+    for seed in range(5):
+        text = sample_episode(task, level=spec.levels[0], seed=seed).problem.prompt.text
+        assert re.fullmatch(pattern, text), text
+
+
+def test_a_mistyped_task_gets_a_suggestion() -> None:
+    with pytest.raises(UnknownTaskError, match=r"no task 'rotat'\. Did you mean 'rotate'\?"):
+        task_spec("rotat")
+
+
+def test_a_level_without_the_task_is_refused() -> None:
+    with pytest.raises(LevelError, match="'rotate' is not defined at level L4; use train, L1, L2, L3"):
+        task_spec("rotate").pool("L4")
+    with pytest.raises(LevelError, match="no level 'L5'"):
+        task_spec("rotate").pool("L5")
+
+
+def test_a_name_can_be_registered_once_only() -> None:
+    with pytest.raises(ValueError, match="registered twice"):
+        register_task("rotate", family="x", template="x.", oracle_max_steps=1)(sample_episode)
+
+
+def test_a_new_task_may_bring_its_own_pools() -> None:
+    pools: dict[Level, object] = {"train": pool("rotate", "train")}
+    register_task("test only", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample_episode)  # type: ignore[arg-type]
+    try:
+        assert task_spec("test only").levels == ("train",)
+    finally:
+        from openvima.tasks import registry
+
+        del registry._TASKS["test only"]
+
+
+def test_the_list_of_tasks_needs_no_compiled_code() -> None:
+    code = (
+        "import sys; from openvima.tasks import list_tasks; list_tasks(); "
+        "print({'numba', 'mujoco', 'torch'} & set(sys.modules))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "set()"

@@ -1,0 +1,260 @@
+"""Free places, sizes, crowding, redraws; what a sampled episode promises whatever the task."""
+
+import collections
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from openvima.catalog import Assets, object_spec, pool
+from openvima.errors import ConfigError, LevelError, SamplingError, UnknownTaskError
+from openvima.render.labels import label_raster
+from openvima.scene import (
+    FIRST_OBJECT_ID,
+    AtPose,
+    Episode,
+    ObjectImage,
+    Outcome,
+    Placement,
+    Pose,
+    in_workspace,
+)
+from openvima.tasks import (
+    TableSampler,
+    advance,
+    begin,
+    list_tasks,
+    register_task,
+    registry,
+    sample_episode,
+    task_spec,
+)
+from openvima.tasks.sampling import CELL_M, is_in_hollow
+from strategies import seeds
+
+EVERYWHERE = [(task, level) for task in list_tasks() for level in task_spec(task).levels]
+
+
+def table_for(assets: Assets, *, seed: int = 0, compat: bool = False) -> TableSampler:
+    rng = np.random.default_rng(seed)
+    return TableSampler(rng, pool("visual_manipulation", "train"), assets=assets, compat=compat)
+
+
+def roles(episode: Episode) -> tuple[Placement, Placement]:
+    """Target and base of an episode of `visual_manipulation`."""
+    (goal,) = episode.problem.goals
+    scene = episode.problem.scene
+    assert isinstance(goal, AtPose) and goal.relative_to is not None
+    return scene[goal.object_id], scene[goal.relative_to]
+
+
+@pytest.mark.parametrize(("task", "level"), EVERYWHERE)
+def test_the_same_seed_gives_the_same_episode_and_another_seed_another(task: str, level: str) -> None:
+    episodes = [sample_episode(task, level=level, seed=seed) for seed in (3, 3, 4)]
+    assert episodes[0] == episodes[1]
+    assert episodes[0].problem != episodes[2].problem
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_domains_and_levels_share_no_scene(task: str) -> None:
+    level = task_spec(task).levels[0]
+    scenes = [
+        sample_episode(task, level=level, seed=seed, domain=domain).problem.scene
+        for domain in ("train", "eval", "user")
+        for seed in range(20)
+    ]
+    scenes += [
+        sample_episode(task, level=task_spec(task).levels[1], seed=seed).problem.scene for seed in range(20)
+    ]
+    assert len(set(scenes)) == len(scenes)
+
+
+@settings(max_examples=60)
+@given(seeds)
+def test_every_start_is_open_inside_the_workspace_and_numbered_without_gaps(seed: int) -> None:
+    task, level = EVERYWHERE[seed % len(EVERYWHERE)]
+    episode = sample_episode(task, level=level, seed=seed)
+    problem, scene = episode.problem, episode.problem.scene
+    first = FIRST_OBJECT_ID[scene.end_effector]
+    assert [p.id for p in scene.placements] == list(range(first, first + len(scene.placements)))
+    assert all(in_workspace(p.pose) for p in scene.placements)
+    assert advance(problem, begin(problem), scene) == (begin(problem), Outcome())
+    assert (episode.task, episode.level, episode.seed, episode.domain) == (task, level, seed, "user")
+    assert episode.max_steps == episode.oracle_max_steps + 2
+
+
+@pytest.mark.parametrize(("task", "level"), EVERYWHERE)
+def test_objects_start_at_rest_or_hover_with_compat(task: str, level: str, assets: Assets) -> None:
+    for placement in sample_episode(task, level=level, seed=1).problem.scene.placements:
+        rest_z_m = assets.geometry(placement.object, placement.size, placement.scale).rest_z_m
+        assert placement.pose.z == rest_z_m
+    for placement in sample_episode(task, level=level, seed=1, compat=True).problem.scene.placements:
+        assert placement.pose.z == placement.size[2] / 2
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_no_two_objects_cover_the_same_cell(task: str, assets: Assets) -> None:
+    for seed in range(30):
+        scene = sample_episode(task, seed=seed).problem.scene
+        movable = [p for p in scene.placements if task != "sweep_without_exceeding" or not p.fixed]
+        alone = sum((label_raster([p], assets) > 0).astype(int) for p in movable)
+        assert np.max(alone) <= 1, seed
+
+
+def test_ids_say_nothing_about_roles() -> None:
+    episodes = [sample_episode("visual_manipulation", seed=seed) for seed in range(1200)]
+    counts = collections.Counter(roles(episode)[0].id for episode in episodes)
+    # 1200 draws over three ids: the standard deviation of each count is 16.3.
+    assert set(counts) == {5, 6, 7} and all(abs(count - 400) < 65 for count in counts.values())
+    bases = collections.Counter(roles(episode)[1].id for episode in episodes)
+    assert all(abs(bases[object_id] - 400) < 65 for object_id in (5, 6, 7))
+
+
+def test_goals_constraints_and_prompt_follow_the_ids() -> None:
+    for seed in range(30):
+        episode = sample_episode("visual_manipulation", seed=seed)
+        target, base = roles(episode)
+        shown = {
+            name: fill.placement
+            for name, fill in episode.problem.prompt.images
+            if isinstance(fill, ObjectImage)
+        }
+        assert shown == {"dragged_obj_1": target, "base_obj": base}
+        (constraint,) = episode.problem.constraints
+        assert set(constraint.object_ids) == {5, 6, 7} - {target.id, base.id}
+
+
+def test_compat_keeps_the_order_of_placing() -> None:
+    for seed in range(20):
+        target, base = roles(sample_episode("visual_manipulation", seed=seed, compat=True))
+        assert (base.id, target.id) == (5, 6)
+
+
+def test_a_free_place_keeps_half_a_window_from_edge_and_objects(assets: Assets) -> None:
+    table = table_for(assets)
+    table.add("block", "red", size=(0.07, 0.07, 0.07), pose=Pose.planar(0.5, 0.0))
+    size = object_spec("letter A").size_max
+    half = round(float(np.hypot(size[0], size[1])) / CELL_M) / 2 * CELL_M
+    for _ in range(200):
+        pose = table.free_pose("letter A", size)
+        assert pose is not None
+        assert 0.25 + half <= pose.x <= 0.75 - half and -0.5 + half <= pose.y <= 0.5 - half
+        assert max(abs(pose.x - 0.5), abs(pose.y)) >= 0.035 + half - 2 * CELL_M
+
+
+def test_places_and_headings_are_uniform_over_what_is_free(assets: Assets) -> None:
+    table = table_for(assets)
+    poses = [table.free_pose("block", (0.07, 0.07, 0.07)) for _ in range(1000)]
+    xs, ys, yaws = np.array([(p.x, p.y, p.yaw_rad) for p in poses if p is not None]).T
+    for values, low, high in ((xs, 0.303, 0.697), (ys, -0.447, 0.447), (yaws, -np.pi, np.pi)):
+        counts, _ = np.histogram(values, bins=10, range=(low, high))
+        assert (
+            counts.sum() == 1000 and ((counts - 100) ** 2 / 100).sum() < 27.9
+        )  # chi-square, 9 degrees, p = 0.001
+
+
+def test_a_crowded_table_has_no_free_place(assets: Assets) -> None:
+    table = table_for(assets)
+    for y in np.linspace(-0.4, 0.4, 7):
+        table.add("pallet", "red", size=(0.21, 0.175, 0.035), pose=Pose.planar(0.5, float(y)))
+    assert table.free_pose("letter A", object_spec("letter A").size_max) is None
+    with pytest.raises(SamplingError, match="only 0 of 1 × target found a place in 10 tries"):
+        table.place_one("target", lambda: ("letter A", "red"))
+
+
+def test_the_bars_of_a_square_stay_on_the_table_and_off_other_objects(assets: Assets) -> None:
+    # Its nominal size is one bar of 0.2 × 0.04 m; what is seen is 0.24 × 0.24 m.
+    size = object_spec("square").size_max
+    for seed in range(40):
+        table = table_for(assets, seed=seed)
+        letter = table.place_one("target", lambda: ("letter T", "red"))
+        pose = table.free_pose("square", size)
+        if pose is None:
+            continue
+        square = Placement(9, "square", "blue", size, pose.moved(dz=0.001), fixed=True)
+        corners = pose.transform(np.array([[x, y, 0] for x in (-0.12, 0.12) for y in (-0.1, 0.1)]))
+        assert (corners[:, 0] > 0.249).all() and (np.abs(corners[:, 1]) < 0.501).all()
+        both = (label_raster([letter], assets) > 0) & (label_raster([square], assets) > 0)
+        assert not both.any()
+
+
+@pytest.mark.parametrize(
+    ("size", "base", "reach"),
+    [
+        ((0.144, 0.144, 0.036), "frame", 0.1945),
+        ((0.144, 0.144, 0.036), "square", 0.182),
+        ((0.128, 0.128, 0.032), "frame", 0.1865),
+        ((0.128, 0.128, 0.032), "square", 0.174),
+        ((0.07, 0.07, 0.07), "frame", 0.1575),
+        ((0.07, 0.07, 0.07), "square", 0.145),
+        ((0.07, 0.07, 0.07), "container", None),
+    ],
+)
+def test_hollow_bases_keep_objects_out_of_their_middle(
+    size: tuple[float, float, float], base: str, reach: float | None
+) -> None:
+    hollow = Placement(5, base, "red", object_spec(base).size_max, Pose.planar(0.5, 0.0), fixed=True)
+
+    def inside(distance: float) -> bool:
+        return is_in_hollow(Placement(6, "any", "red", size, Pose.planar(0.5, distance)), hollow)
+
+    if reach is None:
+        assert not inside(0.0)
+    else:
+        assert inside(reach - 1e-9) and not inside(reach + 1e-6)
+
+
+def test_sizes_are_drawn_axis_by_axis(assets: Assets) -> None:
+    table = table_for(assets)
+    sizes = np.array([table.sample_size("container") for _ in range(200)])
+    assert (sizes.min(axis=0) >= (0.15, 0.15, 0.05)).all() and (sizes.max(axis=0) <= (0.17, 0.17, 0.05)).all()
+    assert abs(np.corrcoef(sizes[:, 0], sizes[:, 1])[0, 1]) < 0.25
+
+
+def unlucky_task(num_failures: int) -> list[int]:
+    calls: list[int] = []
+
+    def sample(table: TableSampler) -> object:
+        calls.append(int(table.rng.integers(2**60)))
+        if len(calls) <= num_failures:
+            raise SamplingError("no luck.")
+        return task_spec("rotate").sample(table)
+
+    pools = task_spec("rotate").pools
+    register_task("unlucky", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)  # type: ignore[arg-type]
+    return calls
+
+
+def test_an_unlucky_draw_is_repeated_with_other_numbers_and_counted() -> None:
+    calls = unlucky_task(3)
+    try:
+        assert sample_episode("unlucky", seed=0).num_redraws == 3
+        assert len(set(calls)) == 4
+    finally:
+        del registry._TASKS["unlucky"]
+
+
+def test_a_hundred_unlucky_draws_are_an_error() -> None:
+    unlucky_task(1000)
+    try:
+        with pytest.raises(
+            SamplingError, match="101 draws of unlucky at level train, seed 5, failed: no luck"
+        ):
+            sample_episode("unlucky", seed=5)
+    finally:
+        del registry._TASKS["unlucky"]
+
+
+def test_wrong_arguments_are_refused_by_name() -> None:
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        sample_episode("rotat", seed=0)
+    with pytest.raises(LevelError, match="not defined at level L3"):
+        sample_episode("sweep_without_exceeding", level="L3", seed=0)
+    with pytest.raises(ConfigError, match="Did you mean 'num_distractors'"):
+        sample_episode("rotate", seed=0, num_distractor=2)
+    with pytest.raises(ConfigError, match=r"difficulty 'esy'\. Did you mean 'easy'"):
+        sample_episode("rotate", seed=0, difficulty="esy")
+    with pytest.raises(ConfigError, match="num_distractors is 9; give an integer from 0 to 6"):
+        sample_episode("rotate", seed=0, num_distractors=9)
+    with pytest.raises(ConfigError, match="seed is -1"):
+        sample_episode("rotate", seed=-1)
