@@ -60,9 +60,9 @@ def test_all_problems_of_the_settings_are_named_together():
 
 
 def test_run_folders_are_named_after_themselves_or_as_asked():
-    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "runs/third/model.safetensors"))
-    assert [source.name for source in sources] == ["first", "best", "oracle", "third"]
-    assert [source.kind for source in sources] == ["run", "run", "oracle", "run"]
+    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "nano"))
+    assert [source.name for source in sources] == ["first", "best", "oracle", "nano"]
+    assert [source.kind for source in sources] == ["run", "run", "oracle", "untrained"]
 
 
 def test_two_policies_of_one_name_are_refused():

@@ -1,6 +1,5 @@
 """Who decides in an episode: the oracle, which asks the environment, or a policy, which sees observations."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol
@@ -68,7 +67,7 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
     """Make the player of a batch of episodes.
 
     Args:
-        batch: What will be played; for a random policy, it decides what is drawn.
+        batch: What will be played.
         fingerprint: Text that stands for the policy's weights; a policy that was loaded before is used again
             only if it is the same.
 
@@ -78,10 +77,6 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
     """
     if batch.source == ORACLE:
         return OraclePlayer()
-    if batch.source == "random":
-        from openvima.policies import load_policy
-
-        return PolicyPlayer(load_policy("random", seed=_draw_seed(batch)))
     return PolicyPlayer(_load_policy(batch.source, fingerprint))
 
 
@@ -90,12 +85,6 @@ def _load_policy(source: str, fingerprint: str) -> Any:  # Any: see `PolicyPlaye
     from openvima.policies import load_policy
 
     return load_policy(source)
-
-
-def _draw_seed(batch: Batch) -> int:
-    """Seed for what a random policy draws: another one for every batch, whoever plays it."""
-    text = f"{batch.task}/{batch.level}/{batch.first_seed}"
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
 def _oracle(env: TabletopEnv) -> Action | OracleError:

@@ -13,11 +13,13 @@ from pathlib import Path
 
 from openvima.catalog.partitions import LEVELS
 from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
+from openvima.policies.base import checkpoint_folder
+from openvima.policies.presets import PRESETS
 from openvima.tasks.registry import list_tasks, task_spec
 
 ORACLE = "oracle"
 NAMED_POLICIES = (ORACLE, "random", "untrained")
-_WEIGHTS = (".safetensors", ".ckpt", ".pt", ".pth", ".bin")
+_WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +95,7 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained" or the path of a run folder or checkpoint.
+        source: "oracle", "random", "untrained", the name of a preset, or the path of a run folder.
     """
 
     name: str
@@ -101,7 +103,9 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """The source itself if it is one of the named policies, else "run"."""
+        """What it is: "oracle", "random", "untrained" (also for a preset's name) or "run"."""
+        if self.source in PRESETS:
+            return "untrained"
         return self.source if self.source in NAMED_POLICIES else "run"
 
     def record(self) -> dict[str, str]:
@@ -111,9 +115,9 @@ class PolicySource:
             UnknownPolicyError: There is no such run folder.
             CheckpointError: The run folder holds no weights.
         """
-        if self.kind != "run":
-            return {"kind": self.kind}
-        return {"kind": "run", "sha256": weights_hash(Path(self.source))}
+        if self.kind == "run":
+            return {"kind": "run", "sha256": weights_hash(Path(self.source))}
+        return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
 
 def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
@@ -135,21 +139,20 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     return tuple(sources)
 
 
-def weights_hash(path: Path) -> str:
-    """SHA-256 over the files of weights in a run folder, or over one checkpoint file, as hexadecimal text.
+def weights_hash(folder: Path) -> str:
+    """SHA-256 over the weights that a run folder or checkpoint folder stands for, as hexadecimal text.
 
     Raises:
-        UnknownPolicyError: There is no such file or folder.
-        CheckpointError: The folder holds no weights.
+        UnknownPolicyError: There is no such folder.
+        CheckpointError: It holds no weights.
     """
-    if not path.exists():
-        hint = unknown_name("policy", str(path), NAMED_POLICIES)
-        raise UnknownPolicyError(f"{hint} Or give the folder of a training run.")
-    files = [path] if path.is_file() else sorted(f for f in path.rglob("*") if f.suffix in _WEIGHTS)
+    if not folder.is_dir():
+        known = (*NAMED_POLICIES, *PRESETS)
+        hint = f"Give the folder of a training run or one of {', '.join(known)}."
+        raise UnknownPolicyError(unknown_name("policy", str(folder), known, hint))
+    files = sorted(file for file in checkpoint_folder(folder).iterdir() if file.suffix in _WEIGHTS)
     if not files:
-        raise CheckpointError(
-            f"{path} holds no weights ({', '.join(_WEIGHTS)}); give the folder of a training run."
-        )
+        raise CheckpointError(f"{folder} holds no weights; give the folder of a training run.")
     digest = hashlib.sha256()
     for file in files:
         with open(file, "rb") as stream:
@@ -243,7 +246,4 @@ def plan(config: EvaluationConfig) -> list[Batch]:
 
 
 def _default_name(source: str) -> str:
-    if source in NAMED_POLICIES:
-        return source
-    path = Path(source)
-    return path.parent.name if path.suffix in _WEIGHTS else path.name
+    return source if source in NAMED_POLICIES else Path(source).name
