@@ -13,6 +13,7 @@ from pathlib import Path
 
 from golden_scenes import GoldenScene, interpenetrating, ious, mean_colour_error, read_scenes
 from openvima.catalog.original import OriginalAssets
+from openvima.errors import AssetError
 from openvima.render import VIEWS, Rasteriser
 from openvima.scene import FIRST_OBJECT_ID
 
@@ -65,7 +66,10 @@ def main() -> None:
     parser.add_argument("--assets", type=Path, required=True, help="checkout with the original asset pack")
     parser.add_argument("--json", type=Path, help="file to write the result to")
     arguments = parser.parse_args()
-    rasteriser = Rasteriser(OriginalAssets(arguments.assets))
+    try:
+        rasteriser = Rasteriser(OriginalAssets(arguments.assets))
+    except AssetError as error:
+        parser.error(str(error))
     tasks: dict[str, Agreement] = {}
     for golden in read_scenes(arguments.scenes):
         compare(golden, rasteriser, tasks.setdefault(golden.task, Agreement()))
