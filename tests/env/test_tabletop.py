@@ -246,6 +246,14 @@ def test_rendering_shows_both_views() -> None:
     assert np.array_equal(np.moveaxis(image[128:], -1, 0), observation["rgb"]["top"])
 
 
+def test_the_arm_is_shown_only_if_asked_for() -> None:
+    hidden, shown = (TabletopEnv("rotate", hide_arm=hide_arm) for hide_arm in (True, False))
+    segm = [env.reset(seed=0)[0]["segm"] for env in (hidden, shown)]
+    ids = [set(np.unique(views["front"]).tolist()) for views in segm]
+    assert ids[0].isdisjoint({2, 3, 4})
+    assert 2 in ids[1]
+
+
 def test_closing_twice_is_fine_and_a_reset_opens_again() -> None:
     env = TabletopEnv("rotate")
     env.reset(seed=0)

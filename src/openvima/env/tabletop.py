@@ -12,8 +12,8 @@ from gymnasium import spaces
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError, EpisodeError
-from openvima.render.camera import VIEWS
-from openvima.render.rasteriser import Rasteriser
+from openvima.render.camera import VIEWS, View
+from openvima.render.rasteriser import Image, Rasteriser
 from openvima.scene import (
     ACTION_SHAPES,
     END_EFFECTORS,
@@ -78,7 +78,7 @@ class _Run:
 class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     """A UR5 arm at a table: read a prompt, look from two cameras, pick and place or sweep.
 
-    **Observation** — a dictionary; the cameras `front` and `top` are fixed, the arm is not shown.
+    **Observation** — a dictionary; the cameras `front` and `top` are fixed.
 
     | key | shape, dtype | meaning |
     |---|---|---|
@@ -120,6 +120,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
         compat: Follow the original benchmark also where it is odd: objects hover at the start, ids follow
             the order of spawning, the oracle picks any visible point.
+        hide_arm: Leave arm and tool out of the images, as in all published data; else they are ids 2 to 4.
         realtime: Record `frames`, 30 a second, while a step runs.
         render_mode: None, or "rgb_array": `render` returns both views, front above top.
         **task_options: Arguments of the task.
@@ -139,6 +140,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         domain: str = "user",
         assets: str | Path | Assets = "procedural",
         compat: bool = False,
+        hide_arm: bool = True,
         realtime: bool = False,
         render_mode: str | None = None,
         **task_options: Any,
@@ -149,6 +151,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self.domain = domain
         self.assets = load_assets(assets)
         self.compat = compat
+        self.hide_arm = hide_arm
         self.realtime = realtime
         self.render_mode = render_mode
         self.task_options = task_options
@@ -221,7 +224,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         """
         if self.render_mode is None:
             return None
-        images = self._rasteriser.scene(self.scene)
+        images = self._images()
         return np.concatenate([np.moveaxis(images[view].rgb, 0, -1) for view in VIEWS])
 
     def close(self) -> None:
@@ -299,13 +302,21 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             **self.task_options,
         )
 
+    def _images(self) -> dict[View, Image]:
+        world = self._running().world
+        scene = world.scene
+        if self.hide_arm:
+            return self._rasteriser.scene(scene)
+        from openvima.sim.arm_view import arm_drawables
+
+        return self._rasteriser.scene(scene, extra=arm_drawables(world.joints, scene.end_effector))
+
     def _observe(self) -> dict[str, Any]:
-        scene = self.scene
-        images = self._rasteriser.scene(scene)
+        images = self._images()
         return {
             "rgb": {view: images[view].rgb for view in VIEWS},
             "segm": {view: images[view].segm for view in VIEWS},
-            "ee": END_EFFECTORS.index(scene.end_effector),
+            "ee": END_EFFECTORS.index(self.scene.end_effector),
         }
 
     def _info(self) -> dict[str, Any]:
