@@ -42,5 +42,6 @@ def main(
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = film_episode(env, load_player(batch), seed, out, title=title)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
-    print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {outcome.steps} steps")
+    steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
+    print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {steps}")
     return 0

@@ -91,7 +91,10 @@ def print_results(results: "Results") -> None:
 
     policies = results.policy_names()
     means = {(mean.policy, mean.level): mean for mean in results.level_means()}
-    table = Table("level", "task", *policies, title="solved episodes in per cent (95 % interval)")
+    table = Table("level", title="solved episodes in per cent (95 % interval)")
+    table.add_column("task", overflow="fold", min_width=12)
+    for policy in policies:
+        table.add_column(policy, justify="right", no_wrap=True)
     for level in results.levels():
         for task in results.tasks(level):
             rows = (results.row(policy, task, level) for policy in policies)
@@ -103,7 +106,7 @@ def print_results(results: "Results") -> None:
 
 
 def _cell(rate: float, interval: tuple[float, float]) -> str:
-    return f"{100 * rate:5.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
+    return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -9,10 +9,9 @@ from pathlib import Path
 
 from openvima.errors import MissingExtraError
 from openvima.evaluation.clips import Clip, load_clips, png, save_clips
-from openvima.evaluation.protocol import Batch, EvaluationConfig, PolicySource, policy_sources
+from openvima.evaluation.protocol import DEFAULT_BATCH, Batch, EvaluationConfig, PolicySource, policy_sources
 from openvima.evaluation.results import Results, Row
 
-Report = Callable[[int, int, str], None]
 REPORT_NAME = "report.html"
 _METRICS = "metrics.jsonl"  # what a training run writes into its folder
 
@@ -39,13 +38,13 @@ def require_extra() -> None:
         )
 
 
-def finish(config: EvaluationConfig, results: Results, report: Report | None = None) -> Path:
+def finish(config: EvaluationConfig, results: Results, note: Callable[[str], None] | None = None) -> Path:
     """Film some of the episodes and write `report.html`.
 
     Args:
         config: The evaluation's settings.
         results: What it found.
-        report: Called with films done, films in all and a note.
+        note: Called after each film with what was done.
 
     Returns:
         The report.
@@ -59,8 +58,8 @@ def finish(config: EvaluationConfig, results: Results, report: Report | None = N
         filmed = {}
         for job, clip in in_workers(film, jobs, workers=config.workers):
             filmed[job] = clip
-            if report is not None:
-                report(len(filmed), len(jobs), f"filmed {clip.policy} {clip.task}")
+            if note is not None:
+                note(f"filmed {len(filmed)} of {len(jobs)}")
         clips = [filmed[job] for job in jobs]
         save_clips(clips, config.out)
     sources = policy_sources(config.policies)
@@ -138,6 +137,7 @@ def command_of(config: EvaluationConfig) -> str:
         f"--episodes {config.episodes}",
         f"--seed {config.seed}",
         *([] if config.assets == "procedural" else [f"--assets {shlex.quote(str(config.assets))}"]),
+        *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
         "--out DIR",
     ]
     return " ".join(words)

@@ -19,6 +19,7 @@ from openvima.tasks.registry import list_tasks, task_spec
 
 ORACLE = "oracle"
 NAMED_POLICIES = (ORACLE, "random", "untrained")
+DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 
@@ -50,7 +51,7 @@ class EvaluationConfig:
     workers: int = 1
     out: Path = Path("evaluation")
     assets: str = "procedural"
-    batch: int = 16
+    batch: int = DEFAULT_BATCH
     videos: int = 1
     report: bool = True
     force: bool = False

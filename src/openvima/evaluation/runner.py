@@ -58,7 +58,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         require_extra()
     batches = plan(config)
     policies = {source.name: source.record() for source in policy_sources(config.policies)}
-    found = versions(with_torch=any(what["kind"] != "oracle" for what in policies.values()))
+    found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
     if results is None:
@@ -69,7 +69,8 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         _write_log(config, results, time.perf_counter() - started)
         shutil.rmtree(config.out / _PARTS, ignore_errors=True)
     if config.report:
-        finish(config, results)
+        episodes = sum(batch.episodes for batch in batches)
+        finish(config, results, None if report is None else lambda note: report(episodes, episodes, note))
     return path
 
 
@@ -140,7 +141,7 @@ def play_batch(job: Job) -> tuple[EpisodeOutcome, ...]:
 @contextmanager
 def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    if batch.source == "oracle":
+    if batch.source in ("oracle", "random"):  # no network
         yield
         return
     import torch

@@ -261,7 +261,7 @@ def _clip_card(clip: Clip) -> str:
     )
     label = f"{clip.policy} on {clip.task}, level {clip.level}, seed {clip.seed}"
     return (
-        f'<article class="card clip"><video controls muted loop playsinline preload="metadata" '
+        f'<article class="card clip"><video controls autoplay muted loop playsinline '
         f'aria-label="{prose(label)}" poster="{_data_uri(clip.poster, "image/png")}" '
         f'src="{_data_uri(clip.video, "video/mp4")}"></video><div class="text"><p class="prompt">{prompt}</p>'
         f'<div class="meta">{outcome}<span>{prose(clip.policy)}</span><span>{prose(clip.task)}</span>'

@@ -26,6 +26,10 @@ _ROLES = {
 }
 
 
+_OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
+_NUM_COLOURS = 6  # in the style sheet, for all other policies
+
+
 def role(results: Results, policy: str) -> str:
     """One or two sentences on what a policy is."""
     return _ROLES.get(results.policies.get(policy, {}).get("kind", "run"), _ROLES["run"])
@@ -34,14 +38,14 @@ def role(results: Results, policy: str) -> str:
 def series_colours(results: Results) -> dict[str, str]:
     """CSS variable of the colour that stands for each policy."""
     colours: dict[str, str] = {}
-    num_runs = 0
+    num_others = 0
     for policy in results.policy_names():
-        kind = results.policies.get(policy, {}).get("kind", "run")
-        if kind in ("oracle", "random", "untrained"):
-            colours[policy] = f"--series-{kind}"
+        own = f"--series-{results.policies.get(policy, {}).get('kind', 'run')}"
+        if own in _OWN_COLOURS and own not in colours.values():
+            colours[policy] = own
         else:
-            num_runs += 1
-            colours[policy] = f"--series-{(num_runs - 1) % 6 + 1}"
+            colours[policy] = f"--series-{num_others % _NUM_COLOURS + 1}"
+            num_others += 1
     return colours
 
 

@@ -1,0 +1,89 @@
+"""The verbs `tasks`, `demo`, `evaluate` and `report`."""
+
+import json
+
+import av
+import pytest
+
+from openvima.cli.main import main
+
+
+def test_tasks_lists_prompt_tool_levels_and_steps(capsys):
+    assert main(["tasks"]) == 0
+    shown = capsys.readouterr().out
+    assert "sweep_without_exceeding" in shown and "spatula" in shown and "train L1 L2" in shown
+
+
+def test_tasks_speaks_json(capsys):
+    assert main(["tasks", "--json"]) == 0
+    tasks = {task["name"]: task for task in json.loads(capsys.readouterr().out)}
+    assert tasks["rotate"]["levels"] == ["train", "L1", "L2", "L3"]
+    assert tasks["rotate"]["max_steps"] == tasks["rotate"]["oracle_max_steps"] + 2
+    assert "{" in tasks["visual_manipulation"]["prompt"]
+
+
+def test_demo_films_the_oracle(tmp_path, capsys):
+    path = tmp_path / "film.mp4"
+    assert main(["demo", "rotate", "--seed", "1", "--out", str(path)]) == 0
+    assert "solved; 1 step" in capsys.readouterr().out
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.width == 768
+
+
+def test_demo_refuses_a_level_without_the_task(capsys):
+    assert main(["demo", "sweep_without_exceeding", "--level", "L3", "--out", "never_written.mp4"]) == 2
+    assert "not defined at level L3" in capsys.readouterr().err
+
+
+def test_evaluate_then_report(tmp_path, capsys):
+    words = [
+        "--tasks",
+        "rotate",
+        "--levels",
+        "L1,L2",
+        "--episodes",
+        "2",
+        "--videos",
+        "0",
+        "--out",
+        str(tmp_path),
+    ]
+    assert main(["evaluate", "--policy", "oracle,random", *words]) == 0
+    table = capsys.readouterr().out
+    assert "oracle" in table and "random" in table and "100.0" in table
+    assert main(["evaluate", "--policy", "oracle,random", *words, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [(row["policy"], row["level"]) for row in rows] == [
+        ("oracle", "L1"),
+        ("oracle", "L2"),
+        ("random", "L1"),
+        ("random", "L2"),
+    ]
+    first = (tmp_path / "report.html").read_text()
+    assert main(["report", str(tmp_path), "--out", str(tmp_path / "again.html")]) == 0
+    assert (tmp_path / "again.html").read_text() == first
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--policy", "oracel"], "Did you mean 'oracle'?"),
+        (["--policy", "oracle", "--tasks", "rotat"], "Did you mean 'rotate'?"),
+        (
+            ["--policy", "oracle", "--tasks", "sweep_without_exceeding", "--levels", "L3"],
+            "exists at train, L1, L2",
+        ),
+        (["--policy", "oracle", "--levels", "L9"], "Allowed: train, L1"),
+        (["--policy", "oracle", "--episodes", "0"], "episodes is 0"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(words, message, tmp_path, capsys):
+    assert main(["evaluate", *words, "--out", str(tmp_path / "new")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error.splitlines()[-1]
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_report_of_nothing_is_status_2(tmp_path, capsys):
+    assert main(["report", str(tmp_path)]) == 2
+    assert "openvima evaluate" in capsys.readouterr().err
