@@ -7,7 +7,7 @@ straight to the middle of the zone; the others go elsewhere in it, move a block 
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from openvima.scene import InZone, Placement, Pose, Problem, Scene, Zone, in_workspace
@@ -21,9 +21,9 @@ _BLADE_HALF_THICKNESS_M = 0.0025
 _HALF_WIDTH_M = 0.025 + 0.005  # half of the blade, and what a block drifts to the side while it turns
 _BLOCK_REACH_M = 0.0212  # from a block's centre to its corner
 _OVERRUN_M = 0.008  # a block slides on by up to 5 mm
-_BRUSH_M = 0.01  # how far a way may overlap a block that is allowed to be nudged
+_NUDGE_M, _SHOVE_M = 0.012, 0.03  # how far a way may overlap a block in the zone that counts already
 
-_END_SHIFTS_M = (0.0, 0.03, -0.03, 0.055, -0.055, 0.075, -0.075, 0.09, -0.09, 0.105, -0.105)
+_END_SHIFTS_M = (0.0, *(sign * 0.015 * step for step in range(1, 8) for sign in (1, -1)))
 _ASIDE_LENGTHS_M = (0.06, 0.1)
 _ASIDE_ANGLES_RAD = tuple(2 * math.pi * step / 24 for step in range(24))
 _PARKING_EDGE_M = 0.03  # a parked block keeps this far from the zone and the edge of the workspace
@@ -63,8 +63,9 @@ def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compa
     blocks = [placement for placement in scene.placements if not placement.fixed]
     sweeps = itertools.chain(
         _direct_sweeps(nearest_first, blocks),
-        _direct_sweeps(nearest_first, blocks, may_brush=met_ids),
+        _direct_sweeps(nearest_first, blocks, swept_ids=met_ids, overlap_m=_NUDGE_M),
         _aside_sweeps(nearest_first, blocks),
+        _direct_sweeps(nearest_first, blocks, swept_ids=met_ids, overlap_m=_SHOVE_M),
         _parting_sweeps(nearest_first, blocks, may_move=open_ids),
         _last_resort(nearest_first, blocks),
     )
@@ -79,11 +80,13 @@ def _direct_sweeps(
     goals: Sequence[InZone],
     blocks: Sequence[Placement],
     *,
-    may_brush: set[int] | frozenset[int] = frozenset(),
+    swept_ids: Collection[int] = (),
+    overlap_m: float = 0.0,
 ) -> Iterator[Sweep]:
     """Clear sweeps that bring one block into the zone: to its middle, else beside it, the near side first.
 
-    Blocks of `may_brush` may be nudged; those that count as swept already can bear it.
+    The way may overlap blocks of `swept_ids`: they count as swept already, and the blade stops too far before
+    the line to push them onto it.
     """
     poses = {block.id: block.pose for block in blocks}
     for shift in _END_SHIFTS_M:
@@ -91,11 +94,9 @@ def _direct_sweeps(
             pose = poses[goal.object_id]
             end = (goal.zone.x, goal.zone.y + math.copysign(shift, shift * pose.y))
             way = _way(pose, end)
-            if not any(
-                way.comes_near(_footprint(block), -_BRUSH_M if block.id in may_brush else 0.0)
-                for block in blocks
-                if block.id != goal.object_id
-            ):
+            others = [block for block in blocks if block.id != goal.object_id]
+            margins = [-overlap_m if block.id in swept_ids else 0.0 for block in others]
+            if not any(way.comes_near(_footprint(b), m) for b, m in zip(others, margins, strict=True)):
                 yield _push(goal, pose, end)
 
 
