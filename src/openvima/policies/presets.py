@@ -15,11 +15,11 @@ def nano() -> "VimaConfig":
     from openvima.policies.layers.decoder import DecoderConfig
     from openvima.policies.layers.object_encoder import ObjectEncoderConfig
     from openvima.policies.layers.text_encoder import TextEncoderConfig
-    from openvima.policies.layers.vit import VitConfig
+    from openvima.policies.layers.conv_encoder import ConvConfig
     from openvima.policies.vima.config import VimaConfig
     from openvima.policies.vima.heads.pointing import PointingConfig
 
-    crop = VitConfig(width=128, num_layers=3, num_heads=4, output_width=128, patch_size=8)
+    crop = ConvConfig(width=32, output_width=128)
     return VimaConfig(
         objects=ObjectEncoderConfig(crop, box_width=64, width=128, fuse_views=True, appearance_width=128),
         text=TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256),

@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError
+from openvima.policies.layers.conv_encoder import ConvConfig, ConvEncoder
 from openvima.policies.layers.mlp import mlp
 from openvima.policies.layers.vit import VisionTransformer, VitConfig
 
@@ -22,14 +23,14 @@ class ObjectEncoderConfig:
     """Sizes of the object encoder.
 
     Args:
-        crop: The crop encoder.
+        crop: The crop encoder: a vision transformer, as published, or convolutions.
         box_width: Width of the box features.
         width: Width of an object token.
         fuse_views: One token for both views of an object, instead of one for each.
         appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
     """
 
-    crop: VitConfig
+    crop: VitConfig | ConvConfig
     box_width: int
     width: int
     fuse_views: bool = False
@@ -54,7 +55,7 @@ class ObjectEncoder(nn.Module):
         self.config = config
         features = config.crop.output_width
         self.register_buffer("box_units", torch.tensor(_BOX_UNITS), persistent=False)
-        self.crop_encoder = VisionTransformer(config.crop)
+        self.crop_encoder = _crop_encoder(config.crop)
         box_widths = (4, config.box_width, config.box_width, config.box_width)
         self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))
         per_view = features + config.box_width
@@ -106,3 +107,7 @@ class ObjectEncoder(nn.Module):
         seen_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
         both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
         return F.normalize(self.appearance(both), dim=-1)
+
+
+def _crop_encoder(config: VitConfig | ConvConfig) -> VisionTransformer | ConvEncoder:
+    return VisionTransformer(config) if isinstance(config, VitConfig) else ConvEncoder(config)

@@ -84,5 +84,14 @@ def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written 
     if isinstance(hint, UnionType):
         if value is None:
             return None
-        hint = next(option for option in get_args(hint) if option is not NoneType)
+        options = [option for option in get_args(hint) if option is not NoneType]
+        hint = max(options, key=lambda option: _num_shared_fields(option, value))
     return _build(hint, value, where) if is_dataclass(hint) and isinstance(hint, type) else value
+
+
+def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written in the dataclass
+    """How well the fields of a record fit a mapping; tells apart the records that a field may hold."""
+    if not is_dataclass(kind) or not isinstance(value, Mapping):
+        return 0
+    names = {field.name for field in fields(kind)}
+    return len(names & set(value)) - len(names ^ set(value))

@@ -66,10 +66,14 @@ class StepInput:
 
     Args:
         objects: The objects in view.
+        positions: Table points under their boxes, shape (N, 2), metres.
+        grasps: Table points under their most interior pixels, shape (N, 2), metres.
         end_effector: 0 suction cup, 1 spatula.
     """
 
     objects: ObjectViews
+    positions: np.ndarray
+    grasps: np.ndarray
     end_effector: int
 
 
@@ -124,7 +128,8 @@ def read_step(observation: Mapping, *, fuse_views: bool) -> StepInput:
         fuse_views: Whether a slot holds the same object in both views; else visible objects come first in each.
     """
     objects = observe(observation)
-    return StepInput(objects if fuse_views else objects.compacted(), int(observation["ee"]))
+    objects = objects if fuse_views else objects.compacted()
+    return StepInput(objects, objects.positions(), objects.grasp_points(), int(observation["ee"]))
 
 
 def read_prompt(prompt: RenderedPrompt, *, fuse_views: bool) -> PromptInput:
@@ -207,8 +212,8 @@ def batch_histories(
             numbers[b, t, :, :size] = crops[b][t]
             boxes[b, t, :, :size] = step.objects.boxes
             masks[b, t, :, :size] = step.objects.masks
-            positions[b, t, :size] = step.objects.positions()
-            grasps[b, t, :size] = step.objects.grasp_points()
+            positions[b, t, :size] = step.positions
+            grasps[b, t, :size] = step.grasps
             end_effector[b, t] = step.end_effector
             exists[b, t] = True
     arrays = (numbers, boxes, masks, positions, grasps, end_effector, exists)

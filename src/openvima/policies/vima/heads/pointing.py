@@ -22,6 +22,7 @@ from openvima.policies.vima.heads.base import (
 )
 
 _OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
+_RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +87,15 @@ class PointingHead(ActionHead):
             "yaw": masked_mean(_cross_entropy(yaw_scores, yaw), has_place) * self.config.yaw_weight,
         }
         with torch.no_grad():
+            error_BT = (offset - true_offset).norm(dim=-1)
+            right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == place)
+            right_BT &= error_BT < _RIGHT_OFFSET_M
             metrics = {
+                "accuracy": masked_mean(right_BT.to(offset.dtype), has_place),
                 "pick_accuracy": _accuracy(pick_scores, pick, has_pick),
                 "place_accuracy": _accuracy(place_scores, place, has_place),
                 "yaw_accuracy": _accuracy(yaw_scores, yaw, has_place),
-                "offset_error_m": masked_mean((offset - true_offset).norm(dim=-1), has_place),
+                "offset_error_m": masked_mean(error_BT, has_place),
             }
         return torch.stack(list(losses.values())).sum(), metrics
 

@@ -1,0 +1,163 @@
+"""The two stages of a run: matching prompt and scene crops, then behaviour cloning."""
+
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+
+from openvima.policies.vima.heads.base import HeadInputs
+from openvima.policies.vima.model import Vima
+from openvima.training.augment import augmented
+from openvima.training.config import TrainingConfig
+from openvima.training.dataset import (
+    Batch,
+    Examples,
+    groups_of_equal_length,
+    make_batch,
+    rows_of_step,
+)
+from openvima.training.pretrain import Pairs, matching_loss, scene_accuracy
+from openvima.training.schedule import step_generator
+
+Metrics = dict[str, float]
+
+
+class Stage(Protocol):
+    """One loss to be minimised for a number of steps.
+
+    Attributes:
+        name: In file names and metrics.
+        num_steps: Length.
+        learning_rate: Highest learning rate.
+        parameters: What is trained.
+    """
+
+    name: str
+    num_steps: int
+    learning_rate: float
+    parameters: list[torch.nn.Parameter]
+
+    def backward(self, step: int) -> Metrics:
+        """Add the gradients of one step's loss, and return its metrics."""
+        ...
+
+    def validate(self) -> Metrics:
+        """Return metrics on held-out data; "score" is to be as large as possible."""
+        ...
+
+
+class Matching:
+    """Trains the crop encoder and the appearance embedding on rendered pairs."""
+
+    name = "1-matching"
+
+    def __init__(self, model: Vima, config: TrainingConfig, pairs: Pairs) -> None:
+        self.num_steps = config.pretraining_steps
+        self.learning_rate = config.pretraining_learning_rate
+        self.encoder = model.objects
+        self.parameters = [*model.objects.crop_encoder.parameters(), *model.objects.appearance.parameters()]
+        held_out = pairs.scenes >= int(pairs.scenes.max()) * 0.95
+        self._training = pairs.select(torch.nonzero(~held_out)[:, 0])
+        self._validation = pairs.select(torch.nonzero(held_out)[:, 0])
+        self._config = config
+
+    def backward(self, step: int) -> Metrics:
+        """Draw a batch of pairs and add its gradients."""
+        config = self._config
+        generator = step_generator(config.seed, self.name, step)
+        count = len(self._training.looks)
+        rows = torch.randperm(count, generator=generator)[: config.pretraining_batch]
+        loss, metrics = matching_loss(
+            self.encoder, self._training.select(rows), temperature=config.temperature, generator=generator
+        )
+        loss.backward()
+        return {"loss": loss.item(), **{name: value.item() for name, value in metrics.items()}}
+
+    def validate(self) -> Metrics:
+        """Share of prompt images whose object is the most similar one in its scene."""
+        accuracy = scene_accuracy(self.encoder, self._validation)
+        return {"scene_accuracy": accuracy, "score": accuracy}
+
+
+class Cloning:
+    """Behaviour cloning: the loss of the action head over whole demonstrations.
+
+    Unless crops are to be tuned, the crop encoder stays as it is and each crop is encoded once.
+    """
+
+    name = "2-cloning"
+
+    def __init__(self, model: Vima, config: TrainingConfig, examples: Examples) -> None:
+        self.num_steps = config.steps
+        self.learning_rate = config.learning_rate
+        self.model = model
+        self._config = config
+        self._examples = examples
+        self._features: torch.Tensor | None = None
+        frozen = set() if config.tune_crops else set(_crop_parameters(model))
+        self.parameters = [p for p in model.parameters() if p not in frozen]
+        if not config.tune_crops:
+            self._features = encode_in_chunks(model, examples.crops)
+
+    def backward(self, step: int) -> Metrics:
+        """Take the step's demonstrations, in groups of like length, and add their gradients."""
+        config = self._config
+        training = self._examples.training
+        rows = rows_of_step(len(training), batch=config.batch, step=step, seed=config.seed)
+        generator = step_generator(config.seed, "augmentation", step)
+        chosen = [training[row] for row in rows]
+        total = sum(len(example.steps) for example in chosen)
+        sums: Metrics = {}
+        for group in groups_of_equal_length(chosen):
+            batch = augmented(make_batch(group), probability=config.spurious_probability, generator=generator)
+            share = sum(len(example.steps) for example in group) / total
+            loss, metrics = self._loss(batch)
+            (loss * share).backward()
+            for name, value in {"loss": loss, **metrics}.items():
+                sums[name] = sums.get(name, 0.0) + value.item() * share
+        return sums
+
+    @torch.no_grad()
+    def validate(self) -> Metrics:
+        """Loss and metrics on the held-out demonstrations; the score is the accuracy of actions."""
+        examples = self._examples.validation
+        if not examples:
+            return {}
+        total = sum(len(example.steps) for example in examples)
+        sums: Metrics = {}
+        for group in groups_of_equal_length(examples):
+            share = sum(len(example.steps) for example in group) / total
+            loss, metrics = self._loss(make_batch(group))
+            for name, value in {"loss": loss, **metrics}.items():
+                sums[name] = sums.get(name, 0.0) + value.item() * share
+        return {**sums, "score": sums["accuracy"]}
+
+    def _loss(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        features, batch = (self._features, batch) if self._features is not None else self._encoded(batch)
+        return self.model.head.loss(self._inputs(batch, features), batch.targets)
+
+    def _inputs(self, batch: Batch, features: torch.Tensor) -> HeadInputs:
+        memory = self.model.encode_prompt(batch.prompts, features)
+        return self.model(memory, batch.history, features, batch.targets.actions_BTC)
+
+    def _encoded(self, batch: Batch) -> tuple[torch.Tensor, Batch]:
+        """Encode the crops of a batch, each once, and number them anew."""
+        prompts, history = batch.prompts, batch.history
+        numbers = torch.cat([prompts.crops_VS.flatten(), history.crops_BTVN.flatten()])
+        used, places = numbers.unique(return_inverse=True)
+        prompt_places, history_places = places.split([prompts.crops_VS.numel(), history.crops_BTVN.numel()])
+        prompts = replace(prompts, crops_VS=prompt_places.view_as(prompts.crops_VS))
+        history = replace(history, crops_BTVN=history_places.view_as(history.crops_BTVN))
+        features = self.model.objects.encode_crops(self._examples.crops[used])
+        return features, replace(batch, prompts=prompts, history=history)
+
+
+@torch.no_grad()
+def encode_in_chunks(model: Vima, crops: torch.Tensor, *, chunk: int = 1024) -> torch.Tensor:
+    """Encode many crops without gradients, shape (K, F)."""
+    return torch.cat([model.objects.encode_crops(part) for part in crops.split(chunk)])
+
+
+def _crop_parameters(model: Vima) -> list[torch.nn.Parameter]:
+    """What the first stage trained, and cloning leaves alone."""
+    return [*model.objects.crop_encoder.parameters(), *model.objects.appearance.parameters()]
