@@ -147,11 +147,9 @@ def _tube_mesh(tube: _Tube) -> TriangleMesh:
     this, following = slice(None, -1), slice(1, None)
     side = [(low[this], low[following], high[following]), (low[this], high[following], high[this])]
     side_normals = [(slant[this], slant[following], slant[i]) for i in (following, this)]
-    caps = [
-        (np.broadcast_to(low[0], (_NUM_SIDES, 3)), low[following], low[this]),
-        (np.broadcast_to(high[0], (_NUM_SIDES, 3)), high[this], high[following]),
-    ]
-    cap_normals = [(np.broadcast_to(sign * axis, (_NUM_SIDES, 3)),) * 3 for sign in (-1.0, 1.0)]
+    start_corner, end_corner = (np.broadcast_to(rim[0], (_NUM_SIDES - 2, 3)) for rim in (low, high))
+    caps = [(start_corner, low[2:-1], low[1:-2]), (end_corner, high[1:-2], high[2:-1])]
+    cap_normals = [(np.broadcast_to(sign * axis, (_NUM_SIDES - 2, 3)),) * 3 for sign in (-1.0, 1.0)]
     vertices = np.concatenate([np.stack(corners, axis=1) for corners in (*side, *caps)])
     normals = np.concatenate([np.stack(corners, axis=1) for corners in (*side_normals, *cap_normals)])
     return TriangleMesh(vertices, normals, np.zeros((len(vertices), 3, 2)))

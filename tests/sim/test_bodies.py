@@ -1,0 +1,93 @@
+"""Bodies in the physics: rest heights, rest, friction, inertia."""
+
+import math
+
+import numpy as np
+import pytest
+
+from openvima.scene import Pose, Scene
+from openvima.sim.bodies import Bodies, body_shape
+from openvima.sim.settling import SETTLE_LIMIT_TICKS, settle
+from openvima.sim.stage import is_at_rest
+from sim_tables import ALL_OBJECTS, ASSETS, table
+
+
+@pytest.mark.parametrize("name", ALL_OBJECTS)
+def test_a_body_laid_on_the_table_stays_there_for_seconds(name) -> None:
+    scene = table((name, 0.5, 0.1, 0.4))
+    bodies = Bodies(scene, ASSETS)
+    bodies.tick(3 * 240)
+    before, after = scene.placements[0].pose, bodies.pose(0)
+    tolerance_m = 5e-4 if name == "pan" else 1e-4  # the pan's hull rocks onto its rim
+    assert math.dist(before.position, after.position) < tolerance_m
+    assert abs(before.yaw_rad - after.yaw_rad) < 1e-4
+
+
+@pytest.mark.parametrize("name", ALL_OBJECTS)
+def test_a_dropped_body_comes_to_lie_at_its_rest_height(name) -> None:
+    scene = table((name, 0.5, 0.0, 0.3))
+    (placement,) = scene.placements
+    tilted = Pose((0.5, 0.0, placement.pose.z + 0.02), (0.02, 0.03, 0.0, math.sqrt(1 - 0.0013)))
+    bodies = Bodies(Scene((placement.at(tilted),)), ASSETS)
+    num_ticks, completed = settle(bodies)
+    assert completed
+    assert num_ticks < SETTLE_LIMIT_TICKS
+    assert bodies.pose(0).z == pytest.approx(placement.pose.z, abs=2e-4)
+
+
+def test_inertia_is_three_times_that_of_the_bounding_box() -> None:
+    def inertia(name: str) -> tuple[float, ...]:
+        (placement,) = table((name, 0.5, 0.0, 0.0)).placements
+        return body_shape(name, ASSETS.geometry(name, placement.size), False).inertia
+
+    np.testing.assert_allclose(inertia("block"), [2.45e-5] * 3, rtol=1e-3)
+    np.testing.assert_allclose(inertia("small block"), [4.5e-7] * 3, rtol=1e-3)
+    np.testing.assert_allclose(inertia("ring"), [2.909e-4, 2.909e-4, 5.202e-4], rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("sliding", "ground", "friction"),
+    [
+        ("small block", None, 0.5),
+        ("block", None, 1.0),
+        ("container", None, 0.3),
+        ("small block", "shorter block", 0.5),
+    ],
+)
+def test_friction_of_a_pair_is_the_product_of_both(sliding, ground, friction) -> None:
+    scene = table((sliding, 0.5, 0.0, 0.0))
+    if ground is not None:
+        scene = table((sliding, 0.5, 0.0, 0.0), fixed=((ground, 0.5, 0.0, 0.0),))
+        base = scene.placements[1].pose.z + 0.015
+        scene = scene.with_poses({5: Pose((0.48, 0.0, base + 0.015))})
+    bodies = Bodies(scene, ASSETS)
+    bodies.tick(60)
+    bodies._velocities[0, 0] = speed = 0.2
+    bodies.tick(120)
+    way = bodies.pose(0).x - scene.placements[0].pose.x
+    assert way == pytest.approx(speed**2 / (2 * friction * 9.8), rel=0.12)  # v² / (2 μ g)
+
+
+def test_two_slippery_bodies_have_the_product_too() -> None:
+    size = 0.03
+    scene = table(("small block", 0.5, 0.0, 0.0), fixed=(("small block", 0.5, 0.0, 0.0),))
+    bodies = Bodies(scene.with_poses({5: Pose((0.495, 0.0, 0.014 + size))}), ASSETS)
+    bodies.tick(60)
+    bodies._velocities[0, 0] = 0.15
+    bodies.tick(120)
+    assert bodies.pose(0).x - 0.495 == pytest.approx(0.15**2 / (2 * 0.25 * 9.8), rel=0.12)
+
+
+def test_bodies_at_rest_need_no_physics_and_others_do() -> None:
+    scene = table(("letter A", 0.4, 0.0, 0.0), ("block", 0.6, 0.0, 0.0))
+    assert is_at_rest(Bodies(scene, ASSETS))
+    assert not is_at_rest(Bodies(scene.with_poses({5: scene[5].pose.moved(dz=0.01)}), ASSETS))
+    assert not is_at_rest(Bodies(scene.with_poses({5: scene[6].pose.moved(dz=-0.034)}), ASSETS))
+
+
+def test_fixed_bodies_do_not_fall() -> None:
+    scene = table(fixed=(("container", 0.5, 0.0, 0.0),))
+    scene = scene.with_poses({5: scene[5].pose.moved(dz=0.1)})
+    bodies = Bodies(scene, ASSETS)
+    bodies.tick(100)
+    assert bodies.pose(0) == scene[5].pose

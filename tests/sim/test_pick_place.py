@@ -1,0 +1,130 @@
+"""Picking and placing: what is lifted, where it goes, what happens to the others."""
+
+import math
+
+import numpy as np
+import pytest
+
+from openvima.scene import Action, Pose
+from openvima.sim import World
+from openvima.sim.bodies import Bodies
+from openvima.sim.primitives import body_under_needle
+from sim_tables import ASSETS, table
+
+
+def assert_same_pose(pose: Pose, other: Pose, tolerance_m: float = 1e-6) -> None:
+    assert math.dist(pose.position, other.position) < tolerance_m
+    assert np.abs(pose.matrix() - other.matrix()).max() < 1e-5
+
+
+def test_an_object_moves_exactly_with_the_tool() -> None:
+    scene = table(("letter A", 0.4, -0.2, 0.5), ("ring", 0.6, 0.3, 0.0))
+    world = World(scene, ASSETS)
+    pick, place, turn_rad = (0.41, -0.21), (0.55, 0.1), 1.2
+    execution = world.execute(Action.planar(pick, place, turn_rad))
+    assert execution.grasped == 5
+    assert execution.completed
+    expected = Pose.planar(*place, turn_rad) @ Pose.planar(*pick).inverse() @ scene[5].pose
+    assert_same_pose(world.scene[5].pose, expected)
+    assert world.scene[6] == scene[6]
+
+
+def test_only_the_difference_of_the_two_yaws_turns_the_object() -> None:
+    scene = table(("letter A", 0.4, -0.2, 0.5))
+    world = World(scene, ASSETS)
+    quaternions = [Pose.planar(0, 0, yaw).quaternion for yaw in (0.7, 1.0)]
+    world.execute(Action((0.4, -0.2), (0.4, -0.2), quaternions[0], quaternions[1]))
+    assert_same_pose(world.scene[5].pose, scene[5].pose.rotated(0.3))
+
+
+def test_a_failed_pick_leaves_everything_where_it_was() -> None:
+    scene = table(("letter A", 0.4, -0.2, 0.5), fixed=(("container", 0.6, 0.2, 0.3),))
+    world = World(scene, ASSETS)
+    for pick in ((0.5, 0.0), (0.6, 0.2)):  # the table, the fixed container
+        execution = world.execute(Action.planar(pick, (0.4, -0.2)))
+        assert execution.grasped is None
+        assert world.scene == scene
+
+
+def test_a_ring_is_picked_in_its_hole() -> None:
+    world = World(table(("ring", 0.5, 0.0, 0.0)), ASSETS)
+    assert world.execute(Action.planar((0.5, 0.0), (0.6, 0.1))).grasped == 5
+
+
+@pytest.mark.parametrize(("beside_m", "is_caught"), [(-0.002, True), (0.002, True), (0.006, False)])
+def test_the_cup_catches_what_is_a_little_beside_it(beside_m, is_caught) -> None:
+    bodies = Bodies(table(("block", 0.5, 0.0, 0.0)), ASSETS)
+    index, z = body_under_needle(bodies, 0.5 + 0.035 + beside_m, 0.0)
+    assert index == (0 if is_caught else None)
+    assert z == pytest.approx(0.069 if is_caught else -0.001, abs=1e-3)
+
+
+def test_of_stacked_bodies_the_upper_one_is_picked_and_can_leave() -> None:
+    scene = table(("block", 0.5, 0.0, 0.0), ("letter A", 0.5, 0.0, 0.0))
+    scene = scene.with_poses({6: scene[6].pose.moved(dz=0.0705)})
+    world = World(scene, ASSETS)
+    assert world.execute(Action.planar((0.5, 0.0), (0.4, 0.3))).grasped == 6
+    assert world.scene[6].pose.z == pytest.approx(0.0, abs=3e-4)
+    assert world.scene[5].pose.planar_distance(scene[5].pose) < 1e-3
+
+
+def test_a_body_falls_when_the_one_below_it_is_taken() -> None:
+    scene = table(("pan", 0.5, 0.0, 0.0), ("small block", 0.5, 0.0, 0.0))
+    scene = scene.with_poses({6: scene[6].pose.moved(dz=0.045)})
+    world = World(scene, ASSETS)
+    execution = world.execute(Action.planar((0.62, 0.0), (0.62, 0.3)))  # by its handle
+    assert execution.grasped == 5
+    assert world.scene[6].pose.z < 0.03
+    assert world.scene[6].pose.planar_distance(scene[6].pose) < 0.05
+
+
+def test_an_object_set_down_on_another_lies_on_top_of_it() -> None:
+    world = World(table(("letter A", 0.4, -0.2, 0.0), ("block", 0.6, 0.2, 0.0)), ASSETS)
+    assert world.execute(Action.planar((0.4, -0.2), (0.6, 0.2))).grasped == 5
+    assert world.scene[5].pose.z == pytest.approx(0.070, abs=1e-3)
+    assert world.scene[6].pose.planar_distance(Pose.planar(0.6, 0.2)) < 1e-3
+
+
+def test_an_object_put_into_a_container_lies_on_its_floor() -> None:
+    scene = table(("ring", 0.4, -0.2, 0.0), fixed=(("container", 0.6, 0.2, 0.3),))
+    world = World(scene, ASSETS)
+    world.execute(Action.planar((0.4, -0.2), (0.6, 0.2)))
+    assert world.scene[5].pose.z == pytest.approx(0.002, abs=5e-4)  # 1.0 mm slab top and 1 mm margin
+    assert world.scene[5].pose.planar_distance(Pose.planar(0.6, 0.2)) < 5e-4
+
+
+def test_an_object_that_meets_a_neighbour_on_its_way_down_is_let_go_there() -> None:
+    scene = table(("block", 0.4, -0.2, 0.0), ("block", 0.6, 0.2, 0.0))
+    world = World(scene, ASSETS)
+    world.execute(Action.planar((0.4, -0.2), (0.6, 0.265)))  # overlaps the neighbour by 5 mm
+    assert world.scene[5].pose.y > 0.265  # it slid off
+    assert world.scene[6].pose.planar_distance(scene[6].pose) < 0.02
+
+
+def test_hovering_bodies_come_to_rest_during_the_first_action() -> None:
+    scene = table(("letter A", 0.4, -0.2, 0.0), ("block", 0.6, 0.2, 0.0))
+    lifted = scene.with_poses({i: scene[i].pose.moved(dz=0.016) for i in (5, 6)})
+    world = World(lifted, ASSETS, compat=True)
+    assert world.scene == lifted
+    world.execute(Action.planar((0.5, 0.0), (0.5, 0.0)))
+    for i in (5, 6):
+        assert world.scene[i].pose.z == pytest.approx(scene[i].pose.z, abs=1e-4)
+        assert world.scene[i].pose.planar_distance(scene[i].pose) < 1e-4
+
+
+def test_far_corners_are_picked_and_placed_though_the_arm_cannot_hover_high_there() -> None:
+    scene = table(("block", 0.75, 0.5, 0.0))
+    world = World(scene, ASSETS)
+    assert world.execute(Action.planar((0.75, 0.5), (0.75, -0.5))).grasped == 5
+    assert world.scene[5].pose.planar_distance(Pose.planar(0.75, -0.5)) < 1e-6
+
+
+def test_the_joint_path_leads_from_where_the_arm_was_to_where_it_is() -> None:
+    world = World(table(("block", 0.5, 0.0, 0.0)), ASSETS)
+    home = world.joints
+    first = world.execute(Action.planar((0.5, 0.0), (0.6, 0.1)))
+    assert first.joint_path.dtype == np.float32
+    np.testing.assert_array_equal(first.joint_path[0], home.astype(np.float32))
+    np.testing.assert_array_equal(first.joint_path[-1], world.joints.astype(np.float32))
+    second = world.execute(Action.planar((0.5, 0.0), (0.6, 0.1)))
+    np.testing.assert_array_equal(second.joint_path[0], first.joint_path[-1])
