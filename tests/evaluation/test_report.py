@@ -100,7 +100,7 @@ def test_the_table_shows_rates_intervals_and_counts(text):
 
 
 def test_the_headline_is_that_of_the_trained_policy(text):
-    assert "<h1>mine solves 75 % of L1 episodes (2 tasks)</h1>" in text
+    assert "<h1>mine solves 75&nbsp;% of L1 episodes (2 tasks)</h1>" in text
 
 
 def test_names_and_reasons_are_escaped(text):

@@ -285,10 +285,10 @@ def _failure_lines(policy: str, colour: str, rows: list[Row]) -> list[str]:
     total = sum(row.episodes for row in rows)
     name = f'<span class="dot" style="--series:var({colour})"></span>{prose(policy)}'
     if not causes:
-        return [f'<tr><td>{name}</td><td colspan="4">every episode was solved</td></tr>']
+        return [f'<tr><td class="name">{name}</td><td colspan="4">every episode was solved</td></tr>']
     return [
-        f'<tr><td>{name if index == 0 else ""}</td><td>{prose(kind)}</td><td class="num">{count}</td>'
-        f'<td class="num">{per_cent(count / total, 1)}</td>'
+        f'<tr><td class="name">{name if index == 0 else ""}</td><td>{prose(kind)}</td>'
+        f'<td class="num">{count}</td><td class="num">{per_cent(count / total, 1)}</td>'
         f'<td class="long">{prose(_by_task(tasks[kind]))}</td></tr>'
         for index, (kind, count) in enumerate(sorted(causes.items(), key=lambda item: (-item[1], item[0])))
     ]

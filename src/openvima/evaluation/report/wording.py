@@ -98,5 +98,5 @@ def findings(results: Results) -> str:
 
 
 def prose(text: str) -> str:
-    """Escape text for HTML."""
-    return html.escape(text, quote=True)
+    """Escape text for HTML, and keep numbers with their per cent sign."""
+    return html.escape(text, quote=True).replace(" %", "&nbsp;%")
