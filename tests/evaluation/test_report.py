@@ -180,11 +180,24 @@ def test_no_films_are_no_error_but_lost_ones_are(clip, tmp_path):
 
 
 def test_curves_are_grouped_by_kind(metrics):
-    charts = read_charts(metrics)
-    assert [(title, sorted(curves)) for title, _, _, curves in charts] == [
-        ("Training loss", ["loss", "validation loss"]),
-        ("Training accuracy", ["accuracy"]),
+    assert [(chart.title, list(chart.curves)) for chart in read_charts(metrics)] == [
+        ("Training: loss", ["training data", "held out"]),
+        ("Training: accuracy", ["training data"]),
     ]
+
+
+def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
+    kinds = ("accuracy", "pick_accuracy", "yaw_accuracy")
+    lines = [
+        {"step": 5, "name": "matching", "loss": 2.0, "stage": 0},
+        {"step": 5, "name": "cloning", **dict.fromkeys(kinds, 0.5)},
+        {"step": 5, "name": "cloning", **{f"validation_{kind}": 0.4 for kind in kinds}},
+    ]
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    matching, cloning = read_charts(path)
+    assert (matching.title, matching.curves) == ("Matching: loss", {"training data": [(5.0, 2.0)]})
+    assert list(cloning.curves) == ["held out", "pick, held out", "yaw, held out"]
 
 
 def test_a_damaged_training_record_names_the_line(tmp_path):

@@ -62,13 +62,14 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, mon
     assert not (tmp_path / "parts").exists()
 
 
-def test_a_damaged_part_is_played_again(first, tmp_path, monkeypatch):
+@pytest.mark.parametrize("damaged", [lambda text: text[:-20], lambda text: "[]", lambda text: "{}"])
+def test_a_damaged_part_is_played_again(damaged, first, tmp_path, monkeypatch):
     config = replace(ORACLE, out=tmp_path)
     play_batch = runner.play_batch
 
     def damage(job):
         outcomes = play_batch(job)
-        job.part.write_text(job.part.read_text()[:-20])
+        job.part.write_text(damaged(job.part.read_text()))
         if job.batch.first_seed == 42 and job.batch.task == "rotate":
             raise KeyboardInterrupt
         return outcomes

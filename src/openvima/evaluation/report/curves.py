@@ -1,22 +1,40 @@
 """Training curves for the report, read from a run's `metrics.jsonl`."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import DatasetError
 
 Curve = Sequence[tuple[float, float]]
-Chart = tuple[str, str, bool, Mapping[str, Curve]]  # title, label of the values, are they fractions, curves
+
+_KINDS = (("loss", False), ("accuracy", True))  # part of a metric's name, and whether it is a fraction
+_HELD_OUT = "validation_"
+_MOST_CURVES = 4  # more of them in one chart cannot be told apart
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Curves that share one pair of axes.
+
+    Args:
+        title: What they show.
+        curves: Name of each curve to its (step, value) points.
+        percent: Whether values are fractions.
+    """
+
+    title: str
+    curves: dict[str, Curve]
+    percent: bool
 
 
 def read_charts(metrics: Path) -> list[Chart]:
-    """Read what the report shows of a training run: losses and accuracies over steps.
-
-    Every number with "loss" or "accuracy" in its name becomes a curve; those of one kind share a chart.
+    """Read what the report shows of a training run: losses and accuracies over the steps of each stage.
 
     Args:
-        metrics: A file with one JSON object a line, each with a "step".
+        metrics: A file with one JSON object a line: its "step", perhaps the "name" of its stage, and numbers.
+            Those with "loss" or "accuracy" in their names are shown; "validation_" in front means held out.
 
     Returns:
         The charts; none where there is nothing to show.
@@ -24,23 +42,34 @@ def read_charts(metrics: Path) -> list[Chart]:
     Raises:
         DatasetError: The file is not of that form.
     """
-    curves: dict[str, list[tuple[float, float]]] = {}
+    stages: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for number, line in enumerate(metrics.read_text(encoding="utf-8").splitlines(), start=1):
         try:
             record = json.loads(line)
-            step = float(record["step"])
-        except (ValueError, KeyError, TypeError) as error:
+            step, stage = float(record["step"]), str(record.get("name", "training"))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise DatasetError(f"{metrics}, line {number}, is no record with a step ({error!r}).") from error
         for name, value in record.items():
             if isinstance(value, int | float) and not isinstance(value, bool):
-                curves.setdefault(name, []).append((step, float(value)))
-    charts: list[Chart] = []
-    for kind, label, percent in (("loss", "Loss", False), ("accuracy", "Accuracy of the actions", True)):
-        chosen = {_readable(name): points for name, points in curves.items() if kind in name}
-        if chosen:
-            charts.append((f"Training {kind}", label, percent, chosen))
+                stages.setdefault(stage, {}).setdefault(name, []).append((step, float(value)))
+    charts = []
+    for stage, values in stages.items():
+        for kind, percent in _KINDS:
+            chosen = _chosen(sorted(name for name in values if kind in name))
+            if chosen:
+                curves: dict[str, Curve] = {_label(name, kind): values[name] for name in chosen}
+                charts.append(Chart(f"{stage.capitalize()}: {kind}", curves, percent))
     return charts
 
 
-def _readable(name: str) -> str:
-    return name.replace("_", " ").replace("/", " ")
+def _chosen(names: list[str]) -> list[str]:
+    """All metrics of a kind, or the held-out ones alone where all would be too many."""
+    held_out = [name for name in names if name.startswith(_HELD_OUT)]
+    return held_out[:_MOST_CURVES] if held_out and len(names) > _MOST_CURVES else names[:_MOST_CURVES]
+
+
+def _label(name: str, kind: str) -> str:
+    """Name of a curve, such as "pick, held out" for "validation_pick_accuracy"."""
+    what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_").replace("_", " ")
+    seen = "held out" if name.startswith(_HELD_OUT) else "training data"
+    return f"{what}, {seen}" if what else seen

@@ -67,14 +67,13 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
 
 
 def curve_chart(
-    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, label: str, percent: bool = False
+    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, percent: bool = False
 ) -> str:
     """Draw curves over training steps.
 
     Args:
         curves: Name of each curve to its (step, value) points.
-        title: What the chart shows, for screen readers and as base of its names.
-        label: What stands on the vertical axis.
+        title: What the chart shows; stands above it.
         percent: Whether values are fractions to be shown as per cent, on an axis from 0 to 100.
 
     Returns:
@@ -92,7 +91,7 @@ def curve_chart(
     if percent:
         axes.set_ylim(-2, 102)
         axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
-    axes.set_title(label, loc="left", fontsize=10, color=_INK)
+    axes.set_title(title, loc="left", fontsize=10, color=_INK)
     axes.set_xlabel("step")
     axes.tick_params(length=0)
     if len(curves) > 1:

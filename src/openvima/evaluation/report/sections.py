@@ -125,8 +125,8 @@ def training_charts(charts: Sequence[Chart]) -> str:
         charts: As read from the run's record.
     """
     figures = "".join(
-        f'<figure class="card">{curve_chart(lines, title=title, label=label, percent=percent)}</figure>'
-        for title, label, percent, lines in charts
+        f'<figure class="card">{curve_chart(chart.curves, title=chart.title, percent=chart.percent)}</figure>'
+        for chart in charts
     )
     if not figures:
         return ""
