@@ -68,14 +68,28 @@ def test_of_stacked_bodies_the_upper_one_is_picked_and_can_leave() -> None:
     assert world.scene[5].pose.planar_distance(scene[5].pose) < 1e-3
 
 
-def test_a_body_falls_when_the_one_below_it_is_taken() -> None:
+def test_a_body_falls_as_soon_as_the_one_below_it_is_taken() -> None:
     scene = table(("pan", 0.5, 0.0, 0.0), ("small block", 0.5, 0.0, 0.0))
     scene = scene.with_poses({6: scene[6].pose.moved(dz=0.045)})
     world = World(scene, ASSETS)
-    execution = world.execute(Action.planar((0.62, 0.0), (0.62, 0.3)))  # by its handle
+    seen = []
+    execution = world.execute(  # the pan is taken by its handle and put back: now it stands on the block
+        Action.planar((0.62, 0.0), (0.62, 0.0)), watch=lambda now: seen.append(now[6].pose.z)
+    )
     assert execution.grasped == 5
-    assert world.scene[6].pose.z < 0.03
-    assert world.scene[6].pose.planar_distance(scene[6].pose) < 0.05
+    assert seen[-1] == pytest.approx(0.014, abs=2e-3)
+    assert world.scene[5].pose.z > 0.02
+
+
+def test_what_lay_tilted_is_not_left_standing_on_its_edge() -> None:
+    scene = table(("letter A", 0.5, 0.0, 0.0), fixed=(("shorter block", 0.55, 0.0, 0.0),))
+    leaning = Pose((0.5, 0.0, 0.012), (0.0, -0.1, 0.0, math.sqrt(1 - 0.01)))
+    world = World(scene.with_poses({5: leaning}), ASSETS)
+    world.execute(Action.planar((0.3, 0.4), (0.3, 0.4)))  # it settles against the block
+    assert world.scene[5].pose.matrix()[2, 2] < 0.999
+    x, y, _ = world.scene[5].pose.position
+    assert world.execute(Action.planar((x, y), (0.4, -0.3))).grasped == 5
+    assert world.scene[5].pose.matrix()[2, 2] > 0.99999
 
 
 def test_an_object_set_down_on_another_lies_on_top_of_it() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from openvima.scene import Action, Pose
+from openvima.scene import Action
 from openvima.sim import World
 from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
 from openvima.sim.settling import WATCH_TICKS
@@ -78,13 +78,22 @@ def test_compat_ends_three_millimetres_earlier() -> None:
     assert ends[1] - ends[0] == pytest.approx(COMPAT_SHORTFALL_M, abs=1.5e-3)
 
 
-def test_a_blade_that_comes_down_on_a_block_nudges_it_aside() -> None:
-    world = blocks((0.615, 0.0, 0.4))
+def test_a_blade_that_comes_down_on_a_block_nudges_it_aside_and_pushes_it_on() -> None:
+    world = blocks((0.615, 0.0, 0.4))  # the blade comes down at 0.62
     execution = world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
     assert execution.completed
     pose = world.scene[4].pose
-    assert pose.z == pytest.approx(0.014, abs=1e-3)
-    assert pose.planar_distance(Pose.planar(0.615, 0.0)) < 0.1
+    assert pose.x == pytest.approx(0.55 - 0.0175, abs=4e-3)
+    assert abs(pose.y) < 0.015
+    assert pose.z == pytest.approx(0.014, abs=1e-4)
+
+
+def test_a_block_just_behind_the_blade_is_left_alone() -> None:
+    behind = 0.02 + 0.0025 + 0.015 + 0.002  # run-up, half a blade, half a block, 2 mm of air
+    world = blocks((0.6 + behind, 0.0, 0.0))
+    before = world.scene
+    world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
+    assert world.scene == before
 
 
 def test_watching_sees_the_blocks_on_their_way() -> None:
@@ -98,12 +107,22 @@ def test_watching_sees_the_blocks_on_their_way() -> None:
     assert seen[-1] == world.scene[4].pose.x
 
 
-def test_fixed_bodies_are_not_pushed_and_what_is_caught_before_them_is_not_flung_away() -> None:
+def test_fixed_bodies_are_not_pushed() -> None:
     scene = table(
         ("small block", 0.6, 0.0, 0.2), fixed=(("container", 0.45, 0.0, 0.1),), end_effector="spatula"
     )
     world = World(scene, ASSETS)
     world.execute(Action.planar((0.6, 0.0), (0.35, 0.0)))
     assert world.scene[5] == scene[5]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "yaw_rad"),
+    [(0.4578, -0.1225, -2.0892), (0.4553, -0.1202, -2.2721), (0.4595, -0.1253, -2.3764)],
+)
+def test_a_block_caught_between_blade_and_wall_is_not_flung_away(x, y, yaw_rad) -> None:
+    fixed = (("container", 0.2866, -0.2002, -0.6),)
+    scene = table(("small block", x, y, yaw_rad), fixed=fixed, end_effector="spatula")
+    world = World(scene, ASSETS)
+    world.execute(Action.planar((0.4359, -0.1139), (0.2553, -0.1942)))
     assert world.scene[4].pose.planar_distance(scene[4].pose) < 0.4
-    assert -0.01 < world.scene[4].pose.z < 0.15

@@ -4,10 +4,11 @@ A model depends on the shapes alone, not on where they stand, so that models and
 shared between scenes; poses live in `MjData`.
 
 Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s
-allows, so that a body at rest sinks in by micrometres. The benchmark multiplies the friction coefficients of
-a pair where MuJoCo takes the larger one: floor and blade (coefficient 1) are given 0 here, so that the
-other's holds; the slipperier of two bodies has priority; pairs of two slippery bodies are listed with their
-product.
+allows, so that a body at rest sinks in by micrometres.
+
+The benchmark multiplies the friction coefficients of a pair where MuJoCo takes the larger one. No coefficient
+exceeds 1, so it is enough to give the slipperier of two bodies priority, and to list pairs of two slippery
+ones with their product.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -38,7 +39,8 @@ _SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
 _INERTIA_FACTOR = 3.0  # the benchmark's bodies turn as if they were three times as heavy
 _INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, every side
 _TURNING_DAMPING_PER_S = 3.0  # else discs wobble on; its effect on straight motion is a hundred times smaller
-_SMALLEST_RADIUS_M = 0.015
+_FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
+_SLOWEST = -_FASTEST - np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0])  # falling is free
 _BLADE_MASS_KG = 17.0  # so that stopping it within a tick takes about the 500 N of the benchmark's tool mount
 _PARKED_M = 1000.0  # height at which bodies are kept that must touch nothing
 _MODEL_CACHE_SIZE = 256
@@ -136,7 +138,7 @@ def _compile(bodies: Sequence[BodyShape], with_blade: bool) -> mujoco.MjModel:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would turn friction towards its edges
     spec.option.impratio = 10.0  # friction as stiff as this against creeping
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [5.0, 5.0, 1.0], "pos": [0.0, 0.0, FLOOR_Z_M]}
-    spec.worldbody.add_geom(**floor, **_contact(friction=0.0))
+    spec.worldbody.add_geom(**floor, **_contact(friction=1.0))
     assets: dict[str, bytes] = {}
     slippery: list[tuple[str, float, bool]] = []  # geom name, friction, whether the body is fixed
     for index, body in enumerate(bodies):
@@ -240,7 +242,7 @@ def _add_blade(spec: mujoco.MjSpec) -> None:
     body.explicitinertial = True
     body.mass, body.inertia = _BLADE_MASS_KG, [_BLADE_MASS_KG] * 3
     body.ipos, body.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-    contact = _contact(0.0) | {"contype": _COLLIDES_WITH_BLADE, "conaffinity": 0}
+    contact = _contact(1.0) | {"contype": _COLLIDES_WITH_BLADE, "conaffinity": 0}
     box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(BLADE_HALF_SIZE_M)}
     body.add_geom(name="blade", **box, **contact)
 
@@ -315,11 +317,10 @@ class Bodies:
         """Put the lower end of the needle somewhere, metres."""
         self.data.mocap_pos[self._needle_mocap] = (x, y, z + _NEEDLE_HALF_LENGTH_M + NEEDLE_RADIUS_M)
 
-    def place_blade(self, pose: Pose, velocity: Vector3 = (0.0, 0.0, 0.0)) -> None:
-        """Put the blade's centre somewhere, moving with `velocity` in m/s."""
+    def place_blade(self, pose: Pose) -> None:
+        """Put the blade's centre somewhere, at rest."""
         self._positions[-1] = _numbers(pose)
         self._velocities[-1] = 0.0
-        self._velocities[-1, :3] = velocity
 
     def park_blade(self) -> None:
         """Put the blade where it touches nothing."""
@@ -334,6 +335,24 @@ class Bodies:
         """Advance the physics."""
         mujoco.mj_step(self.model, self.data, num_ticks)
 
+    def tick_with_blade(self, pose: Pose, velocity: Vector3, *, num_ticks: int, top_speed: float) -> None:
+        """Advance the physics while the blade moves evenly, whatever stands in its way.
+
+        Args:
+            pose: The blade's centre at the start.
+            velocity: Of the blade, m/s.
+            num_ticks: For how long.
+            top_speed: See `limit_speed`; kept after every tick, for a body that is squeezed between the blade
+                and a fixed one gains speed at a rate that no later limit could undo.
+        """
+        place = np.array(_numbers(pose))
+        speed = np.array((*velocity, 0.0, 0.0, 0.0))
+        for _ in range(num_ticks):
+            self._positions[-1], self._velocities[-1] = place, speed
+            mujoco.mj_step(self.model, self.data)
+            self.limit_speed(top_speed)
+            place[:3] += speed[:3] * TICK_S
+
     def stop(self) -> None:
         """Bring all bodies to rest where they are."""
         self.data.qvel[:] = 0.0
@@ -347,10 +366,8 @@ class Bodies:
                 what gives the smallest block's sides that speed.
         """
         velocities = self._velocities[: len(self.rigid)]
-        turning = top_speed / _SMALLEST_RADIUS_M
-        low = (-top_speed, -top_speed, -np.inf, -turning, -turning, -turning)
-        high = (top_speed, top_speed, top_speed, turning, turning, turning)
-        np.clip(velocities, low, high, out=velocities)
+        np.minimum(velocities, top_speed * _FASTEST, out=velocities)
+        np.maximum(velocities, top_speed * _SLOWEST, out=velocities)
 
     def speeds(self, *, apart_from: int | None = None) -> tuple[float, float]:
         """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies.

@@ -255,7 +255,7 @@ class _Blade:
         stage = self._stage
         self._bodies.park_blade()
         if stage.num_ticks:
-            stage.settle()
+            stage.settle(top_speed=TOP_SPEED)
         after = stage.scene() if stage.path.is_filmed else stage.start
         self._tip_z = tools.SWEEP_HOVER_TIP_Z_M
         stage.path.move(self._joints(), scene=lambda _: after)
@@ -313,9 +313,7 @@ class _Blade:
             self._y += direction[1] * step * ticks
 
     def _run(self, num_ticks: int, velocity: tuple[float, float, float]) -> None:
-        self._bodies.place_blade(self._pose(), velocity)
-        self._bodies.tick(num_ticks)
-        self._bodies.limit_speed(TOP_SPEED)
+        self._bodies.tick_with_blade(self._pose(), velocity, num_ticks=num_ticks, top_speed=TOP_SPEED)
         self._stage.count_ticks(num_ticks)
         self._stage.path.stay(num_ticks, scene=self._stage.scene, joints=self._joints)
 
