@@ -78,14 +78,22 @@ def test_compat_ends_three_millimetres_earlier() -> None:
     assert ends[1] - ends[0] == pytest.approx(COMPAT_SHORTFALL_M, abs=1.5e-3)
 
 
-def test_a_blade_that_comes_down_on_a_block_nudges_it_aside_and_pushes_it_on() -> None:
-    world = blocks((0.615, 0.0, 0.4))  # the blade comes down at 0.62
+@pytest.mark.parametrize("y", [0.0, 0.02])
+def test_a_blade_that_comes_down_on_a_block_nudges_it_forward_and_pushes_it_on(y) -> None:
+    world = blocks((0.614, y, 0.8))  # the blade comes down at 0.62
     execution = world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
     assert execution.completed
     pose = world.scene[4].pose
-    assert pose.x == pytest.approx(0.55 - 0.0175, abs=4e-3)
-    assert abs(pose.y) < 0.015
-    assert pose.z == pytest.approx(0.014, abs=1e-4)
+    assert 0.52 < pose.x < 0.535
+    assert pose.y == pytest.approx(y, abs=0.015)
+    assert pose.z == pytest.approx(0.014, abs=2e-4)
+
+
+def test_a_blade_that_comes_down_on_the_side_of_a_block_nudges_it_sideways() -> None:
+    world = blocks((0.618, 0.03, 0.4))
+    before = world.scene[4].pose
+    world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
+    assert 0.01 < world.scene[4].pose.planar_distance(before) < 0.02
 
 
 def test_a_block_just_behind_the_blade_is_left_alone() -> None:
