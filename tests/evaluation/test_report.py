@@ -189,7 +189,7 @@ def test_curves_are_grouped_by_kind(metrics):
 def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
     kinds = ("accuracy", "pick_accuracy", "yaw_accuracy")
     lines = [
-        {"step": 5, "name": "matching", "loss": 2.0, "stage": 0},
+        {"step": 5, "name": "1-matching", "loss": 2.0, "stage": 0},
         {"step": 5, "name": "cloning", **dict.fromkeys(kinds, 0.5)},
         {"step": 5, "name": "cloning", **{f"validation_{kind}": 0.4 for kind in kinds}},
     ]
