@@ -204,6 +204,35 @@ def test_hollow_bases_keep_objects_out_of_their_middle(
         assert inside(reach - 1e-9) and not inside(reach + 1e-6)
 
 
+def test_nothing_movable_is_placed_in_the_hollow_of_a_base(assets: Assets) -> None:
+    for seed in range(60):
+        table = table_for(assets, seed=seed, compat=True)
+        table.add("frame", "red", size=(0.225, 0.225, 0.0), pose=Pose.planar(0.5, 0.0))
+        block = table.place_one("target", lambda: ("block", "blue"), tries=50)
+        assert block.pose.planar_distance(Pose.planar(0.5, 0.0)) > 0.1575
+
+
+def test_no_hollow_base_is_placed_around_what_is_movable(assets: Assets) -> None:
+    for seed in range(60):
+        table = table_for(assets, seed=seed, compat=True)
+        table.add("block", "blue", size=(0.07, 0.07, 0.07), pose=Pose.planar(0.5, 0.0))
+        square = table.place_one("distractor", lambda: ("square", "red"), tries=50)
+        assert square.pose.planar_distance(Pose.planar(0.5, 0.0)) > 0.145
+
+
+def test_objects_keep_the_distance_asked_for_except_with_compat(assets: Assets) -> None:
+    nearest = {}
+    for compat in (False, True):
+        distances = []
+        for seed in range(40):
+            table = table_for(assets, seed=seed, compat=compat)
+            table.add("block", "blue", size=(0.07, 0.07, 0.07), pose=Pose.planar(0.5, 0.0))
+            other = table.place_one("distractor", lambda: ("block", "red"), tries=100, apart_m=0.3)
+            distances.append(other.pose.planar_distance(Pose.planar(0.5, 0.0)))
+        nearest[compat] = min(distances)
+    assert nearest[False] >= 0.3 > nearest[True]
+
+
 def test_sizes_are_drawn_axis_by_axis(assets: Assets) -> None:
     table = table_for(assets)
     sizes = np.array([table.sample_size("container") for _ in range(200)])

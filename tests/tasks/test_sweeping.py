@@ -58,8 +58,8 @@ def test_a_lone_block_goes_straight_to_the_middle_of_the_zone() -> None:
 
 
 def test_the_nearest_block_goes_first_whatever_its_id() -> None:
-    assert plan(problem_with({4: (0.72, 0.1), 5: (0.62, 0.05)}, {})).goal.object_id == 5
-    assert plan(problem_with({4: (0.62, 0.05), 5: (0.72, 0.1)}, {})).goal.object_id == 4
+    assert plan(problem_with({4: (0.72, -0.15), 5: (0.62, 0.1)}, {})).goal.object_id == 5
+    assert plan(problem_with({4: (0.62, 0.1), 5: (0.72, -0.15)}, {})).goal.object_id == 4
 
 
 def test_a_distractor_in_the_way_makes_another_block_go_first() -> None:
