@@ -369,18 +369,31 @@ class Bodies:
         np.minimum(velocities, top_speed * _FASTEST, out=velocities)
         np.maximum(velocities, top_speed * _SLOWEST, out=velocities)
 
-    def speeds(self, *, apart_from: int | None = None) -> tuple[float, float]:
-        """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies.
+    def speeds(self) -> tuple[float, float]:
+        """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies."""
+        velocities = np.abs(self._velocities[: len(self.rigid)])
+        return float(velocities[:, :3].max(initial=0.0)), float(velocities[:, 3:].max(initial=0.0))
+
+    def coordinates(self) -> np.ndarray:
+        """Present positions and quaternions of the free bodies, shape (N, 7), a copy."""
+        return self._positions[: len(self.rigid)].copy()
+
+    def mean_speeds(
+        self, since: np.ndarray, duration_s: float, *, apart_from: int | None = None
+    ) -> tuple[float, float]:
+        """Greatest component of the mean velocity (m/s), and greatest mean turning rate component (rad/s).
+
+        A body that trembles in its place has a velocity, but no mean one.
 
         Args:
+            since: What `coordinates` gave.
+            duration_s: How long ago that was.
             apart_from: A body that does not count, such as a parked one.
         """
-        velocities = np.abs(self._velocities[: len(self.rigid)])
+        change = np.abs(self._positions[: len(self.rigid)] - since) / duration_s
         if apart_from is not None:
-            velocities[self._joint[apart_from]] = 0.0
-        if not len(velocities):
-            return 0.0, 0.0
-        return float(velocities[:, :3].max()), float(velocities[:, 3:].max())
+            change[self._joint[apart_from]] = 0.0
+        return float(change[:, :3].max(initial=0.0)), 2 * float(change[:, 3:].max(initial=0.0))
 
     def lowest_z(self, index: int, quaternion: Quaternion) -> float:
         """Height of a body's lowest touching point above its link frame, in metres, in a given attitude."""

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from openvima.sim.bodies import Bodies
+from openvima.sim.bodies import TICK_S, Bodies
 
 SETTLED_SPEED = 5e-3  # m/s, as in VIMA-Bench
-SETTLED_TURNING = 0.05  # rad/s; a body that begins to topple turns before its centre moves
+SETTLED_TURNING = 0.05  # rad/s: a body that begins to topple turns before its centre moves
 SETTLE_LIMIT_TICKS = 1000
 WATCH_TICKS = 25  # longest stretch of motion between two looks at the constraints
 _STRIDE_TICKS = 5  # between two looks at the speeds; divides WATCH_TICKS
@@ -33,11 +33,12 @@ def settle(
     """
     num_ticks = quiet = 0
     while quiet < _QUIET_STRIDES and num_ticks < SETTLE_LIMIT_TICKS:
+        before = bodies.coordinates()
         bodies.tick(_STRIDE_TICKS)
         if top_speed is not None:
             bodies.limit_speed(top_speed)
         num_ticks += _STRIDE_TICKS
-        speed, turning = bodies.speeds(apart_from=apart_from)
+        speed, turning = bodies.mean_speeds(before, _STRIDE_TICKS * TICK_S, apart_from=apart_from)
         quiet = quiet + 1 if speed < SETTLED_SPEED and turning < SETTLED_TURNING else 0
         if each is not None:
             each(_STRIDE_TICKS)
