@@ -8,13 +8,13 @@ Report = Callable[[int, int, str], None]
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Report]:
-    """Show one bar with count, rate and time left while the block runs.
+    """Show one bar with count, time taken and time left while the block runs.
 
     Args:
         label: What is being done, in a word or two.
 
     Yields:
-        A callback `report(done, total, note)`; the note stands at the end of the line.
+        A callback `report(done, total, note)`; the note stands at the end of the line, cut where the line ends.
     """
     from rich.console import Console
     from rich.progress import (
@@ -25,17 +25,18 @@ def progress_bar(label: str) -> Iterator[Report]:
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.table import Column
 
     columns = (
-        TextColumn("{task.description:<24}"),
-        BarColumn(bar_width=30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True, min_width=18)),
+        BarColumn(bar_width=16),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
+        TextColumn("left", table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
     )
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4) as progress:
+    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4, expand=True) as progress:
         task = progress.add_task(label, total=None, note="")
 
         def report(done: int, total: int, note: str) -> None:
