@@ -1,4 +1,4 @@
-"""Run one task with `python examples/01_run_a_task.py`: read the prompt, let the oracle act, see how it ended."""
+"""Run one task with `python examples/01_run_a_task.py`: read the prompt, let the oracle act, see the end."""
 
 import openvima
 

@@ -1,7 +1,7 @@
 """Score a policy of your own: anything with `reset(prompts)` and `act(observations)`.
 
-Run it with `python examples/02_score_your_policy.py`. This policy never reads the prompt: it puts the second largest
-object in view into the largest, which is right about every second time.
+Run it with `python examples/02_score_your_policy.py`. This policy never reads the prompt: it puts the second
+largest object in view into the largest, which is right about every second time.
 """
 
 import numpy as np

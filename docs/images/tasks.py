@@ -1,4 +1,4 @@
-"""Make tasks.png beside this file: one solved episode of each task, the prompt above the table before and after."""
+"""Make tasks.png beside this file: one solved episode of each task, before and after."""
 
 import tempfile
 from pathlib import Path

@@ -14,7 +14,7 @@ def progress_bar(label: str) -> Iterator[Report]:
         label: What is being done, in a word or two.
 
     Yields:
-        A callback `report(done, total, note)`; the note stands at the end of the line, cut where the line ends.
+        A callback `report(done, total, note)`; the note ends the line and is cut where the line ends.
     """
     from rich.console import Console
     from rich.progress import (

@@ -21,8 +21,8 @@ def main(
 ) -> int:
     """Write demonstrations, train a small VIMA policy on them, score it, and leave a report.
 
-    Takes at most ten minutes on two cores. It can be interrupted at any time; the same command goes on where it
-    stopped. Example: openvima quickstart --out quickstart
+    Takes at most ten minutes on two cores. It can be interrupted at any time; the same command goes on where
+    it stopped. Example: openvima quickstart --out quickstart
 
     Args:
         out: Folder for everything that is made.
