@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from openvima.scene import Scene
-from openvima.sim.bodies import TICK_S
 from openvima.sim.end_effectors import REACH_RESERVE_M
+from openvima.sim.model import TICK_S
 from openvima.sim.ur5 import highest_tip_z, inverse
 
 FREE_SPEED = 2.4  # rad/s, Euclidean norm over the joints, as in VIMA-Bench

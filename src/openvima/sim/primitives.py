@@ -15,7 +15,8 @@ from openvima.scene.pose import rotate
 from openvima.sim import end_effectors as tools
 from openvima.sim import settling, ur5
 from openvima.sim.arm_path import SWEEP_SPEED, reachable_joints
-from openvima.sim.bodies import FLOOR_Z_M, TICK_S, Bodies
+from openvima.sim.bodies import Bodies
+from openvima.sim.model import FLOOR_Z_M, TICK_S
 from openvima.sim.stage import RESTING_GAP_M, Stage
 from openvima.sim.touch import body_gap, gap, way_to_touch
 

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from openvima.sim.bodies import TICK_S, Bodies
+from openvima.sim.bodies import Bodies
+from openvima.sim.model import TICK_S
 
 SETTLED_SPEED = 5e-3  # m/s, as in VIMA-Bench
 SETTLED_TURNING = 0.05  # rad/s: a body that begins to topple turns before its centre moves

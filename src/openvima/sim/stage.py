@@ -6,7 +6,8 @@ from collections.abc import Callable
 from openvima.scene import Placement, Pose, Scene
 from openvima.sim import settling
 from openvima.sim.arm_path import ArmPath
-from openvima.sim.bodies import FLOOR_Z_M, Bodies
+from openvima.sim.bodies import Bodies
+from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.touch import body_gap
 
 RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another

@@ -1,0 +1,243 @@
+"""The MuJoCo model of a scene: free and fixed bodies on a floor, and the tool's blade.
+
+A model depends on the shapes alone, not on where they stand, so that models and the convex hulls in them are
+shared between scenes; poses live in `MjData`.
+
+Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s
+allows, so that a body at rest sinks in by micrometres.
+
+The benchmark multiplies the friction coefficients of a pair where MuJoCo takes the larger one. No coefficient
+exceeds 1, so it is enough to give the slipperier of two bodies priority, and to list pairs of two slippery
+ones with their product.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's names come from a compiled module without type stubs.)
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+
+from openvima.catalog.geometry import CollisionBox, CollisionShape, Geometry, Vector3
+from openvima.catalog.objects import ObjectSpec, object_spec
+from openvima.sim.end_effectors import BLADE_HALF_SIZE_M, NEEDLE_RADIUS_M
+
+TICK_S = 1 / 240
+GRAVITY_M_S2 = 9.8
+FLOOR_Z_M = -0.001  # top of the floor; the visible sheet lies at 0
+HULL_MARGIN_M = 0.001  # hulls touch at this distance, as in the benchmark
+BOX_MARGIN_M = 1e-5  # at 0, a box that just touches the floor would fall freely for one tick
+
+_SOLREF = (0.0125, 1.0)  # s, damping ratio: three ticks, critically damped; at two, round bodies gain energy
+_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
+_INERTIA_FACTOR = 3.0  # the benchmark's bodies turn as if they were three times as heavy
+_INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, every side
+_TURNING_DAMPING_PER_S = 3.0  # else discs wobble on; its effect on straight motion is a hundred times smaller
+_BLADE_MASS_KG = 17.0  # so that stopping it within a tick takes about the 500 N of the benchmark's tool mount
+PARKED_M = 1000.0  # height at which bodies are kept that must touch nothing
+_MODEL_CACHE_SIZE = 256
+_MEMORY_BYTES = 2 << 20  # working memory of a world: twenty times what crowded scenes need
+NEEDLE_HALF_LENGTH_M = 0.2
+_COLLIDES, _COLLIDES_WITH_BLADE = 1, 2  # bits of contype and conaffinity
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyShape:
+    """One body without its pose; equal `key` means equal in every respect.
+
+    Args:
+        key: Digest of all that the model needs.
+        shapes: Convex parts in the link frame.
+        points: Corners of all parts with the margin that each is given, shape (N, 4): x, y, z, margin;
+            metres.
+        radius_m: Greatest planar distance of a corner from the link frame, margin included, whatever the
+            attitude.
+        spec: Catalogue entry.
+        fixed: Welded to the floor.
+        inertia: Principal moments in kg m².
+    """
+
+    key: bytes
+    shapes: tuple[CollisionShape, ...]
+    points: np.ndarray
+    radius_m: float
+    spec: ObjectSpec
+    fixed: bool
+    inertia: Vector3
+
+
+@lru_cache(maxsize=1024)
+def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
+    """Prepare the body of an object; one that nothing can touch counts as fixed."""
+    spec = object_spec(object_name)
+    digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, fixed)).encode())
+    for shape in geometry.collision:
+        digest.update(repr(shape).encode() if isinstance(shape, CollisionBox) else shape.points.tobytes())
+    corners = [_corners(shape) for shape in geometry.collision]
+    points = np.concatenate(corners) if corners else np.zeros((0, 4))
+    reach = np.linalg.norm(points[:, :3], axis=1) + points[:, 3]
+    return BodyShape(
+        digest.digest(),
+        geometry.collision,
+        points,
+        float(reach.max(initial=0.0)),
+        spec,
+        fixed or not geometry.collision,
+        _inertia(points, spec.mass_kg),
+    )
+
+
+def _corners(shape: CollisionShape) -> np.ndarray:
+    if isinstance(shape, CollisionBox):
+        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+        return np.c_[np.asarray(shape.centre) + signs * np.asarray(shape.half_size), np.full(8, BOX_MARGIN_M)]
+    return np.c_[shape.points, np.full(len(shape.points), HULL_MARGIN_M)]
+
+
+def _inertia(points: np.ndarray, mass_kg: float) -> Vector3:
+    """Moments of the solid box around the collision shape, times the benchmark's factor."""
+    if not len(points):
+        return (1e-6, 1e-6, 1e-6)
+    growth = 2 * _INERTIA_GROWTH_M if points[:, 3].max() > BOX_MARGIN_M else 0.0
+    x, y, z = np.square(np.ptp(points[:, :3], axis=0) + growth) * (_INERTIA_FACTOR * mass_kg / 12)
+    return (float(y + z), float(x + z), float(x + y))
+
+
+@lru_cache(maxsize=_MODEL_CACHE_SIZE)
+def _model_cache(key: tuple[bytes, ...], with_blade: bool) -> list[mujoco.MjModel]:
+    """A place to keep the model of these bodies; empty the first time."""
+    return []
+
+
+def build_model(bodies: Sequence[BodyShape], *, with_blade: bool) -> mujoco.MjModel:
+    """Compile the model of some bodies, or return the one compiled before.
+
+    Body 0 is the world, the next ones are `bodies` in order, then needle and blade. Free joints stand in the
+    same order, the blade's last.
+    """
+    kept = _model_cache(tuple(body.key for body in bodies), with_blade)
+    if not kept:
+        kept.append(_compile(bodies, with_blade))
+    return kept[0]
+
+
+def _compile(bodies: Sequence[BodyShape], with_blade: bool) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.memory = _MEMORY_BYTES
+    spec.option.timestep = TICK_S
+    spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
+    spec.option.tolerance = 1e-10  # before 4.0 relative to the mean inertia, which the blade dominates
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would turn friction towards its edges
+    spec.option.impratio = 10.0  # friction as stiff as this against creeping
+    floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [5.0, 5.0, 1.0], "pos": [0.0, 0.0, FLOOR_Z_M]}
+    spec.worldbody.add_geom(**floor, **_contact(friction=1.0))
+    assets: dict[str, bytes] = {}
+    slippery: list[tuple[str, float, bool]] = []  # geom name, friction, whether the body is fixed
+    for index, body in enumerate(bodies):
+        slippery += _add_body(spec, index, body, assets)
+    spec.assets = assets
+    _add_slippery_pairs(spec, slippery)
+    _add_needle(spec)
+    if with_blade:
+        _add_blade(spec)
+    return spec.compile()
+
+
+def _contact(
+    friction: float, *, slippery: bool = False, affinity: int = _COLLIDES, margin: float = 0.0
+) -> dict:
+    return {
+        "friction": [friction, 0.0, 0.0],
+        "priority": int(slippery),
+        "condim": 3,
+        "solref": list(_SOLREF),
+        "solimp": list(_SOLIMP),
+        "margin": margin,
+        "contype": _COLLIDES,
+        "conaffinity": affinity,
+    }
+
+
+def _add_body(
+    spec: mujoco.MjSpec, index: int, body: BodyShape, assets: dict[str, bytes]
+) -> list[tuple[str, float, bool]]:
+    added = spec.worldbody.add_body(name=f"body{index}")
+    if body.fixed:
+        added.mocap = True  # so that its pose, too, is data and not part of the model
+    else:
+        moment = sum(body.inertia) / 3
+        added.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, damping=[_TURNING_DAMPING_PER_S * moment] * 3)
+        added.explicitinertial = True
+        added.mass, added.inertia = body.spec.mass_kg, list(body.inertia)
+        added.ipos, added.iquat = list(body.spec.com_offset), [1.0, 0.0, 0.0, 0.0]
+    affinity = _COLLIDES if body.fixed else _COLLIDES | _COLLIDES_WITH_BLADE
+    friction = body.spec.friction
+    names = []
+    for part, shape in enumerate(body.shapes):
+        name = f"body{index}/{part}"
+        box = isinstance(shape, CollisionBox)
+        contact = _contact(
+            friction, slippery=friction < 1, affinity=affinity, margin=BOX_MARGIN_M if box else HULL_MARGIN_M
+        )
+        if box:
+            place = {
+                "type": mujoco.mjtGeom.mjGEOM_BOX,
+                "size": list(shape.half_size),
+                "pos": list(shape.centre),
+            }
+        else:
+            place = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": _add_hull(spec, shape.points, assets)}
+        added.add_geom(name=name, **place, **contact)
+        names.append(name)
+    return [(name, friction, body.fixed) for name in names] if friction < 1 else []
+
+
+def _add_hull(spec: mujoco.MjSpec, points: np.ndarray, assets: dict[str, bytes]) -> str:
+    """Add points whose convex hull collides; MuJoCo keeps the hulls of files, so they are given as one."""
+    header = np.array([len(points), 0, 0, 0], dtype=np.int32)  # vertices; no normals, texture points, faces
+    content = header.tobytes() + points.astype(np.float32).tobytes()
+    name = hashlib.sha1(content).hexdigest()
+    file = f"{name}.msh"
+    if file not in assets:
+        assets[file] = content
+        spec.add_mesh(name=name, file=file)
+    return name
+
+
+def _add_slippery_pairs(spec: mujoco.MjSpec, slippery: list[tuple[str, float, bool]]) -> None:
+    for i, (name1, friction1, fixed1) in enumerate(slippery):
+        for name2, friction2, fixed2 in slippery[:i]:
+            if name1.split("/")[0] == name2.split("/")[0] or (fixed1 and fixed2):
+                continue
+            friction = friction1 * friction2
+            spec.add_pair(
+                geomname1=name1,
+                geomname2=name2,
+                condim=3,
+                friction=[friction, friction, 0.0, 0.0, 0.0],
+                solref=list(_SOLREF),
+                solimp=list(_SOLIMP),
+            )
+
+
+def _add_needle(spec: mujoco.MjSpec) -> None:
+    """A thin upright line that collides with nothing; distances to it tell what is under the cup."""
+    body = spec.worldbody.add_body(name="needle", mocap=True, pos=[0.0, 0.0, PARKED_M])
+    capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [NEEDLE_RADIUS_M, NEEDLE_HALF_LENGTH_M, 0.0]}
+    body.add_geom(name="needle", **capsule, contype=0, conaffinity=0)
+
+
+def _add_blade(spec: mujoco.MjSpec) -> None:
+    """A free body whose motion is prescribed; it pushes free bodies and passes through all others."""
+    body = spec.worldbody.add_body(name="blade", pos=[0.0, 0.0, PARKED_M], gravcomp=1.0)
+    body.add_freejoint()
+    body.explicitinertial = True
+    body.mass, body.inertia = _BLADE_MASS_KG, [_BLADE_MASS_KG] * 3
+    body.ipos, body.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    contact = _contact(1.0) | {"contype": _COLLIDES_WITH_BLADE, "conaffinity": 0}
+    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(BLADE_HALF_SIZE_M)}
+    body.add_geom(name="blade", **box, **contact)
