@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from openvima.scene import Action
 from openvima.sim import World
-from sim_tables import ASSETS, random_action, random_table
+from sim_tables import ASSETS, random_action, random_table, table
 
 SEEDS = range(30)
 NUM_ACTIONS = 4
@@ -32,6 +33,14 @@ def test_random_actions_never_lose_a_body(seed) -> None:
             else:
                 assert -0.03 < now.pose.z < 0.6, (action, now)
                 assert now.pose.planar_distance(before.pose) < 3.0, (action, now)
+
+
+def test_a_heap_of_bodies_in_one_another_comes_apart() -> None:
+    names = ("bowl", "container", "letter A") * 4
+    bodies = [(name, 0.5 + 0.01 * i, 0.01 * i, 0.3 * i) for i, name in enumerate(names)]
+    world = World(table(*bodies), ASSETS)
+    world.execute(Action.planar((0.5, 0.0), (0.6, 0.2)))
+    assert all(abs(placement.pose.z) < 0.6 for placement in world.scene.placements)
 
 
 def digest() -> str:

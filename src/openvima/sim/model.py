@@ -40,7 +40,7 @@ _TURNING_DAMPING_PER_S = 3.0  # else discs wobble on; its effect on straight mot
 _BLADE_MASS_KG = 17.0  # so that stopping it within a tick takes about the 500 N of the benchmark's tool mount
 PARKED_M = 1000.0  # height at which bodies are kept that must touch nothing
 _MODEL_CACHE_SIZE = 256
-_MEMORY_BYTES = 2 << 20  # working memory of a world: twenty times what crowded scenes need
+_MEMORY_BYTES = 64 << 20  # reserved, not used: crowded scenes need 0.3 MB, a heap of bodies in one another 5
 NEEDLE_HALF_LENGTH_M = 0.2
 _COLLIDES, _COLLIDES_WITH_BLADE = 1, 2  # bits of contype and conaffinity
 
