@@ -36,7 +36,7 @@ def test_random_actions_never_lose_a_body(seed) -> None:
 
 
 def test_a_heap_of_bodies_in_one_another_comes_apart() -> None:
-    names = ("bowl", "container", "letter A") * 4
+    names = ("bowl", "container", "letter A") * 3
     bodies = [(name, 0.5 + 0.01 * i, 0.01 * i, 0.3 * i) for i, name in enumerate(names)]
     world = World(table(*bodies), ASSETS)
     world.execute(Action.planar((0.5, 0.0), (0.6, 0.2)))
