@@ -15,6 +15,7 @@ ones with their product.
 # (MuJoCo's names come from a compiled module without type stubs.)
 
 import hashlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +26,9 @@ import numpy as np
 from openvima.catalog.geometry import CollisionBox, CollisionShape, Geometry, Vector3
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.sim.end_effectors import BLADE_HALF_SIZE_M, NEEDLE_RADIUS_M
+
+# Left alone, MuJoCo writes its warnings into a file in the working directory.
+mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
 
 TICK_S = 1 / 240
 GRAVITY_M_S2 = 9.8
