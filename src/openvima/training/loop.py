@@ -164,7 +164,9 @@ def _optimizer(model: Vima, stage: Stage, config: TrainingConfig) -> torch.optim
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]
     groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=config.weight_decay)
+    return torch.optim.AdamW(
+        groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
 
 
 def _settings(config: TrainingConfig, dataset: Dataset) -> dict[str, Any]:  # Any: plain YAML values

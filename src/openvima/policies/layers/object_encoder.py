@@ -28,6 +28,9 @@ class ObjectEncoderConfig:
         width: Width of an object token.
         fuse_views: One token for both views of an object, instead of one for each.
         appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
+        crop_dropout: Share of objects whose crop features are left out of their token in training. What is then
+            left of them, box and appearance embedding, serves for unknown objects too, so that the policy does
+            not come to know the training objects by heart.
     """
 
     crop: VitConfig | ConvConfig
@@ -35,10 +38,13 @@ class ObjectEncoderConfig:
     width: int
     fuse_views: bool = False
     appearance_width: int = 0
+    crop_dropout: float = 0.0
 
     def __post_init__(self) -> None:
         if self.appearance_width and not self.fuse_views:
             raise ConfigError("object encoder: an appearance embedding needs fuse_views, one token per object.")
+        if not 0 <= self.crop_dropout < 1:
+            raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
 
 
 class ObjectEncoder(nn.Module):
@@ -83,6 +89,9 @@ class ObjectEncoder(nn.Module):
         Returns:
             Shape (..., N, D) with fused views, else (..., 2 · N, D), all front slots first.
         """
+        if self.training and self.config.crop_dropout:
+            kept = torch.rand(masks_VN.shape[:-2] + (1,) + masks_VN.shape[-1:]) >= self.config.crop_dropout
+            features_VNF = features_VNF * kept[..., None]
         boxes_VN4 = boxes_VN4.to(features_VNF.dtype) / self.box_units
         views = [
             torch.cat([features_VNF[..., v, :, :], encoder(boxes_VN4[..., v, :, :])], dim=-1)
