@@ -68,8 +68,14 @@ _RULES: tuple[tuple[str, str], ...] = (
         r"t5_prompt_encoder\.t5\.encoder\.block\.(\d+)\.layer\.1\.layer_norm\.",
         r"text.blocks.\1.norm_feed_forward.",
     ),
-    (r"t5_prompt_encoder\.t5\.encoder\.block\.(\d+)\.layer\.1\.DenseReluDense\.wi\.", r"text.blocks.\1.widen."),
-    (r"t5_prompt_encoder\.t5\.encoder\.block\.(\d+)\.layer\.1\.DenseReluDense\.wo\.", r"text.blocks.\1.narrow."),
+    (
+        r"t5_prompt_encoder\.t5\.encoder\.block\.(\d+)\.layer\.1\.DenseReluDense\.wi\.",
+        r"text.blocks.\1.widen.",
+    ),
+    (
+        r"t5_prompt_encoder\.t5\.encoder\.block\.(\d+)\.layer\.1\.DenseReluDense\.wo\.",
+        r"text.blocks.\1.narrow.",
+    ),
 )
 _STACKS = r"(objects\.box_encoders\.\d|actions\.parts\.\d|prompt_objects|head\.classifiers\.\d+)\.(\d)\."
 _FIRST_CLASSIFIER = {"pose0_position": 0, "pose0_rotation": 2, "pose1_position": 6, "pose1_rotation": 8}

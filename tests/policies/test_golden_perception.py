@@ -43,7 +43,9 @@ def test_objects_of_prompt_images_equal_the_golden_ones(golden, view, name):
         count = int(objects.masks[view].sum())
         expected = golden[f"out.prompt.mask.{name}"][entry]
         assert count == expected.sum()
-        np.testing.assert_array_equal(objects.boxes[view, :count], golden[f"out.prompt.bbox.{name}"][entry, :count])
+        np.testing.assert_array_equal(
+            objects.boxes[view, :count], golden[f"out.prompt.bbox.{name}"][entry, :count]
+        )
         np.testing.assert_array_equal(
             objects.crops[view, :count], golden[f"out.prompt.cropped_img.{name}"][entry, :count]
         )

@@ -113,7 +113,9 @@ def prompt_batch(golden: dict[str, np.ndarray]) -> tuple[PromptBatch, np.ndarray
 
 
 def history_batch(golden: dict[str, np.ndarray]) -> tuple[HistoryBatch, np.ndarray]:
-    crops, boxes, masks = (array.swapaxes(0, 1) for array in both_views(golden, "obs"))  # (B, T, view, slot, …)
+    crops, boxes, masks = (
+        array.swapaxes(0, 1) for array in both_views(golden, "obs")
+    )  # (B, T, view, slot, …)
     batch, steps, _, size = masks.shape
     points = torch.zeros(batch, steps, size, 2, dtype=torch.float64)
     history = HistoryBatch(
@@ -146,7 +148,9 @@ def assert_close(actual, expected: np.ndarray) -> None:
 
 
 def test_golden_crop_features(model, golden):
-    assert_close(model.objects.encode_crops(tensor(golden["in.prompt.cropped_img.front"])), golden["prompt.vit.front"])
+    assert_close(
+        model.objects.encode_crops(tensor(golden["in.prompt.cropped_img.front"])), golden["prompt.vit.front"]
+    )
 
 
 def test_golden_relative_positions_fall_into_the_same_buckets(golden):
@@ -180,7 +184,10 @@ def test_golden_observations_become_the_same_tokens(model, golden):
 
 @torch.no_grad()
 def test_golden_actions_become_the_same_tokens(model, golden):
-    assert_close(model.actions(to_unit_range(past_actions(golden)[:, :2]).float()), golden["action.tokens"].swapaxes(0, 1))
+    assert_close(
+        model.actions(to_unit_range(past_actions(golden)[:, :2]).float()),
+        golden["action.tokens"].swapaxes(0, 1),
+    )
 
 
 def test_golden_positions_count_valid_places_only(golden):

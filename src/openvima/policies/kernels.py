@@ -134,7 +134,7 @@ def most_interior_pixel(segm, object_id, extents, distance, pixel):
     """Write column and row of the object's pixel that is farthest from its outline into `pixel` (2,).
 
     Distances are those of the 3-4 chamfer metric; among equals the one nearest the centroid wins, then the
-    first in reading order. `distance` is int32 of shape (H + 2, W + 2) at least; its border stands for "outside".
+    first in reading order. `distance` is int32 of shape (H + 2, W + 2) at least; its border means "outside".
     """
     xmin, xmax, ymin, ymax = extents[0], extents[1], extents[2], extents[3]
     width = xmax - xmin + 1

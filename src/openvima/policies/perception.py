@@ -71,6 +71,10 @@ class ObjectViews:
             self.grasps[rows, order],
         )
 
+    def visible(self) -> np.ndarray:
+        """Whether each object shows in some view, shape (N,), bool."""
+        return np.asarray(self.masks.any(axis=0))
+
     def positions(self) -> np.ndarray:
         """Points on the table under the centres of the boxes, shape (N, 2), float64, metres.
 
@@ -122,8 +126,8 @@ def see_objects(
 def observe(observation: Mapping) -> ObjectViews:
     """Find the objects of an observation, from left to right.
 
-    Objects are all segmentation values from the end effector's first object id up to 254. Their order is that of
-    the images, not of the ids, which would give away the order in which the task spawned them.
+    Objects are all segmentation values from the end effector's first object id up to 254. Their order is that
+    of the images, not of the ids, which could give away the order in which the task spawned them.
 
     Args:
         observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
@@ -141,11 +145,11 @@ def observe(observation: Mapping) -> ObjectViews:
 def observe_prompt_image(image: PromptImage) -> ObjectViews:
     """Find the objects that a prompt's image shows, in the order of its records, hidden ones left out."""
     objects = see_objects(image.rgb, image.segm, [record.object_id for record in image.objects])
-    return objects.select(objects.masks.any(axis=0))
+    return objects.select(objects.visible())
 
 
 def _left_to_right(objects: ObjectViews) -> ObjectViews:
-    objects = objects.select(objects.masks.any(axis=0))
+    objects = objects.select(objects.visible())
     points = objects.positions()
     return objects.select(np.lexsort((points[:, 0], points[:, 1])))
 

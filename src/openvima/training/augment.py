@@ -64,7 +64,9 @@ def _reordered(history: HistoryBatch, order_BTN: torch.Tensor) -> HistoryBatch:
         crops_BTVN=history.crops_BTVN.gather(3, order_BTVN),
         boxes_BTVN4=history.boxes_BTVN4.gather(3, order_BTVN[..., None].expand_as(history.boxes_BTVN4)),
         masks_BTVN=history.masks_BTVN.gather(3, order_BTVN),
-        positions_BTN2=history.positions_BTN2.gather(2, order_BTN[..., None].expand_as(history.positions_BTN2)),
+        positions_BTN2=history.positions_BTN2.gather(
+            2, order_BTN[..., None].expand_as(history.positions_BTN2)
+        ),
         grasps_BTN2=history.grasps_BTN2.gather(2, order_BTN[..., None].expand_as(history.grasps_BTN2)),
     )
 

@@ -47,7 +47,7 @@ class TrainingConfig:
         pretraining_batch: Pairs of one object a step.
         pretraining_learning_rate: Highest learning rate of that.
         temperature: Divisor of similarities in the matching loss.
-        tune_crops: Go on training the crop encoder while cloning. Slower: crops are encoded anew in every step.
+        tune_crops: Go on training the crop encoder while cloning. Slower: each step encodes its crops anew.
         assets: Asset pack to draw the pairs with: "procedural", or the folder of the original one.
         seed: Decides weights, order and augmentation.
         validation_share: Share of the demonstrations that only serve to choose the best checkpoint.

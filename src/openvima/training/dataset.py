@@ -130,7 +130,9 @@ def read_examples(
         example = _read_example(demonstration, stack, rng, fuse_views=fuse_views)
         parts[_is_held_out(example, validation_share)].append(example)
     if not parts[0]:
-        raise DatasetError("there is no demonstration to learn from; generate some, or lower validation_share.")
+        raise DatasetError(
+            "there is no demonstration to learn from; generate some, or lower validation_share."
+        )
     return Examples(tuple(parts[0]), tuple(parts[1]), torch.from_numpy(stack.stacked()))
 
 

@@ -18,7 +18,7 @@ from openvima.policies.vima.model import Vima, build_model
 from openvima.training.config import TrainingConfig
 from openvima.training.dataset import read_examples
 from openvima.training.pretrain import render_pairs
-from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, Progress, RunFolder
+from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, RunFolder
 from openvima.training.schedule import learning_rate_share, step_seed
 from openvima.training.stages import Cloning, Matching, Metrics, Stage
 
@@ -49,7 +49,9 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
     """
     sizes = preset(config.preset)
     if config.pretraining_steps and not sizes.objects.appearance_width:
-        raise ConfigError(f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0.")
+        raise ConfigError(
+            f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0."
+        )
     dataset = Dataset(config.data)
     run = RunFolder(config.out, _settings(config, dataset), force=config.force)
     with _threads(config.threads):
@@ -75,7 +77,10 @@ class _Trainer:
     def train(self) -> None:
         """Run what is left of the stages."""
         for number, (num_steps, make) in enumerate(self.stages):
-            if number < self.progress.stage or (number, num_steps) == (self.progress.stage, self.progress.step):
+            if number < self.progress.stage or (number, num_steps) == (
+                self.progress.stage,
+                self.progress.step,
+            ):
                 continue
             if number > self.progress.stage:
                 self.progress = replace(self.progress, stage=number, step=0)
@@ -138,9 +143,7 @@ class _Trainer:
 
         tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
         num_scenes, assets = self.config.pretraining_scenes, self.config.assets
-        pairs = render_pairs(
-            tasks, num_scenes=num_scenes, seed=self.config.seed, assets=assets, report=say
-        )
+        pairs = render_pairs(tasks, num_scenes=num_scenes, seed=self.config.seed, assets=assets, report=say)
         return Matching(self.model, self.config, pairs)
 
     def _cloning(self) -> Stage:
@@ -164,9 +167,7 @@ def _optimizer(model: Vima, stage: Stage, config: TrainingConfig) -> torch.optim
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]
     groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
-    return torch.optim.AdamW(
-        groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
+    return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True)
 
 
 def _settings(config: TrainingConfig, dataset: Dataset) -> dict[str, Any]:  # Any: plain YAML values

@@ -1,7 +1,8 @@
 """Pairs of one object, alone in a prompt image and among others in a scene, and the loss that matches them.
 
-Scenes are drawn for this purpose from the training partition: sampled like episodes of the tasks in the data, then
-every object gets another training texture and a prompt image of its own. Nothing of the test levels is ever shown.
+Scenes are drawn for this purpose from the training partition: sampled like episodes of the tasks in the data,
+then every object gets another training texture and a prompt image of its own. Nothing of the test levels is
+ever shown.
 """
 
 from collections.abc import Sequence
@@ -139,7 +140,7 @@ def embed_looks(
 
 
 def colour_mixing(generator: torch.Generator) -> torch.Tensor:
-    """Draw a (3, 3) matrix that mixes R, G and B: half of the time none, else a permutation with some blending.
+    """Draw a (3, 3) matrix that mixes R, G and B: half of the time not at all, else a blended permutation.
 
     Rows sum to 1, so that white, grey and black stay what they are.
     """
@@ -158,7 +159,7 @@ def _training_textures(tasks: Sequence[str]) -> tuple[str, ...]:
 
 
 def _retextured(scene: Scene, textures: Sequence[str], rng: np.random.Generator) -> Scene:
-    """Give every object a training texture; few different ones, so that many objects differ in shape alone."""
+    """Give every object a training texture; few different ones, so that many differ in shape alone."""
     palette = rng.choice(len(textures), size=max(2, len(scene.placements) - 1), replace=False)
     chosen = rng.choice(palette, size=len(scene.placements))
     placements = [replace(p, texture=textures[i]) for p, i in zip(scene.placements, chosen, strict=True)]

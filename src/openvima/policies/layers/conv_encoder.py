@@ -1,7 +1,7 @@
 """A small convolutional crop encoder, for networks that are trained within minutes.
 
-Measured on pairs of prompt and scene crops, batch 256, 60 steps: it finds 97 % of the objects in their scene, a
-transformer over 8 × 8 patches of the same size 90 %, at 1.4 times the cost.
+Measured on pairs of prompt and scene crops, batch 256, 60 steps: it finds 97 % of the objects in their scene,
+a transformer over 8 × 8 patches of the same size 90 %, at 1.4 times the cost.
 
 Shape suffixes: N crops, C channels, Y rows, X columns, F width of the features.
 """
@@ -22,7 +22,7 @@ class ConvConfig:
     """Sizes of the convolutional crop encoder.
 
     Args:
-        width: Channels of the first layer; the next two have twice and four times as many, the last as the third.
+        width: Channels of the first layer; the next have 2, 4 and 4 times as many.
         output_width: Length of the feature vector.
     """
 

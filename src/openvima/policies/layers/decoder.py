@@ -1,6 +1,6 @@
 """The decoder: blocks of cross-attention to the prompt and causal self-attention over the history.
 
-Shape suffixes: B batch, L places of the history, P places of the prompt, D width, H heads, K width of one head.
+Shape suffixes: B batch, L places of the history, P places of the prompt, D width, H heads, K width of a head.
 """
 
 from dataclasses import dataclass
@@ -110,9 +110,7 @@ class CrossBlock(nn.Module):
         self.gate = nn.Linear(width, 4 * width, bias=False)
         self.narrow = nn.Linear(4 * width, width, bias=False)
 
-    def forward(
-        self, x_BLD: torch.Tensor, prompt_BPD: torch.Tensor, bias_B11P: torch.Tensor
-    ) -> torch.Tensor:
+    def forward(self, x_BLD: torch.Tensor, prompt_BPD: torch.Tensor, bias_B11P: torch.Tensor) -> torch.Tensor:
         """Map the history to the same shape; `bias_B11P` hides prompt places."""
         query = self.query(self.norm_attention(x_BLD)).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
         # (B, P, 2·D) -> (2, B, H, P, K)

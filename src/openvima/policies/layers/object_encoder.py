@@ -1,6 +1,6 @@
 """Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
 
-Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token; `...` leading axes.
+Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token; `...` any axes.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,12 @@ from openvima.policies.layers.mlp import mlp
 from openvima.policies.layers.vit import VisionTransformer, VitConfig
 
 NUM_VIEWS = 2
-_BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # box = centre x, centre y, height, width in pixels of a 128 × 256 image
+_BOX_UNITS = (
+    256.0,
+    128.0,
+    128.0,
+    256.0,
+)  # box = centre x, centre y, height, width in pixels of a 128 × 256 image
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +33,9 @@ class ObjectEncoderConfig:
         width: Width of an object token.
         fuse_views: One token for both views of an object, instead of one for each.
         appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
-        crop_dropout: Share of objects whose crop features are left out of their token in training. What is then
-            left of them, box and appearance embedding, serves for unknown objects too, so that the policy does
-            not come to know the training objects by heart.
+        crop_dropout: Share of objects whose crop features are left out of their token in training. What is
+            then left, box and appearance embedding, serves for unknown objects as well: the policy does not
+            learn the training objects by heart.
     """
 
     crop: VitConfig | ConvConfig
@@ -42,7 +47,9 @@ class ObjectEncoderConfig:
 
     def __post_init__(self) -> None:
         if self.appearance_width and not self.fuse_views:
-            raise ConfigError("object encoder: an appearance embedding needs fuse_views, one token per object.")
+            raise ConfigError(
+                "object encoder: an appearance embedding needs fuse_views, one token per object."
+            )
         if not 0 <= self.crop_dropout < 1:
             raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
 
@@ -65,10 +72,8 @@ class ObjectEncoder(nn.Module):
         box_widths = (4, config.box_width, config.box_width, config.box_width)
         self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))
         per_view = features + config.box_width
-        if config.fuse_views:
-            self.fusion = nn.Linear(NUM_VIEWS * (per_view + 1), config.width)
-        else:
-            self.fusion = nn.ModuleList(nn.Linear(per_view, config.width) for _ in range(NUM_VIEWS))
+        fusion_widths = [NUM_VIEWS * (per_view + 1)] if config.fuse_views else [per_view] * NUM_VIEWS
+        self.fusion = nn.ModuleList(nn.Linear(width, config.width) for width in fusion_widths)
         if config.appearance_width:
             self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
 
@@ -90,7 +95,8 @@ class ObjectEncoder(nn.Module):
             Shape (..., N, D) with fused views, else (..., 2 · N, D), all front slots first.
         """
         if self.training and self.config.crop_dropout:
-            kept = torch.rand(masks_VN.shape[:-2] + (1,) + masks_VN.shape[-1:]) >= self.config.crop_dropout
+            shape = (*masks_VN.shape[:-2], 1, masks_VN.shape[-1])
+            kept = torch.rand(shape, device=features_VNF.device) >= self.config.crop_dropout
             features_VNF = features_VNF * kept[..., None]
         boxes_VN4 = boxes_VN4.to(features_VNF.dtype) / self.box_units
         views = [
@@ -101,7 +107,7 @@ class ObjectEncoder(nn.Module):
             return torch.cat([self.fusion[v](view) for v, view in enumerate(views)], dim=-2)
         visible = [masks_VN[..., v, :, None].to(features_VNF.dtype) for v in range(NUM_VIEWS)]
         seen = [view * mask for view, mask in zip(views, visible, strict=True)]
-        return self.fusion(torch.cat([*seen, *visible], dim=-1))
+        return self.fusion[0](torch.cat([*seen, *visible], dim=-1))
 
     def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
         """Embed what objects look like, wherever they lie.

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from openvima.errors import ConfigError
 
-# Mean and standard deviation of R, G, B over the benchmark's training frames, as the published policies use them.
+# Mean and standard deviation of R, G, B over training frames, as the published policies use them.
 PIXEL_MEAN = (0.3471, 0.3429, 0.3383)
 PIXEL_STD = (0.3011, 0.2961, 0.2956)
 
@@ -38,7 +38,9 @@ class VitConfig:
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads:
-            raise ConfigError(f"crop encoder: width {self.width} must be a multiple of {self.num_heads} heads.")
+            raise ConfigError(
+                f"crop encoder: width {self.width} must be a multiple of {self.num_heads} heads."
+            )
         if self.crop_size % self.patch_size:
             raise ConfigError(f"crop encoder: {self.patch_size} px patches do not tile {self.crop_size} px.")
 

@@ -59,8 +59,7 @@ def load_weights(model: Vima, tensors: dict[str, torch.Tensor], *, source: str) 
     differing = [
         f"{name} is {_described(tensors[name])} instead of {_described(wanted)}"
         for name, wanted in expected.items()
-        if name in tensors
-        and (tensors[name].shape, tensors[name].dtype) != (wanted.shape, wanted.dtype)
+        if name in tensors and (tensors[name].shape, tensors[name].dtype) != (wanted.shape, wanted.dtype)
     ]
     problems += _listed("wrong", differing)
     if problems:

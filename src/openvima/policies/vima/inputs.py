@@ -1,7 +1,7 @@
 """Prompts and observations as tensors: sequences, slots, masks.
 
-Numpy records of single prompts and steps come first, batches of them after. Nothing here has weights. Crops are
-given by their number in one stack, so that each is encoded once, or taken from a store of encoded ones.
+Numpy records of single prompts and steps come first, batches of them after. Nothing here has weights. Crops
+are given by their number in one stack, so that each is encoded once, or taken from a store of encoded ones.
 
 Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view.
 """
@@ -45,7 +45,7 @@ class PromptBatch:
 
     Args:
         words_BL: Word ids.
-        slots_BL: Object tokens, numbered through all front (or fused) ones, then all top ones; `WORD` at words.
+        slots_BL: Object tokens, numbered through all front (or fused) ones, then all top ones; or `WORD`.
         mask_BL: Which places exist.
         crops_VS: Number of each object's crop in the stack of crops.
         boxes_VS4: Boxes in pixels.
@@ -125,7 +125,7 @@ def read_step(observation: Mapping, *, fuse_views: bool) -> StepInput:
 
     Args:
         observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
-        fuse_views: Whether a slot holds the same object in both views; else visible objects come first in each.
+        fuse_views: Whether a slot is one object in both views; else each view has its visible ones first.
     """
     objects = observe(observation)
     objects = objects if fuse_views else objects.compacted()
@@ -152,7 +152,7 @@ def read_prompt(prompt: RenderedPrompt, *, fuse_views: bool) -> PromptInput:
         objects = observe_prompt_image(part)
         images.append(objects if fuse_views else objects.compacted())
         for view in range(1 if fuse_views else len(VIEWS)):
-            visible = images[-1].masks.any(axis=0) if fuse_views else images[-1].masks[view]
+            visible = images[-1].visible() if fuse_views else images[-1].masks[view]
             places += [(PADDING_ID, count + k, view, bool(visible[k])) for k in range(len(objects))]
         count += len(objects)
     words, slots, views, mask = (np.array(column) for column in zip(*places, strict=True))

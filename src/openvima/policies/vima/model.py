@@ -1,7 +1,8 @@
 """The VIMA network: prompt and history of objects and actions in, actions out.
 
-Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view, Q slots of
-a step, D width of the decoder, F width of crop features, W width of the prompt encoder, C components of an action.
+Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view,
+Q slots of a step, P places kept, D width of the decoder, F width of crop features, W width of the prompt encoder,
+C components of an action.
 """
 
 from dataclasses import dataclass
@@ -200,7 +201,7 @@ class ActionEncoder(nn.Module):
 
 
 def build_model(config: VimaConfig, *, seed: int) -> Vima:
-    """Build a network with fresh weights that depend on the seed alone; global random state is left as it was."""
+    """Build a network with fresh weights that follow from the seed; global random state stays as it was."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return Vima(config)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -37,8 +38,8 @@ class EpisodeHistory:
 class VimaPolicy:
     """Plays several episodes at once; what the others do does not change an episode's actions.
 
-    It computes in float64, so that the rounding of sums, which varies with the shape of a batch, stays far below
-    the float32 in which actions are sent: the same episode gets the same actions in any batch.
+    It computes in float64, so that the rounding of sums, which varies with the shape of a batch, stays far
+    below the float32 in which actions are sent: the same episode gets the same actions in any batch.
     """
 
     def __init__(self, model: Vima) -> None:
@@ -76,8 +77,8 @@ class VimaPolicy:
         """
         if self._memory is None or len(observations) != len(self._histories):
             raise PolicyError(
-                f"got {len(observations)} observations for {len(self._histories)} prompts; call reset with one "
-                "prompt for each episode first, and pass None for those that have ended."
+                f"got {len(observations)} observations for {len(self._histories)} prompts; call reset "
+                "with one prompt for each episode first, and pass None for those that have ended."
             )
         active = [row for row, observation in enumerate(observations) if observation is not None]
         actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
@@ -108,9 +109,7 @@ class VimaPolicy:
         for history in histories:
             sizes = [2 * len(step.objects) for step in history.steps]
             starts = np.cumsum([first, *sizes])
-            numbers.append(
-                [np.arange(a, b).reshape(2, -1) for a, b in zip(starts[:-1], starts[1:], strict=True)]
-            )
+            numbers.append([np.arange(a, b).reshape(2, -1) for a, b in pairwise(starts)])
             first = int(starts[-1])
         batch = batch_histories([history.steps for history in histories], numbers)
         taken = torch.zeros(*batch.steps_BT.shape, ACTION_WIDTH, dtype=torch.float64)

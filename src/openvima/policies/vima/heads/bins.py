@@ -1,7 +1,7 @@
 """The published action head: every component of an action is a classification over bins.
 
-Encoding and decoding are not inverse to each other: values are compared with n boundaries 1/(n - 1) apart, but
-bin k means k/n. All published weights were trained with that.
+Encoding and decoding are not inverse to each other: values are compared with n boundaries 1/(n - 1) apart,
+but bin k means k/n. All published weights were trained with that.
 """
 
 from dataclasses import dataclass
@@ -58,7 +58,9 @@ class BinsHead(ActionHead):
         losses, hits = [], []
         for component, scores in enumerate(logits):
             target = bins_BTC[..., component]
-            losses.append(F.cross_entropy(scores.flatten(0, 1), target.flatten(), reduction="none").view_as(target))
+            losses.append(
+                F.cross_entropy(scores.flatten(0, 1), target.flatten(), reduction="none").view_as(target)
+            )
             hits.append(scores.argmax(-1) == target)
         parts = [torch.stack(losses[part]).mean(0) for part in ACTION_PARTS.values()]
         all_hit = torch.stack(hits).to(parts[0].dtype).mean(0)

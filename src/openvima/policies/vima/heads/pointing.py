@@ -31,7 +31,7 @@ class PointingConfig:
 
     Args:
         hidden_width: Width of the hidden layers that give offset and yaw.
-        num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 is centred at no turn.
+        num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 means no turn.
         offset_weight: Weight of the offset's loss against the pointers'.
         yaw_weight: Weight of the yaw's loss.
     """
@@ -50,8 +50,8 @@ class PointingHead(ActionHead):
     """Two pointers over the objects in view, then offset and yaw for what they point at.
 
     A pointer scores each object by query · key, plus the similarity of its appearance with that of the prompt
-    object which the query attends to. "Put the A into the B": the pick's query attends to A in the prompt, and
-    whatever in the scene looks like A gets the score, whether or not that look occurred in training.
+    object which the query attends to. "Put the A into the B": the pick's query attends to A in the prompt,
+    and whatever in the scene looks like A gets the score, be that look known from training or not.
     """
 
     def __init__(self, config: PointingConfig, width: int) -> None:
@@ -79,7 +79,9 @@ class PointingHead(ActionHead):
         actions = targets.actions_BTC
         true_offset = actions[..., 6:8] - at(inputs.positions_BTN2, place)
         yaw = yaw_bin(turn_of(actions), self.config.num_yaw_bins)
-        huber = F.smooth_l1_loss(offset / _OFFSET_UNIT_M, true_offset / _OFFSET_UNIT_M, reduction="none", beta=0.1)
+        huber = F.smooth_l1_loss(
+            offset / _OFFSET_UNIT_M, true_offset / _OFFSET_UNIT_M, reduction="none", beta=0.1
+        )
         losses = {
             "pick": masked_mean(_cross_entropy(pick_scores, pick), has_pick),
             "place": masked_mean(_cross_entropy(place_scores, place), has_place),
