@@ -42,11 +42,11 @@ def test_results_hold_no_times_and_the_log_apart_does(first):
 def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, monkeypatch):
     played = []
 
-    def play_two(job):
+    def play_two(job, count):
         if len(played) == 2:
             raise KeyboardInterrupt
         played.append(job.batch)
-        return play_batch(job)
+        return play_batch(job, count)
 
     play_batch = runner.play_batch
     config = replace(ORACLE, out=tmp_path)
@@ -55,7 +55,9 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, mon
         evaluate(config)
     assert not (tmp_path / "results.json").exists()
     rest = []
-    monkeypatch.setattr(runner, "play_batch", lambda job: rest.append(job.batch) or play_batch(job))
+    monkeypatch.setattr(
+        runner, "play_batch", lambda job, count: rest.append(job.batch) or play_batch(job, count)
+    )
     assert evaluate(config).read_bytes() == first.read_bytes()
     assert len(rest) == 2
     assert not set(rest) & set(played)
@@ -67,8 +69,8 @@ def test_a_damaged_part_is_played_again(damaged, first, tmp_path, monkeypatch):
     config = replace(ORACLE, out=tmp_path)
     play_batch = runner.play_batch
 
-    def damage(job):
-        outcomes = play_batch(job)
+    def damage(job, count):
+        outcomes = play_batch(job, count)
         job.part.write_text(damaged(job.part.read_text()))
         if job.batch.first_seed == 42 and job.batch.task == "rotate":
             raise KeyboardInterrupt
@@ -82,7 +84,7 @@ def test_a_damaged_part_is_played_again(damaged, first, tmp_path, monkeypatch):
 
 
 def test_finished_results_are_kept_and_others_not_overwritten(first, monkeypatch):
-    monkeypatch.setattr(runner, "play_batch", lambda job: pytest.fail("nothing should be played"))
+    monkeypatch.setattr(runner, "play_batch", lambda job, count: pytest.fail("nothing should be played"))
     config = replace(ORACLE, out=first.parent)
     before = first.read_bytes()
     assert evaluate(config) == first

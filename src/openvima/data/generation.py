@@ -11,10 +11,10 @@ from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, index_bytes, manif
 from openvima.data.reader import Shard
 from openvima.data.records import Demonstration, package_versions, rollout_oracle
 from openvima.data.schema import INDEX_COLUMNS
-from openvima.data.workers import run_in_processes
 from openvima.data.writer import ShardWriter, remove_leftovers, write_whole
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
+from openvima.processes import in_processes
 from openvima.tasks import list_tasks, task_spec
 
 DOMAIN = "train"
@@ -134,7 +134,10 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     missing = [block for block in blocks if not _is_done(block)]
     num_done = sum(block.episodes for block in blocks) - sum(block.episodes for block in missing)
     try:
-        run_in_processes(write_block, missing, config.workers, report=_shifted(report, num_done, blocks))
+        for _ in in_processes(
+            write_block, missing, config.workers, report=_shifted(report, num_done, blocks)
+        ):
+            pass  # a block's result is its file
     finally:
         remove_leftovers(config.out)
     if missing or not (config.out / MANIFEST_NAME).is_file():

@@ -11,6 +11,7 @@ from openvima.errors import MissingExtraError
 from openvima.evaluation.clips import Clip, load_clips, png, save_clips
 from openvima.evaluation.protocol import DEFAULT_BATCH, Batch, EvaluationConfig, PolicySource, policy_sources
 from openvima.evaluation.results import Results, Row
+from openvima.processes import in_processes
 
 REPORT_NAME = "report.html"
 _METRICS = "metrics.jsonl"  # what a training run writes into its folder
@@ -50,13 +51,12 @@ def finish(config: EvaluationConfig, results: Results, note: Callable[[str], Non
         The report.
     """
     from openvima.evaluation.report import write_report
-    from openvima.evaluation.runner import in_workers
 
     clips = load_clips(config.out)
     jobs = film_jobs(config, results)
     if not clips and jobs:
         filmed = {}
-        for job, clip in in_workers(film, jobs, workers=config.workers):
+        for job, clip in in_processes(film, jobs, config.workers):
             filmed[job] = clip
             if note is not None:
                 note(f"filmed {len(filmed)} of {len(jobs)}")
@@ -93,15 +93,14 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
     return jobs
 
 
-def film(job: FilmJob) -> Clip:
+def film(job: FilmJob, count: Callable[[int], None]) -> Clip:
     """Film one episode; runs in a worker process."""
     from PIL import Image
 
     from openvima.env.tabletop import TabletopEnv
     from openvima.evaluation.film import Artist, film_episode
-    from openvima.evaluation.players import load_player
+    from openvima.evaluation.players import load_player, one_thread
     from openvima.evaluation.prompt_strip import thumbnail
-    from openvima.evaluation.runner import one_thread
 
     batch = job.batch
     env = TabletopEnv(batch.task, level=batch.level, domain="eval", assets=batch.assets, realtime=True)
@@ -113,6 +112,7 @@ def film(job: FilmJob) -> Clip:
         player = load_player(batch, job.fingerprint)
         outcome = film_episode(env, player, batch.first_seed, path, with_prompt=False)
         video = path.read_bytes()
+    count(1)
     return Clip(
         policy=batch.policy,
         task=batch.task,

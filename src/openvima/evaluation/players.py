@@ -1,6 +1,7 @@
 """Who decides in an episode: the oracle, which asks the environment, or a policy, which sees observations."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -78,6 +79,22 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
     if batch.source == ORACLE:
         return OraclePlayer()
     return PolicyPlayer(_load_policy(batch.source, fingerprint))
+
+
+@contextmanager
+def one_thread(batch: Batch) -> Iterator[None]:
+    """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
+    if batch.source in ("oracle", "random"):  # no network
+        yield
+        return
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @lru_cache(maxsize=1)

@@ -2,23 +2,20 @@
 
 import json
 import shutil
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from openvima.errors import ConfigError, OpenVimaError
+from openvima.errors import ConfigError
 from openvima.evaluation.clips import FOLDER
-from openvima.evaluation.players import load_player
+from openvima.evaluation.finish import finish, require_extra
+from openvima.evaluation.players import load_player, one_thread
 from openvima.evaluation.protocol import Batch, EvaluationConfig, plan, policy_sources
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row, write_text
 from openvima.evaluation.versions import versions
+from openvima.processes import in_processes
 from openvima.tasks.registry import task_spec
 
 Report = Callable[[int, int, str], None]
@@ -50,10 +47,8 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
-        OpenVimaError: A worker process died.
+        WorkerError: A worker process died; what was finished is kept.
     """
-    from openvima.evaluation.finish import finish, require_extra
-
     if config.report:
         require_extra()
     batches = plan(config)
@@ -113,7 +108,7 @@ def _play_all(
     if report is not None:
         report(done, total, "")
     todo = [job for job in jobs if job.batch not in outcomes]
-    for job, played in in_workers(play_batch, todo, workers=config.workers):
+    for job, played in in_processes(play_batch, todo, config.workers):
         outcomes[job.batch] = played
         done += job.batch.episodes
         if report is not None:
@@ -121,7 +116,7 @@ def _play_all(
     return outcomes
 
 
-def play_batch(job: Job) -> tuple[EpisodeOutcome, ...]:
+def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, ...]:
     """Play one batch and keep its outcomes; runs in a worker process."""
     from openvima.env.tabletop import TabletopEnv
     from openvima.evaluation.rollout import play
@@ -134,69 +129,9 @@ def play_batch(job: Job) -> tuple[EpisodeOutcome, ...]:
             for _ in batch.seeds
         ]
         outcomes = tuple(play(envs, batch.seeds, player))
+    count(len(outcomes))
     write_text(job.part, json.dumps([asdict(outcome) for outcome in outcomes], ensure_ascii=False) + "\n")
     return outcomes
-
-
-@contextmanager
-def one_thread(batch: Batch) -> Iterator[None]:
-    """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    if batch.source in ("oracle", "random"):  # no network
-        yield
-        return
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def in_workers(
-    function: Callable[[Any], Any], jobs: Sequence[Any], *, workers: int
-) -> Iterator[tuple[Any, Any]]:
-    """Apply a function to jobs in worker processes, or here if one is enough.
-
-    Args:
-        function: A function of a module; it and the jobs are sent to other processes.
-        jobs: Its arguments, one each.
-        workers: Number of processes.
-
-    Yields:
-        A job and its result, as they finish.
-
-    Raises:
-        OpenVimaError: A process died.
-    """
-    workers = min(workers, len(jobs))
-    if workers <= 1:
-        yield from ((job, function(job)) for job in jobs)
-        return
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_ignore_interrupts)
-    try:
-        yield from _as_they_finish(pool, function, jobs)
-    except BrokenProcessPool as error:
-        raise OpenVimaError(
-            "a worker process died, perhaps for want of memory. What was finished is kept: run the same "
-            "command again, with fewer --workers if it happens again."
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _as_they_finish(
-    pool: Executor, function: Callable[[Any], Any], jobs: Sequence[Any]
-) -> Iterator[tuple[Any, Any]]:
-    futures: dict[Future[Any], Any] = {pool.submit(function, job): job for job in jobs}
-    for future in as_completed(futures):
-        yield futures[future], future.result()
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the main process, which lets the workers finish their batches."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _kept(job: Job) -> tuple[EpisodeOutcome, ...] | None:

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait as wait_for
 from typing import Any, Protocol
@@ -15,35 +15,38 @@ from openvima.errors import WorkerError
 
 POLL_S = 0.2
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-_counters: Any = (
-    None  # in a worker: the shared array of counts; Any: multiprocessing has no public type for it
-)
+# In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
+_counters: Any = None
 
 
 class Job(Protocol):
     """Work on one item, which calls `count` with the number of things done so far."""
 
-    def __call__(self, item: Any, count: Callable[[int], None], /) -> None:
+    def __call__(self, item: Any, count: Callable[[int], None], /) -> Any:  # Any: as the caller likes
         """Do it."""
 
 
-def run_in_processes(
-    job: Job, items: Sequence[object], num_workers: int, *, report: Callable[[int], None]
-) -> None:
-    """Run a job on every item.
+def in_processes(
+    job: Job, items: Sequence[Any], num_workers: int, *, report: Callable[[int], None] | None = None
+) -> Iterator[tuple[Any, Any]]:
+    """Apply a job to every item.
 
     Args:
         job: A function of a module (workers import it).
-        items: Its arguments; they are pickled.
+        items: Its arguments; they and the results are pickled.
         num_workers: Number of processes; with one, everything happens in this process.
         report: Called now and then with the sum of all counts.
+
+    Yields:
+        An item and its result, as they finish.
 
     Raises:
         WorkerError: A worker was killed from outside.
         Exception: Whatever a job raised; the other jobs are stopped.
     """
+    report = report or (lambda count: None)
     if num_workers == 1 or len(items) <= 1:
-        _run_here(job, items, report)
+        yield from _one_after_the_other(job, items, report)
         return
     context = multiprocessing.get_context("spawn")
     counters = context.RawArray("q", len(items))  # one slot a job: no lock that a killed worker could keep
@@ -53,8 +56,12 @@ def run_in_processes(
             min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
         )
         try:
-            futures = [pool.submit(_run_one, job, item, slot) for slot, item in enumerate(items)]
-            _wait_for_all(futures, lambda: report(sum(counters)))
+            pending = {pool.submit(_run_one, job, item, slot): item for slot, item in enumerate(items)}
+            while pending:
+                done, _ = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield pending.pop(future), future.result()
+                report(sum(counters))
         except BrokenProcessPool:
             raise WorkerError(
                 "a worker process was killed (often for lack of memory; --workers lowers the need). "
@@ -68,7 +75,9 @@ def run_in_processes(
             pool.shutdown(cancel_futures=True)
 
 
-def _run_here(job: Job, items: Sequence[object], report: Callable[[int], None]) -> None:
+def _one_after_the_other(
+    job: Job, items: Sequence[Any], report: Callable[[int], None]
+) -> Iterator[tuple[Any, Any]]:
     num_before = 0
     for item in items:
         last = 0
@@ -78,17 +87,8 @@ def _run_here(job: Job, items: Sequence[object], report: Callable[[int], None]) 
             last = done
             report(before + done)
 
-        job(item, count)
+        yield item, job(item, count)
         num_before += last
-
-
-def _wait_for_all(futures: Sequence[Future], tick: Callable[[], None]) -> None:
-    pending = set(futures)
-    while pending:
-        done, pending = wait(pending, timeout=POLL_S, return_when=FIRST_EXCEPTION)
-        for future in done:
-            future.result()
-        tick()
 
 
 @contextlib.contextmanager
@@ -120,8 +120,8 @@ def _die_with_parent() -> None:
     os._exit(1)
 
 
-def _run_one(job: Job, item: object, slot: int) -> None:
+def _run_one(job: Job, item: Any, slot: int) -> Any:  # Any: see `Job`
     def count(done: int) -> None:
         _counters[slot] = done
 
-    job(item, count)
+    return job(item, count)
