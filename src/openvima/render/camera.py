@@ -124,7 +124,8 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     """
     points = np.asarray(points, dtype=np.float64)
     _check_last_axis("points", points, 3)
-    right, up, away = (points @ row[:3] + row[3] for row in np.array([camera.right, camera.up, camera.away]))
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    right, up, away = (a * x + b * y + c * z + d for a, b, c, d in (camera.right, camera.up, camera.away))
     behind = away <= 0
     if behind.any():
         first = tuple(float(v) for v in points[behind].reshape(-1, 3)[0])

@@ -89,7 +89,11 @@ class Pose:
 
     def transform(self, points: np.ndarray) -> np.ndarray:
         """Map points from this frame to the frame that it is given in; shape (..., 3) to (..., 3), metres."""
-        return np.asarray(points, dtype=np.float64) @ self.matrix().T + np.asarray(self.position)
+        points = np.asarray(points, dtype=np.float64)
+        along_x, along_y, along_z = self.matrix().T
+        # Written out: the last bits of a matrix product depend on the processor.
+        turned = points[..., :1] * along_x + points[..., 1:2] * along_y + points[..., 2:] * along_z
+        return turned + np.asarray(self.position)
 
 
 def yaw_quaternion(yaw_rad: float) -> Quaternion:

@@ -69,7 +69,7 @@ class ArmPath:
         self.waypoints.append(joints)
         if self._record is None:
             return
-        duration_s = max(float(np.linalg.norm(joints - start)) / speed, 1e-9)
+        duration_s = max(math.dist(joints, start) / speed, 1e-9)
         stored, self._stored = self._stored, []
         now = start
         for time_s in self._frame_times(duration_s):

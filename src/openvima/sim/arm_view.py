@@ -127,7 +127,8 @@ def _parts(end_effector: EndEffector) -> tuple[tuple[tuple[int, tuple[int, int, 
 def _assembled(parts: _Parts, frames: Sequence[Pose]) -> TriangleMesh:
     """Bring meshes from link frames to the world and join them."""
     vertices = [frames[link].transform(mesh.vertices) for link, mesh in parts]
-    normals = [mesh.normals @ frames[link].matrix().T for link, mesh in parts]
+    turns = [Pose((0.0, 0.0, 0.0), frame.quaternion) for frame in frames]
+    normals = [turns[link].transform(mesh.normals) for link, mesh in parts]
     return TriangleMesh(
         np.concatenate(vertices), np.concatenate(normals), np.concatenate([mesh.uvs for _, mesh in parts])
     )

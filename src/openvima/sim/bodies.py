@@ -167,21 +167,25 @@ class Bodies:
     def lowest_z(self, index: int, quaternion: Quaternion) -> float:
         """Height of a body's lowest touching point above its link frame, in metres, in a given attitude."""
         points = self.shapes[index].points
-        heights = points[:, :3] @ _up(quaternion) - points[:, 3]
+        heights = _heights(points, quaternion) - points[:, 3]
         return float(heights.min(initial=np.inf))
 
     def highest_z(self, index: int) -> float:
         """Present height of a body's highest touching point, in metres."""
         pose = self.pose(index)
         points = self.shapes[index].points
-        heights = points[:, :3] @ _up(pose.quaternion) + points[:, 3]
+        heights = _heights(points, pose.quaternion) + points[:, 3]
         return pose.z + float(heights.max(initial=-np.inf))
 
 
-def _up(quaternion: Quaternion) -> np.ndarray:
-    """The world's z axis in the frame of a body with that attitude, shape (3,)."""
+def _heights(points: np.ndarray, quaternion: Quaternion) -> np.ndarray:
+    """Heights above its link frame, shape (N,), of points of a body with that attitude.
+
+    Written out: the last bits of a matrix product depend on the processor.
+    """
     x, y, z, w = quaternion
-    return np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])
+    up = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))  # in the body's frame
+    return points[:, 0] * up[0] + points[:, 1] * up[1] + points[:, 2] * up[2]
 
 
 def _numbers(pose: Pose) -> tuple[float, ...]:

@@ -8,6 +8,7 @@ evaluations.
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's names come from a compiled module without type stubs.)
 
+import math
 from collections.abc import Iterable
 
 import mujoco
@@ -69,8 +70,8 @@ def _way_of_pair(
     margin = float(model.geom_margin[geom] + model.geom_margin[other])
     start = positions[geom].copy()
     offset = positions[other] - start
-    sideways = offset - direction * (offset @ direction)
-    if sideways @ sideways > float(model.geom_rbound[geom] + model.geom_rbound[other] + margin) ** 2:
+    sideways = offset - direction * _dot(offset, direction)
+    if _dot(sideways, sideways) > float(model.geom_rbound[geom] + model.geom_rbound[other] + margin) ** 2:
         return None
     segment = np.zeros(6)
     way = 0.0
@@ -82,7 +83,7 @@ def _way_of_pair(
             found = way
             break
         towards = segment[3:] - segment[:3]
-        closing = float(towards @ direction) / float(np.linalg.norm(towards))
+        closing = _dot(towards, direction) / math.hypot(*towards.tolist())
         if closing <= 1e-6:  # the nearest points no longer approach each other: it passes by
             break
         way += distance / closing
@@ -90,3 +91,9 @@ def _way_of_pair(
             break
     positions[geom] = start
     return found
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Scalar product, written out: the last bits of NumPy's depend on the processor."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return ax * bx + ay * by + az * bz
