@@ -10,7 +10,14 @@ from gymnasium.utils.env_checker import check_env
 
 import openvima
 from openvima.env import TabletopEnv
-from openvima.errors import ActionError, ConfigError, EpisodeError, LevelError, UnknownTaskError
+from openvima.errors import (
+    ActionError,
+    ConfigError,
+    EpisodeError,
+    LevelError,
+    SamplingError,
+    UnknownTaskError,
+)
 from openvima.scene import Action, Outcome
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
@@ -185,6 +192,32 @@ def test_unknown_reset_options_are_refused(rotate: TabletopEnv) -> None:
         rotate.reset(options={"sede": 1})
     with pytest.raises(ConfigError, match="give an Episode"):
         rotate.reset(options={"episode": 3})
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 1.5])
+def test_a_reset_with_a_bad_seed_is_refused_and_changes_nothing(rotate: TabletopEnv, seed) -> None:
+    rotate.reset(seed=3)
+    following = rotate.reset()[1]["seed"]
+    rotate.reset(seed=3)
+    with pytest.raises(ConfigError, match="seed is"):
+        rotate.reset(seed=seed)
+    assert rotate.episode.seed == 3
+    assert rotate.reset()[1]["seed"] == following
+    assert rotate.reset(seed=np.int64(4))[1]["seed"] == 4
+
+
+def test_after_a_reset_that_finds_no_start_no_episode_is_running(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = TabletopEnv("rotate")
+    env.reset(seed=3)
+
+    def fail(*args: object, **options: object) -> None:
+        raise SamplingError("no place")
+
+    monkeypatch.setattr("openvima.env.tabletop.sample_episode", fail)
+    with pytest.raises(SamplingError):
+        env.reset(seed=4)
+    with pytest.raises(EpisodeError, match="call reset"):
+        env.step(idle_action())
 
 
 def test_info_names_what_is_on_the_table(rotate: TabletopEnv) -> None:

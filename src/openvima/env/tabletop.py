@@ -29,7 +29,7 @@ from openvima.sim.world import World
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
-from openvima.tasks.seeding import stream
+from openvima.tasks.seeding import checked_seed, stream
 
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
 FRAMES_PER_SECOND = 30
@@ -173,11 +173,14 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             The first observation, and the info.
 
         Raises:
-            SamplingError: The task finds no start for this seed.
-            ConfigError: An option is not known.
+            SamplingError: The task finds no start for this seed; no episode is running then.
+            ConfigError: An option is not known, or the seed is no whole number from 0 to 2**63 - 1.
         """
+        seed = None if seed is None else checked_seed(seed)
+        given = _episode_option(options)
         super().reset(seed=seed)
-        episode = _episode_option(options) or self._sample(seed)
+        self._run = None  # should the rest fail, nobody goes on with the episode before
+        episode = given or self._sample(seed)
         rng = stream(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
         world = World(episode.problem.scene, self.assets, compat=self.compat)
         self._run = _Run(episode, world, goals.begin(episode.problem), rng)
