@@ -59,23 +59,23 @@ class TrainingConfig:
     data: Path
     out: Path
     preset: str = "nano"
-    steps: int = 2000
+    steps: int = 500
     batch: int = 64
     learning_rate: float = 1e-3
-    warmup_steps: int = 100
+    warmup_steps: int = 50
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
-    pretraining_steps: int = 300
+    pretraining_steps: int = 500
     pretraining_scenes: int = 3000
-    pretraining_batch: int = 256
+    pretraining_batch: int = 128
     pretraining_learning_rate: float = 1e-3
     temperature: float = 0.07
     tune_crops: bool = False
     assets: str = "procedural"
     seed: int = 0
     validation_share: float = 0.05
-    checkpoint_every: int = 200
+    checkpoint_every: int = 100
     threads: int | None = None
     force: bool = False
 

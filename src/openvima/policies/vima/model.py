@@ -34,12 +34,14 @@ class Memory:
 
     Args:
         tokens_BLD: Encoded words and objects.
+        roles_BLD: The same, encoded without knowing what the objects look like.
         mask_BL: Which places exist.
         object_mask_BL: Which of them are objects.
         appearance_BLA: Appearance of these objects; zero elsewhere.
     """
 
     tokens_BLD: torch.Tensor
+    roles_BLD: torch.Tensor
     mask_BL: torch.Tensor
     object_mask_BL: torch.Tensor
     appearance_BLA: torch.Tensor
@@ -47,7 +49,11 @@ class Memory:
     def select(self, rows: list[int]) -> "Memory":
         """Return the prompts of some rows of the batch."""
         return Memory(
-            self.tokens_BLD[rows], self.mask_BL[rows], self.object_mask_BL[rows], self.appearance_BLA[rows]
+            self.tokens_BLD[rows],
+            self.roles_BLD[rows],
+            self.mask_BL[rows],
+            self.object_mask_BL[rows],
+            self.appearance_BLA[rows],
         )
 
 
@@ -89,18 +95,26 @@ class Vima(nn.Module):
             features_KF: Encoded crops, by number.
         """
         features_VSF = features_KF[prompts.crops_VS]
-        tokens_SW = self.prompt_objects(self.objects(features_VSF, prompts.boxes_VS4, prompts.masks_VS))
         is_object_BL = (prompts.slots_BL >= 0) & prompts.mask_BL
-        rows_BL = prompts.slots_BL.clamp(min=0)
+        encoded_BLD = self._read(prompts, features_VSF)
+        width = self.config.objects.appearance_width
+        appearance_BLA = encoded_BLD.new_zeros(*is_object_BL.shape, width)
+        if not width:
+            return Memory(encoded_BLD, encoded_BLD, prompts.mask_BL, is_object_BL, appearance_BLA)
+        roles_BLD = self._read(prompts, torch.zeros_like(features_VSF))
+        if prompts.masks_VS.shape[1]:
+            looks_SA = self.objects.embed_appearance(features_VSF, prompts.masks_VS)
+            appearance_BLA = looks_SA[prompts.slots_BL.clamp(min=0)] * is_object_BL[..., None]
+        return Memory(encoded_BLD, roles_BLD, prompts.mask_BL, is_object_BL, appearance_BLA)
+
+    def _read(self, prompts: PromptBatch, features_VSF: torch.Tensor) -> torch.Tensor:
+        """Run the text encoder over words and objects, shape (B, L, D)."""
+        tokens_SW = self.prompt_objects(self.objects(features_VSF, prompts.boxes_VS4, prompts.masks_VS))
         tokens_BLW = self.words(prompts.words_BL)
         if len(tokens_SW):
-            tokens_BLW = torch.where((prompts.slots_BL >= 0)[..., None], tokens_SW[rows_BL], tokens_BLW)
-        encoded_BLD = self.prompt_out(self.text(tokens_BLW, prompts.mask_BL))
-        appearance_BLA = encoded_BLD.new_zeros(*rows_BL.shape, self.config.objects.appearance_width)
-        if self.config.objects.appearance_width and len(tokens_SW):
-            looks_SA = self.objects.embed_appearance(features_VSF, prompts.masks_VS)
-            appearance_BLA = looks_SA[rows_BL] * is_object_BL[..., None]
-        return Memory(encoded_BLD, prompts.mask_BL, is_object_BL, appearance_BLA)
+            objects_BLW = tokens_SW[prompts.slots_BL.clamp(min=0)]
+            tokens_BLW = torch.where((prompts.slots_BL >= 0)[..., None], objects_BLW, tokens_BLW)
+        return self.prompt_out(self.text(tokens_BLW, prompts.mask_BL))
 
     def forward(
         self, memory: Memory, history: HistoryBatch, features_KF: torch.Tensor, actions_BTC: torch.Tensor
@@ -127,7 +141,7 @@ class Vima(nn.Module):
             appearance_BTNA=self._appearance(features, history.masks_BTVN),
             positions_BTN2=history.positions_BTN2.to(slots_BTQD.dtype),
             grasps_BTN2=history.grasps_BTN2.to(slots_BTQD.dtype),
-            prompt_BMD=memory.tokens_BLD,
+            prompt_BMD=memory.roles_BLD,
             prompt_masks_BM=memory.object_mask_BL,
             prompt_appearance_BMA=memory.appearance_BLA,
         )
