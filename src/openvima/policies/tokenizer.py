@@ -16,7 +16,7 @@ PADDING_ID, END_ID = 0, 1
 LARGEST_NUMBER = 360
 _FIRST_NUMBER_ID = 2
 _FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
-_PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|\d+|\S")
+_PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|[0-9]+|\S")
 
 
 @cache
@@ -49,7 +49,7 @@ def encode_text(text: str) -> list[int]:
     """
     ids, unknown = [], []
     for piece in _PIECE.findall(text.lower()):
-        token = _number_id(piece) if piece.isdigit() else word_ids().get(piece)
+        token = _number_id(piece) if piece[0] in "0123456789" else word_ids().get(piece)
         if token is None:
             unknown.append(piece)
         else:
@@ -78,8 +78,9 @@ def encode_prompt(prompt: RenderedPrompt) -> list[int | PromptImage]:
 
 
 def _number_id(digits: str) -> int | None:
-    number = int(digits)
-    return _FIRST_NUMBER_ID + number if number <= LARGEST_NUMBER else None
+    if len(digits) > len(str(LARGEST_NUMBER)) or int(digits) > LARGEST_NUMBER:
+        return None
+    return _FIRST_NUMBER_ID + int(digits)
 
 
 def _unknown_words(unknown: list[str], text: str) -> str:
