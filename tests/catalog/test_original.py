@@ -122,7 +122,9 @@ def test_golden_pack_returns_the_same_arrays_again(pack) -> None:
     assert isinstance(pack.texture("red swirl"), np.ndarray)
     assert pack.texture("red swirl") is pack.texture("red swirl")
     size = OBJECTS["ring"].size_max
-    assert pack.geometry("ring", size) is OriginalAssets(PACK).geometry("ring", size)
+    ring = pack.geometry("ring", size)
+    assert ring is OriginalAssets(PACK).geometry("ring", size)
+    assert not any(array.flags.writeable for array in (ring.visual.vertices, pack.texture("red swirl")))
     as_protocol: Assets = pack
     assert as_protocol.name == "original"
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from openvima.catalog.cache import cache_dir, cached_array
+from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
 from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import AssetError, UnknownTextureError
@@ -44,6 +45,16 @@ def test_equal_arguments_give_the_same_arrays():
     assert pack.geometry("container", SIZE) is pack.geometry("container", SIZE)
     assert pack.geometry("container", SIZE) is not pack.geometry("container", (0.15, 0.16, 0.05))
     assert pack.texture("tiger") is pack.texture("tiger")
+
+
+def test_shared_arrays_cannot_be_written_to():
+    pack = ProceduralAssets()
+    ring, texture = pack.geometry("ring", SIZE), pack.texture("blue")
+    hull = ring.collision[0]
+    assert isinstance(hull, CollisionHull)
+    for array in (ring.visual.vertices, ring.visual.normals, ring.visual.uvs, hull.points, texture):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
 
 
 def test_objects_of_one_size_share_their_shape():

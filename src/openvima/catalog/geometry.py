@@ -66,10 +66,19 @@ class Geometry:
     rest_z_m: float
 
 
+def protect(geometry: Geometry) -> Geometry:
+    """Make the arrays of a shape that is shared read-only, and return it."""
+    mesh = geometry.visual
+    points = [shape.points for shape in geometry.collision if isinstance(shape, CollisionHull)]
+    for array in (mesh.vertices, mesh.normals, mesh.uvs, *points):
+        array.setflags(write=False)
+    return geometry
+
+
 class Assets(Protocol):
     """A pack of shapes and textures.
 
-    Results are cached: equal arguments give the same arrays; do not write to them.
+    Results are cached: equal arguments give the same arrays. They cannot be written to; copy them first.
     """
 
     @property

@@ -15,7 +15,7 @@ import numpy as np
 
 from openvima.catalog import boxes
 from openvima.catalog.cache import cached_array
-from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
+from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.obj_file import ObjMesh, parse_obj
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.textures import TextureSpec, texture_spec
@@ -113,7 +113,7 @@ class OriginalAssets:
             UnknownObjectError: The catalogue has no such object.
             AssetError: A mesh is missing or damaged, or no task uses the object.
         """
-        return _geometry(self.folder, object_name, size, scale)
+        return _protected_geometry(self.folder, object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image, shape (H, W, 3), uint8; see `Assets.texture`.
@@ -122,7 +122,7 @@ class OriginalAssets:
             UnknownTextureError: The catalogue has no such texture.
             AssetError: The image is missing or damaged.
         """
-        return _texture(self.folder, texture_name)
+        return _protected_texture(self.folder, texture_name)
 
     def problems(self) -> list[str]:
         """Check every file of the pack that tasks use.
@@ -140,6 +140,10 @@ class OriginalAssets:
 
 
 @lru_cache(maxsize=1024)
+def _protected_geometry(folder: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+    return protect(_geometry(folder, object_name, size, scale))
+
+
 def _geometry(folder: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     spec = object_spec(object_name)
     if object_name in _BOX_SHAPES:
@@ -190,6 +194,12 @@ def _mesh(folder: Path, relative_path: str) -> ObjMesh:
 
 
 @lru_cache(maxsize=128)
+def _protected_texture(folder: Path, texture_name: str) -> np.ndarray:
+    texture = _texture(folder, texture_name)
+    texture.setflags(write=False)
+    return texture
+
+
 def _texture(folder: Path, texture_name: str) -> np.ndarray:
     spec = texture_spec(texture_name)
     if spec.texel is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from openvima.catalog import images, materials, noise, patterns
 from openvima.catalog.bodies import build_geometry, has_fixed_size
 from openvima.catalog.cache import cached_array
-from openvima.catalog.geometry import Geometry, Vector3
+from openvima.catalog.geometry import Geometry, Vector3, protect
 from openvima.catalog.textures import texture_spec
 
 _DRAWING_MODULES = (images, materials, noise, patterns)
@@ -23,7 +23,7 @@ class ProceduralAssets:
 
     def __init__(self) -> None:
         self._textures: dict[str, np.ndarray] = {}
-        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(build_geometry)
+        self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(_built)
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return the shape of a catalogue object; see `Assets.geometry`."""
@@ -34,8 +34,14 @@ class ProceduralAssets:
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image; see `Assets.texture`."""
         if texture_name not in self._textures:
-            self._textures[texture_name] = _load_texture(texture_name)
+            texture = _load_texture(texture_name)
+            texture.setflags(write=False)
+            self._textures[texture_name] = texture
         return self._textures[texture_name]
+
+
+def _built(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+    return protect(build_geometry(object_name, size, scale))
 
 
 def _load_texture(texture_name: str) -> np.ndarray:

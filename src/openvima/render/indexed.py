@@ -45,11 +45,12 @@ def indexed(mesh: TriangleMesh) -> IndexedMesh:
     a, b, c = (mesh.vertices[:, k, :2] for k in range(3))
     doubled_area = (b - a)[:, 0] * (c - a)[:, 1] - (c - a)[:, 0] * (b - a)[:, 1]
     corners = np.ascontiguousarray(corners, dtype=np.int32)
+    # Copies, for kernels are compiled anew for arrays that cannot be written to, as those of packs.
     return IndexedMesh(
-        vertices=np.ascontiguousarray(vertices, dtype=np.float64),
+        vertices=np.array(vertices, dtype=np.float64, order="C"),
         corners=corners,
-        normals=np.ascontiguousarray(mesh.normals, dtype=np.float64),
-        uvs=np.ascontiguousarray(mesh.uvs, dtype=np.float64),
+        normals=np.array(mesh.normals, dtype=np.float64, order="C"),
+        uvs=np.array(mesh.uvs, dtype=np.float64, order="C"),
         is_flat=(mesh.normals == mesh.normals[:, :1]).all(axis=(1, 2)),
         upward=np.ascontiguousarray(corners[doubled_area > 0]),
     )

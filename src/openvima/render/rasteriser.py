@@ -261,11 +261,14 @@ def _rectangle(length_x: float, length_y: float) -> TriangleMesh:
 
 
 def _texture_array(texture: np.ndarray | Rgb) -> np.ndarray:
+    """The texture in the form that the kernels are compiled for: read-only, as packs deliver them."""
     if isinstance(texture, tuple):
-        return np.array(texture, dtype=np.uint8).reshape(1, 1, 3)
+        texture = np.array(texture, dtype=np.uint8).reshape(1, 1, 3)
     if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:
         raise ShapeError(f"texture is {texture.dtype} of shape {texture.shape}; it must be uint8 (H, W, 3).")
-    return np.ascontiguousarray(texture)
+    array = np.ascontiguousarray(texture).view()
+    array.setflags(write=False)
+    return array
 
 
 def _checked_id(object_id: int) -> int:
