@@ -1,7 +1,9 @@
 """Choosing an asset pack, what it remembers, and the cache on disk."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,6 +74,13 @@ def test_pictures_are_read_back_from_the_cache_unchanged():
     (file,) = cache_dir().rglob("magma.npy")
     assert np.array_equal(np.load(file), drawn)
     assert np.array_equal(ProceduralAssets().texture("magma"), drawn)
+
+
+def test_every_module_that_decides_on_a_picture_counts_for_the_cache():
+    counted = {module.__name__ for module in _DRAWING_MODULES}
+    for module in _DRAWING_MODULES:
+        code = Path(str(module.__file__)).read_text(encoding="utf-8")
+        assert set(re.findall(r"^from (openvima\.catalog\.\w+) import", code, re.MULTILINE)) <= counted
 
 
 def test_a_cached_array_is_built_once():
