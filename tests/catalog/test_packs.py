@@ -11,7 +11,7 @@ import pytest
 from openvima.catalog.cache import cache_dir, cached_array
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.packs import load_assets
-from openvima.catalog.procedural import ProceduralAssets
+from openvima.catalog.procedural import _DRAWING_MODULES, ProceduralAssets
 from openvima.errors import AssetError, UnknownTextureError
 
 SIZE = (0.16, 0.16, 0.05)
