@@ -1,15 +1,20 @@
-"""One thread, so that sums do not depend on the machine, and episodes for policies to play."""
+"""Short demonstrations by the oracle and small networks, on one thread."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 
 import pytest
 
+from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
+
+TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
+    """Sums then do not depend on the number of cores."""
     if find_spec("torch") is None:
         yield
         return
@@ -21,11 +26,37 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-@pytest.fixture
-def envs() -> list[TabletopEnv]:
-    """Four environments with a fresh episode each, of prompts and tables of different size."""
-    tasks = ("visual_manipulation", "rotate", "sweep_without_exceeding", "visual_manipulation")
-    made = [TabletopEnv(task) for task in tasks]
-    for seed, env in enumerate(made):
-        env.reset(seed=seed)
-    return made
+@pytest.fixture(scope="session")
+def starts() -> list[tuple[TabletopEnv, dict]]:
+    """Environments at their start, and what they show; not to be stepped."""
+    envs = [TabletopEnv(task) for task in TASKS]
+    return [(env, env.reset(seed=seed)[0]) for seed, env in enumerate(envs)]
+
+
+@pytest.fixture(scope="session")
+def demonstrations() -> list[Demonstration]:
+    """Two of each task, of one step and of several."""
+    runs = []
+    for task in TASKS:
+        env = TabletopEnv(task, level="train", domain="user")
+        runs += [rollout_oracle(env, seed) for seed in range(2)]
+    long = next(
+        run for seed in range(100) if (run := rollout_oracle(env, seed)).num_steps > 1 and run.outcome.success
+    )
+    return [*runs, long]
+
+
+@pytest.fixture(scope="session")
+def small_sizes():
+    """A nano network that is narrower and shallower."""
+    pytest.importorskip("torch")
+    from openvima.policies import preset
+    from openvima.policies.layers.conv_encoder import ConvConfig
+
+    sizes = preset("nano")
+    return replace(
+        sizes,
+        objects=replace(sizes.objects, crop=ConvConfig(width=8, output_width=32), width=64),
+        text=replace(sizes.text, num_layers=1),
+        decoder=replace(sizes.decoder, width=64, num_layers=1),
+    )

@@ -58,6 +58,14 @@ FILLS = {
 }
 
 
+# Prompts of the harder variants of some tasks.
+HARDER = (
+    "Put the {a} and {b} and {c} into the {d}.",
+    "Rotate the {a} and {b} -90 degrees.",
+    "Sweep one {a} into {b}. Sweep two {a} into {b}. Sweep all {a} into {b}.",
+)
+
+
 def filled(template: str) -> list[str]:
     """Every text that a template can become."""
     slots = [slot for slot in FILLS if slot in template]
@@ -75,7 +83,7 @@ def blank_images(text: str) -> RenderedPrompt:
     return RenderedPrompt(text, {name: PromptImage(name, "object", {}, {}, ()) for name in names})
 
 
-@pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template[:24])
+@pytest.mark.parametrize("template", TEMPLATES + HARDER, ids=lambda template: template[:24])
 def test_every_prompt_of_the_17_tasks_is_encoded(template: str) -> None:
     for text in filled(template):
         sequence = encode_prompt(blank_images(text))

@@ -1,0 +1,220 @@
+"""Boxes, crops and grasp points against slow twins, and objects that are small, hidden or at the border."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openvima.errors import ShapeError
+from openvima.policies.perception import (
+    FRONT,
+    TOP,
+    ObjectViews,
+    crop_box,
+    observe,
+    observe_prompt_image,
+    see_objects,
+)
+from openvima.render.camera import CAMERAS, unproject
+from openvima.scene import ObjectRecord, PromptImage
+from slow_perception import crop_and_box, most_interior
+
+VIEWS = ("front", "top")
+ID = 9
+
+
+def noise(seed: int = 0, shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {view: rng.integers(0, 256, (3, *shape), dtype=np.uint8) for view in VIEWS}
+
+
+def empty(shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
+    return {view: np.ones(shape, np.uint8) for view in VIEWS}
+
+
+def seen_in_top(shown: np.ndarray, rgb: dict[str, np.ndarray] | None = None) -> ObjectViews:
+    segm = empty(shown.shape)
+    segm["top"][shown] = ID
+    return see_objects(rgb or noise(shape=shown.shape), segm, [ID])
+
+
+def rectangle(rows: slice, columns: slice, shape: tuple[int, int] = (128, 256)) -> np.ndarray:
+    shown = np.zeros(shape, bool)
+    shown[rows, columns] = True
+    return shown
+
+
+@st.composite
+def blobs(draw: st.DrawFn) -> np.ndarray:
+    """A few overlapping rectangles and holes, as an object that others hide in part."""
+    shown = np.zeros((48, 72), bool)
+    for _ in range(draw(st.integers(1, 4))):
+        row, column = draw(st.integers(0, 47)), draw(st.integers(0, 71))
+        height, width = draw(st.integers(1, 40)), draw(st.integers(2, 60))
+        shown[row : row + height, column : column + width] = draw(st.booleans())
+    return shown
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(blobs())
+def test_crops_boxes_and_grasps_equal_those_of_the_slow_twin(shown: np.ndarray) -> None:
+    rgb = noise(shape=shown.shape)
+    objects = seen_in_top(shown, rgb)
+    if shown.sum() < 2:
+        assert not objects.masks.any()
+        return
+    crop, box = crop_and_box(rgb["top"], shown)
+    np.testing.assert_array_equal(objects.boxes[TOP, 0], box)
+    np.testing.assert_array_equal(objects.grasps[TOP, 0], most_interior(shown))
+    assert np.abs(objects.crops[TOP, 0] - crop).max() < 1.01  # the twin does not round
+
+
+@pytest.mark.parametrize("size", [1, 2, 31, 32, 33, 63, 64, 65, 128])
+def test_crops_of_every_size_equal_those_of_the_slow_twin(size: int) -> None:
+    rgb = noise()
+    crop, box = crop_box(rgb["top"], (5, 5 + size - 1, 0, size - 1))
+    expected, expected_box = crop_and_box(rgb["top"], rectangle(slice(0, size), slice(5, 5 + size)))
+    np.testing.assert_array_equal(box, expected_box)
+    assert np.abs(crop - expected).max() < 1.01
+    if size == 32:
+        np.testing.assert_array_equal(crop, expected)
+
+
+def test_a_crop_keeps_what_surrounds_the_object() -> None:
+    shown = np.eye(40, 60, dtype=bool)
+    rgb = {view: np.full((3, 40, 60), 200, np.uint8) for view in VIEWS}
+    assert (seen_in_top(shown, rgb).crops[TOP, 0] == 200).all()
+
+
+def test_a_narrow_object_is_centred_on_black() -> None:
+    rgb = {view: np.full((3, 128, 256), 200, np.uint8) for view in VIEWS}
+    crop = seen_in_top(rectangle(slice(10, 42), slice(100, 108)), rgb).crops[TOP, 0]
+    assert (crop[:, :, 12:20] == 200).all()
+    assert not crop[:, :, :12].any()
+    assert not crop[:, :, 20:].any()
+
+
+@pytest.mark.parametrize(("count", "visible"), [(0, False), (1, False), (2, True)])
+def test_an_object_counts_from_two_pixels(count: int, visible: bool) -> None:
+    objects = seen_in_top(rectangle(slice(5, 6), slice(7, 7 + count)))
+    assert objects.masks[TOP, 0] == visible
+    assert objects.visible()[0] == visible
+    if not visible:
+        assert not objects.crops.any()
+        assert not objects.boxes.any()
+        assert not objects.grasps.any()
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [
+        (slice(0, 3), slice(0, 3)),
+        (slice(125, 128), slice(253, 256)),
+        (slice(0, 128), slice(0, 256)),
+        (slice(0, 1), slice(0, 256)),
+        (slice(0, 128), slice(255, 256)),
+    ],
+)
+def test_objects_at_the_border_lose_nothing(rows: slice, columns: slice) -> None:
+    shown, rgb = rectangle(rows, columns), noise()
+    objects = seen_in_top(shown, rgb)
+    crop, box = crop_and_box(rgb["top"], shown)
+    np.testing.assert_array_equal(objects.boxes[TOP, 0], box)
+    assert np.abs(objects.crops[TOP, 0] - crop).max() < 1.01
+    column, row = objects.grasps[TOP, 0]
+    assert shown[row, column]
+
+
+def test_an_object_hidden_from_above_is_placed_by_the_front_view() -> None:
+    segm = empty()
+    segm["front"][60:70, 100:111] = ID
+    objects = see_objects(noise(), segm, [ID])
+    assert objects.masks[:, 0].tolist() == [True, False]
+    expected = unproject(np.array([105, 64]), CAMERAS["front"])
+    np.testing.assert_array_equal(objects.positions()[0], expected)
+    np.testing.assert_array_equal(
+        objects.grasp_points()[0], unproject(objects.grasps[FRONT, 0], CAMERAS["front"])
+    )
+
+
+def test_an_object_in_both_views_is_placed_by_the_top_view() -> None:
+    segm = empty()
+    segm["front"][60:70, 100:111] = ID
+    segm["top"][20:30, 30:41] = ID
+    expected = unproject(np.array([35, 24]), CAMERAS["top"])
+    np.testing.assert_array_equal(see_objects(noise(), segm, [ID]).positions()[0], expected)
+
+
+def test_slots_are_the_same_object_in_both_views_until_compacted() -> None:
+    segm = empty()
+    segm["front"][10:20, 10:20] = 7
+    segm["top"][10:20, 10:20] = 8
+    objects = see_objects(noise(), segm, [7, 8])
+    assert objects.masks.tolist() == [[True, False], [False, True]]
+    compacted = objects.compacted()
+    assert compacted.masks.tolist() == [[True, False], [True, False]]
+    np.testing.assert_array_equal(compacted.boxes[TOP, 0], objects.boxes[TOP, 1])
+    np.testing.assert_array_equal(compacted.crops[TOP, 0], objects.crops[TOP, 1])
+
+
+@pytest.mark.parametrize(("effector", "first"), [(0, 5), (1, 4)])
+def test_objects_of_an_observation_start_after_the_arm(effector: int, first: int) -> None:
+    segm = empty()
+    for number in (0, 2, 3, 4, 5, 254, 255):
+        segm["top"][number % 100 : number % 100 + 1, 10 + number // 2 : 20 + number // 2] = number
+    ids = observe({"rgb": noise(), "segm": segm, "ee": effector}).ids
+    assert sorted(ids) == [number for number in (4, 5, 254) if number >= first]
+
+
+def test_the_order_of_objects_is_that_of_the_image_and_not_of_the_ids() -> None:
+    def ordered(ids: tuple[int, int, int]) -> list[list[int]]:
+        segm = empty()
+        for number, column in zip(ids, (200, 20, 100), strict=True):
+            segm["top"][50:60, column : column + 10] = number
+        return observe({"rgb": noise(), "segm": segm, "ee": 0}).boxes[TOP, :, 0].tolist()
+
+    assert ordered((5, 6, 7)) == ordered((7, 5, 6)) == [24, 104, 204]
+
+
+def test_prompt_images_keep_the_order_of_their_records_and_drop_what_is_hidden() -> None:
+    segm = empty()
+    segm["front"][50:60, 20:30] = 3
+    segm["top"][50:60, 100:110] = 2
+    records = tuple(ObjectRecord(number, "flower", "red") for number in (3, 4, 2))
+    image = PromptImage("scene", "scene", noise(), segm, records)
+    assert observe_prompt_image(image).ids.tolist() == [3, 2]
+
+
+def test_real_observations_have_boxes_of_exactly_the_segmented_pixels(starts) -> None:
+    for env, observation in starts:
+        objects = observe(observation)
+        assert set(objects.ids) <= {p.id for p in env.scene.placements}
+        for slot, object_id in enumerate(objects.ids):
+            for v, view in enumerate(VIEWS):
+                shown = observation["segm"][view] == object_id
+                if shown.sum() < 2:
+                    assert not objects.masks[v, slot]
+                    continue
+                crop, box = crop_and_box(observation["rgb"][view], shown)
+                np.testing.assert_array_equal(objects.boxes[v, slot], box)
+                np.testing.assert_array_equal(objects.grasps[v, slot], most_interior(shown))
+                assert np.abs(objects.crops[v, slot] - crop).max() < 1.01
+
+
+def test_images_that_are_not_contiguous_give_the_same() -> None:
+    shown = rectangle(slice(10, 40), slice(30, 90))
+    rgb, segm = noise(), empty()
+    segm["top"][shown] = ID
+    turned = {view: np.moveaxis(np.moveaxis(image, 0, -1).copy(), -1, 0) for view, image in rgb.items()}
+    plain, other = see_objects(rgb, segm, [ID]), see_objects(turned, segm, [ID])
+    np.testing.assert_array_equal(plain.crops, other.crops)
+
+
+def test_images_of_another_shape_or_dtype_are_refused() -> None:
+    rgb, segm = noise(), empty()
+    with pytest.raises(ShapeError, match="rgb 'front'"):
+        see_objects({**rgb, "front": rgb["front"].astype(float)}, segm, [ID])
+    with pytest.raises(ShapeError, match="rgb 'front'"):
+        see_objects({**rgb, "front": rgb["front"].transpose(1, 2, 0)}, segm, [ID])
+    with pytest.raises(ShapeError, match="segm 'top'"):
+        see_objects(rgb, {**segm, "top": segm["top"][:-1]}, [ID])
