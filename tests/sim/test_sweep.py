@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from openvima.scene import Action
+from openvima.scene import Action, Scene
 from openvima.sim import World
 from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
 from openvima.sim.settling import WATCH_TICKS
+from openvima.sim.stage import Stage
 from sim_tables import ASSETS, Body, table
 
 
@@ -113,6 +114,28 @@ def test_watching_sees_the_blocks_on_their_way() -> None:
     assert len(seen) >= num_ticks // WATCH_TICKS
     assert np.abs(np.diff([0.6, *seen])).max() < 0.025  # 0.5 mm a tick, 25 ticks, and catching up
     assert seen[-1] == world.scene[4].pose.x
+
+
+def test_no_stretch_of_motion_without_a_look_is_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    unwatched, stretches = 0, []
+    count_ticks = Stage.count_ticks
+
+    def note(stage: Stage, num_ticks: int, *args: object) -> None:
+        nonlocal unwatched
+        unwatched += num_ticks
+        stretches.append(unwatched)
+        count_ticks(stage, num_ticks, *args)  # type: ignore[arg-type]
+
+    def look(_: Scene) -> None:
+        nonlocal unwatched
+        unwatched = 0
+
+    monkeypatch.setattr(Stage, "count_ticks", note)
+    world = blocks((0.6, 0.0, 0.3), (0.55, 0.02, 1.0), (0.47, -0.02, 0.0))
+    for x, y in ((0.4, 0.013), (0.43, -0.1), (0.5, 0.1)):
+        pose = world.scene[4].pose
+        world.execute(Action.planar((pose.x, pose.y), (x, y)), watch=look)
+    assert max(stretches) == WATCH_TICKS
 
 
 def test_fixed_bodies_are_not_pushed() -> None:

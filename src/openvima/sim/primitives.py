@@ -24,7 +24,6 @@ SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
 TOP_SPEED = 0.5  # m/s, of bodies that slip out between the blade and something fixed
 _DOWN = (0.0, 0.0, -1.0)
 _ABOVE_ALL_M = 1.0  # height from which tools and held bodies are lowered, above every stack
-_STRIDE_TICKS = 5
 
 
 def pick_place(stage: Stage, action: Action) -> int | None:
@@ -282,8 +281,8 @@ class _Blade:
 
     def _wait(self) -> None:
         """Run physics with the blade at rest until all others are, too."""
-        for _ in range(settling.SETTLE_LIMIT_TICKS // _STRIDE_TICKS):
-            self._run(_STRIDE_TICKS, (0.0, 0.0, 0.0))
+        for _ in range(settling.SETTLE_LIMIT_TICKS // settling.STRIDE_TICKS):
+            self._run(settling.STRIDE_TICKS, (0.0, 0.0, 0.0))
             if self._is_calm():
                 return
 
@@ -307,7 +306,7 @@ class _Blade:
         step = length / left
         velocity = (direction[0] * speed, direction[1] * speed, 0.0)
         while left:
-            ticks = min(_STRIDE_TICKS, left)
+            ticks = min(settling.STRIDE_TICKS, left)
             self._run(ticks, velocity)
             left -= ticks
             self._x += direction[0] * step * ticks

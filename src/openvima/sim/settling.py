@@ -9,7 +9,7 @@ SETTLED_SPEED = 5e-3  # m/s, as in VIMA-Bench
 SETTLED_TURNING = 0.05  # rad/s: a body that begins to topple turns before its centre moves
 SETTLE_LIMIT_TICKS = 1000
 WATCH_TICKS = 25  # longest stretch of motion between two looks at the constraints
-_STRIDE_TICKS = 5  # between two looks at the speeds; divides WATCH_TICKS
+STRIDE_TICKS = 5  # longest stretch of motion between two looks at the speeds; divides WATCH_TICKS
 _QUIET_STRIDES = 2  # in a row, so that a body at the turning point of its motion does not count as settled
 
 
@@ -35,14 +35,14 @@ def settle(
     num_ticks = quiet = 0
     while quiet < _QUIET_STRIDES and num_ticks < SETTLE_LIMIT_TICKS:
         before = bodies.coordinates()
-        bodies.tick(_STRIDE_TICKS)
+        bodies.tick(STRIDE_TICKS)
         if top_speed is not None:
             bodies.limit_speed(top_speed)
-        num_ticks += _STRIDE_TICKS
-        speed, turning = bodies.mean_speeds(before, _STRIDE_TICKS * TICK_S, apart_from=apart_from)
+        num_ticks += STRIDE_TICKS
+        speed, turning = bodies.mean_speeds(before, STRIDE_TICKS * TICK_S, apart_from=apart_from)
         quiet = quiet + 1 if speed < SETTLED_SPEED and turning < SETTLED_TURNING else 0
         if each is not None:
-            each(_STRIDE_TICKS)
+            each(STRIDE_TICKS)
     bodies.stop()
     bodies.refresh()
     return num_ticks, quiet >= _QUIET_STRIDES

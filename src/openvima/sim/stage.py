@@ -48,10 +48,11 @@ class Stage:
         return self.start.with_poses(poses)
 
     def count_ticks(self, num_ticks: int, held: tuple[int, Pose] | None = None) -> None:
-        """Note that physics has run, and let the onlooker look if it is time."""
+        """Note that physics ran, for up to `STRIDE_TICKS`; let the onlooker look before it is too late."""
         self.num_ticks += num_ticks
         self._unwatched_ticks += num_ticks
-        if self._unwatched_ticks >= settling.WATCH_TICKS and self._watch is not None:
+        is_time = self._unwatched_ticks + settling.STRIDE_TICKS > settling.WATCH_TICKS
+        if is_time and self._watch is not None:
             self._unwatched_ticks = 0
             self._watch(self.scene(held))
 
