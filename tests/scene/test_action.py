@@ -47,6 +47,8 @@ def test_planar_actions_stay_in_the_workspace() -> None:
         ({"pose0_rotation": np.array([0, 0, 0, 1])}, "pose0_rotation has dtype int64"),
         ({"pose0_rotation": np.array([0, 0, 0, 1.5], np.float32)}, "-1 … 1"),
         ({"gripper": 1.0}, "unknown keys gripper"),
+        ({"pose0_position": [0.5, [0.1, 0.2]]}, "cannot convert; give 2 numbers"),
+        ({"pose0_position": np.array([1e300, 0.0])}, "must be finite"),
     ],
 )
 def test_an_action_that_cannot_be_is_refused_with_the_reason(

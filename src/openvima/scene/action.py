@@ -119,12 +119,16 @@ def _key_problems(action: Mapping[str, object]) -> list[str]:
 
 
 def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], list[str]]:
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # such as nested lists of unequal lengths, or a tensor on a device
+        return (), [f"{key} is a {type(value).__name__} that NumPy cannot convert; give {length} numbers."]
     if not np.issubdtype(array.dtype, np.floating):
         return (), [f"{key} has dtype {array.dtype}; it must be floating-point (float32)."]
     if array.shape != (length,):
         return (), [f"{key} has shape {array.shape}; it must be ({length},)."]
-    array = array.astype(np.float32)
+    with np.errstate(over="ignore"):  # reported below as not finite
+        array = array.astype(np.float32)
     given = tuple(float(v) for v in array)
     if not np.isfinite(array).all():
         return (), [f"{key} is {given}; all values must be finite."]
