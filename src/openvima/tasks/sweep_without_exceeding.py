@@ -62,10 +62,10 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     distractor_texture = table.choose([t for t in pool.dragged_textures if t != swept_texture])
 
     bounds = _add_flat(table, pool.base_objects[0], bounds_texture, AREA_X)
-    depth = bounds.size[1]
+    depth, width = bounds.size[:2]
     low, high = (AREA_X + (share - 0.5) * depth for share in LINE_RANGE)
     line = _add_flat(table, "line", line_texture, rng.uniform(low, high))
-    zone = _goal_zone(line.pose.x, line.size[1], depth=depth, width=bounds.size[0])
+    zone = _goal_zone(line.pose.x, line.size[1], depth=depth, width=width)
 
     def scatter(texture: str, corner: tuple[float, float], spread_m: float) -> list[Placement]:
         return scattered_blocks(
