@@ -17,7 +17,7 @@ from openvima.policies.vima.checkpoint import load_checkpoint, save_checkpoint  
 from openvima.policies.vima.config import VimaConfig  # noqa: E402
 from openvima.policies.vima.heads.base import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.vima.heads.bins import BinsConfig, decode_bins, encode_bins  # noqa: E402
-from openvima.policies.vima.heads.pointing import yaw_bin  # noqa: E402
+from openvima.policies.vima.heads.pointing import carried_place, yaw_bin  # noqa: E402
 from openvima.policies.vima.model import Vima, build_model  # noqa: E402
 from openvima.policies.vima.policy import VimaPolicy  # noqa: E402
 from openvima.scene import Action  # noqa: E402
@@ -25,7 +25,7 @@ from openvima.training.dataset import make_batch, read_examples  # noqa: E402
 
 
 def played(policy: VimaPolicy, demonstrations, *, num_steps: int = 2) -> list[list[dict]]:
-    """Feed the observations of demonstrations, whatever the policy does; episodes end with their demonstration."""
+    """Feed the observations of demonstrations, whatever the policy does, each to its own end."""
     policy.reset([demo.prompt for demo in demonstrations])
     actions: list[list[dict]] = [[] for _ in demonstrations]
     for step in range(num_steps):
@@ -139,6 +139,14 @@ def test_unit_range_undoes_itself_and_clips():
 def test_yaw_bins_are_centred_on_whole_steps():
     turns = torch.deg2rad(torch.tensor([0.0, 2.4, 2.6, -2.6, 180.0, -180.0, 357.6]))
     assert yaw_bin(turns, 72).tolist() == [0, 0, 1, 71, 36, 36, 0]
+
+
+def test_a_place_follows_the_grasp_rigidly():
+    """Grasped 2 cm further along x and turned by 90 degrees, the hand ends 2 cm further along y."""
+    half = 0.5**0.5
+    action = torch.tensor([[[0.4, 0.0, 0, 0, 0, 1, 0.6, 0.1, 0, 0, half, half]]])
+    place = carried_place(action, torch.tensor([[[0.42, 0.0]]]))
+    torch.testing.assert_close(place, torch.tensor([[[0.6, 0.12]]]))
 
 
 def test_a_prompt_word_that_is_not_known_is_an_error(demonstrations):

@@ -123,7 +123,11 @@ class _Trainer:
         self._report(f"{stage.name}: {note}")
 
     def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
-        """Validate, note whether it is the best, and write a checkpoint."""
+        """Validate, note whether it is the best, and write a checkpoint.
+
+        With few held-out demonstrations scores are noisy, and later checkpoints have learnt at smaller rates:
+        a later one counts as the best unless it is worse by more than the score's standard error.
+        """
         self.model.eval()
         metrics = stage.validate()
         if metrics:
@@ -132,9 +136,10 @@ class _Trainer:
             self.run.append(METRICS_FILE, {**here, "name": stage.name, **names})
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self.stages) - 1
-        score = metrics.get("score", 0.0)
-        if is_last_stage and (self.progress.best_score is None or score >= self.progress.best_score):
-            self.progress = replace(self.progress, best_score=score, best_checkpoint=name)
+        score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
+        best = self.progress.best_score
+        if is_last_stage and (best is None or score >= best - error):
+            self.progress = replace(self.progress, best_score=max(score, best or 0.0), best_checkpoint=name)
         self.run.save(name, self.model, optimizer, self.progress)
 
     def _matching(self) -> Stage:

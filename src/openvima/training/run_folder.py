@@ -42,7 +42,7 @@ class Progress:
         stage: Number of the stage, from 0.
         step: Steps of it that are done.
         best_score: Best validation score so far; None before the first.
-        best_checkpoint: Name of that checkpoint.
+        best_checkpoint: Name of the checkpoint to use.
     """
 
     stage: int = 0

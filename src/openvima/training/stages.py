@@ -1,5 +1,6 @@
 """The two stages of a run: matching prompt and scene crops, then behaviour cloning."""
 
+import math
 from dataclasses import replace
 from typing import Protocol
 
@@ -42,7 +43,7 @@ class Stage(Protocol):
         ...
 
     def validate(self) -> Metrics:
-        """Return metrics on held-out data; "score" is to be as large as possible."""
+        """Return metrics on held-out data: "score", the larger the better, and its standard error."""
         ...
 
 
@@ -76,7 +77,7 @@ class Matching:
     def validate(self) -> Metrics:
         """Share of prompt images whose object is the most similar one in its scene."""
         accuracy = scene_accuracy(self.encoder, self._validation)
-        return {"scene_accuracy": accuracy, "score": accuracy}
+        return {"scene_accuracy": accuracy}
 
 
 class Cloning:
@@ -130,7 +131,8 @@ class Cloning:
             loss, metrics = self._loss(make_batch(group))
             for name, value in {"loss": loss, **metrics}.items():
                 sums[name] = sums.get(name, 0.0) + value.item() * share
-        return {**sums, "score": sums["accuracy"]}
+        score = sums["accuracy"]
+        return {**sums, "score": score, "score_error": math.sqrt(score * (1 - score) / total)}
 
     def _loss(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         features, batch = (self._features, batch) if self._features is not None else self._encoded(batch)

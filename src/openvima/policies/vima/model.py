@@ -1,8 +1,8 @@
 """The VIMA network: prompt and history of objects and actions in, actions out.
 
 Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view,
-Q slots of a step, P places kept, D width of the decoder, F width of crop features, W width of the prompt encoder,
-C components of an action.
+Q slots of a step, P places kept, D width of the decoder, F width of crop features, W width of the prompt
+encoder, C components of an action.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,10 @@ from openvima.policies.vima.heads.base import (
 from openvima.policies.vima.heads.bins import BinsHead
 from openvima.policies.vima.heads.pointing import PointingHead
 from openvima.policies.vima.inputs import HistoryBatch, PromptBatch
+from openvima.scene import END_EFFECTORS
 
-NUM_END_EFFECTORS = 2
+NUM_END_EFFECTORS = len(END_EFFECTORS)
+SUCTION = END_EFFECTORS.index("suction")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +143,7 @@ class Vima(nn.Module):
             appearance_BTNA=self._appearance(features, history.masks_BTVN),
             positions_BTN2=history.positions_BTN2.to(slots_BTQD.dtype),
             grasps_BTN2=history.grasps_BTN2.to(slots_BTQD.dtype),
+            lifts_BT=history.end_effector_BT == SUCTION,
             prompt_BMD=memory.roles_BLD,
             prompt_masks_BM=memory.object_mask_BL,
             prompt_appearance_BMA=memory.appearance_BLA,

@@ -33,8 +33,9 @@ class HeadInputs:
         appearance_BTNA: Appearance of the objects in view.
         positions_BTN2: Table points under the objects' boxes, metres.
         grasps_BTN2: Table points under the objects' most interior pixels, metres.
-        prompt_BMD: Encoded prompt at its object tokens.
-        prompt_masks_BM: Which of these exist.
+        lifts_BT: Whether the tool lifts what it picks, which then moves rigidly with it; else it pushes.
+        prompt_BMD: Encoded prompt, one row for each place.
+        prompt_masks_BM: Which of these places are objects.
         prompt_appearance_BMA: Appearance of the prompt's objects.
     """
 
@@ -44,6 +45,7 @@ class HeadInputs:
     appearance_BTNA: torch.Tensor
     positions_BTN2: torch.Tensor
     grasps_BTN2: torch.Tensor
+    lifts_BT: torch.Tensor
     prompt_BMD: torch.Tensor
     prompt_masks_BM: torch.Tensor
     prompt_appearance_BMA: torch.Tensor

@@ -77,7 +77,9 @@ class PointingHead(ActionHead):
         place_scores = self.place_scores(inputs, pick)
         offset, yaw_scores = self.relate(inputs, pick, place)
         actions = targets.actions_BTC
-        true_offset = actions[..., 6:8] - at(inputs.positions_BTN2, place)
+        grasp = at(inputs.grasps_BTN2, pick)
+        true_place = torch.where(inputs.lifts_BT[..., None], carried_place(actions, grasp), actions[..., 6:8])
+        true_offset = true_place - at(inputs.positions_BTN2, place)
         yaw = yaw_bin(turn_of(actions), self.config.num_yaw_bins)
         huber = F.smooth_l1_loss(
             offset / _OFFSET_UNIT_M, true_offset / _OFFSET_UNIT_M, reduction="none", beta=0.1
@@ -171,6 +173,26 @@ def turn_of(actions_BTC: torch.Tensor) -> torch.Tensor:
         x, y, z, w = actions_BTC[..., start : start + 4].unbind(-1)
         yaws.append(torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
     return yaws[1] - yaws[0]
+
+
+def carried_place(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.Tensor:
+    """Where a grasp point goes if the object moves as it did when it was grasped elsewhere.
+
+    The demonstrator may hold an object by another of its points than the policy would. The object moves
+    rigidly, so that place' = place + turn · (grasp' − grasp).
+
+    Args:
+        actions_BTC: The demonstrated actions.
+        grasp_BT2: The policy's grasp points, metres.
+
+    Returns:
+        Places for them, shape (B, T, 2), metres.
+    """
+    turn = turn_of(actions_BTC)
+    x, y = (grasp_BT2 - actions_BTC[..., 0:2]).unbind(-1)
+    cosine, sine = torch.cos(turn), torch.sin(turn)
+    moved = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
+    return actions_BTC[..., 6:8] + moved
 
 
 def yaw_bin(turn: torch.Tensor, num_bins: int) -> torch.Tensor:

@@ -1,0 +1,49 @@
+"""A small data set, and settings for training that takes seconds."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from openvima.data import GenerateConfig, generate
+from openvima.policies import presets
+
+TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory) -> Path:
+    """Eight demonstrations of each of three tasks."""
+    folder = tmp_path_factory.mktemp("data")
+    return generate(GenerateConfig(out=folder / "demos", tasks=TASKS, episodes=8))
+
+
+@pytest.fixture
+def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
+    """Arguments of a run of a narrow network over a few steps."""
+    pytest.importorskip("torch")
+    from openvima.policies.layers.conv_encoder import ConvConfig
+
+    def tiny():
+        sizes = presets.nano()
+        return replace(
+            sizes,
+            objects=replace(sizes.objects, crop=ConvConfig(width=4, output_width=16), width=32),
+            text=replace(sizes.text, num_layers=1),
+            decoder=replace(sizes.decoder, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
+        )
+
+    monkeypatch.setitem(presets.PRESETS, "tiny", tiny)
+    return {
+        "data": data,
+        "out": tmp_path / "run",
+        "preset": "tiny",
+        "steps": 6,
+        "batch": 6,
+        "pretraining_steps": 4,
+        "pretraining_scenes": 30,
+        "pretraining_batch": 16,
+        "validation_share": 0.2,
+        "checkpoint_every": 2,
+        "threads": 1,
+    }

@@ -1,0 +1,187 @@
+"""Whole runs: resuming, settings that differ, what a run folder holds."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from openvima.errors import CheckpointError, ConfigError, DatasetError  # noqa: E402
+from openvima.policies import load_policy  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.run_folder import RunFolder  # noqa: E402
+
+
+class Killed(BaseException):
+    """Stands for a kill signal."""
+
+
+def train_until(config: TrainingConfig, step: int) -> None:
+    """Train and be killed when so many steps have been begun; nothing is tidied up."""
+    from openvima.training import loop
+
+    begun = 0
+
+    class Trainer(loop._Trainer):
+        def _step(self, *arguments):
+            nonlocal begun
+            begun += 1
+            if begun > step:
+                raise Killed
+            return super()._step(*arguments)
+
+    original, loop._Trainer = loop._Trainer, Trainer
+    try:
+        with pytest.raises(Killed):
+            train(config)
+    finally:
+        loop._Trainer = original
+
+
+def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:
+    folder = run / "checkpoints" / name
+    return {**load_file(folder / "model.safetensors"), **load_file(folder / "optimizer.safetensors")}
+
+
+@pytest.mark.parametrize("killed_at", [1, 3, 4, 7])
+def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_path, killed_at):
+    whole = TrainingConfig(**{**settings, "out": tmp_path / "whole"})
+    torn = TrainingConfig(**{**settings, "out": tmp_path / "torn"})
+    train(whole)
+    train_until(torn, killed_at)
+    train(torn)
+    expected, actual = final_weights(whole.out), final_weights(torn.out)
+    assert expected.keys() == actual.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, actual[name]), name
+    assert (whole.out / "metrics.jsonl").read_bytes() == (torn.out / "metrics.jsonl").read_bytes()
+    assert (whole.out / "config.yaml").read_bytes() == (torn.out / "config.yaml").read_bytes()
+
+
+def test_a_finished_run_is_left_as_it_is(settings):
+    config = TrainingConfig(**settings)
+    train(config)
+    before = {file: file.stat().st_mtime_ns for file in config.out.rglob("*.safetensors")}
+    train(config)
+    assert {file: file.stat().st_mtime_ns for file in config.out.rglob("*.safetensors")} == before
+
+
+def test_another_seed_gives_other_weights(settings, tmp_path):
+    runs = [TrainingConfig(**{**settings, "seed": seed, "out": tmp_path / str(seed)}) for seed in (0, 1)]
+    first, second = (final_weights(train(run)) for run in runs)
+    assert not torch.equal(first["query"], second["query"])
+
+
+def test_global_random_state_and_threads_are_left_alone(settings):
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    threads = torch.get_num_threads()
+    train(TrainingConfig(**settings))
+    assert torch.equal(torch.rand(2), expected)
+    assert torch.get_num_threads() == threads
+
+
+def test_other_settings_on_a_run_are_named_and_force_begins_anew(settings):
+    train(TrainingConfig(**settings))
+    changed = {**settings, "steps": 2, "learning_rate": 5e-4}
+    with pytest.raises(ConfigError, match=r"training\.steps is 6 there and 2 here; training\.learning_rate"):
+        train(TrainingConfig(**changed))
+    run = train(TrainingConfig(**changed, force=True))
+    assert [folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()] == [
+        "2-cloning-000002"
+    ]
+
+
+def test_a_folder_with_other_files_is_never_cleared(settings):
+    settings["out"].mkdir()
+    (settings["out"] / "thesis.tex").write_text("years of work")
+    with pytest.raises(ConfigError, match="not empty"):
+        train(TrainingConfig(**settings))
+    with pytest.raises(ConfigError, match="other files"):
+        train(TrainingConfig(**settings, force=True))
+    assert (settings["out"] / "thesis.tex").exists()
+
+
+def test_without_demonstrations_the_error_says_how_to_make_some(settings, tmp_path):
+    with pytest.raises(DatasetError, match="openvima generate"):
+        train(TrainingConfig(**{**settings, "data": tmp_path / "nothing"}))
+    assert not settings["out"].exists()
+
+
+def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
+    run = train(TrainingConfig(**settings))
+    kept = {folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()}
+    assert kept == {"2-cloning-000006", (run / "checkpoints" / "best.txt").read_text()}
+    load_policy(str(run))
+
+
+def test_metrics_name_stage_and_step_and_hold_no_times(settings):
+    run = train(TrainingConfig(**settings))
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [(line["name"], line["step"]) for line in lines if "loss" in line] == [
+        ("1-matching", 2),
+        ("1-matching", 4),
+        ("2-cloning", 2),
+        ("2-cloning", 4),
+        ("2-cloning", 6),
+    ]
+    assert not any("second" in key for line in lines for key in line)
+
+
+def test_a_damaged_checkpoint_is_named(settings):
+    config = TrainingConfig(**settings)
+    train_until(config, 3)
+    (weights,) = config.out.rglob("model.safetensors")
+    weights.write_bytes(weights.read_bytes()[:100])
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        train(config)
+
+
+def test_what_an_interrupted_save_left_behind_is_removed(settings):
+    config = TrainingConfig(**settings)
+    leftover = config.out / "checkpoints" / "2-cloning-000002.partial"
+    train_until(config, 3)
+    leftover.mkdir()
+    (leftover / "model.safetensors").write_bytes(b"half")
+    train(config)
+    assert not leftover.exists()
+
+
+def test_the_progress_report_ends_at_the_total(settings):
+    seen = []
+    train(TrainingConfig(**settings), lambda done, total, note: seen.append((done, total, note)))
+    assert seen[-1][:2] == (10, 10)
+    assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
+    assert "drawing scenes" in seen[0][2]
+
+
+@pytest.mark.parametrize(
+    "change", [{"preset": "nano-bins", "pretraining_steps": 0, "steps": 1}, {"tune_crops": True}]
+)
+def test_bins_and_tuned_crops_train_too(settings, change):
+    run = train(TrainingConfig(**{**settings, **change}))
+    load_policy(str(run))
+
+
+def test_an_empty_run_folder_has_nothing_to_go_on_from(tmp_path):
+    folder = RunFolder(tmp_path / "run", {"a": 1})
+    assert folder.latest() is None
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        folder.resume_optimizer(torch.optim.AdamW([torch.zeros(1, requires_grad=True)]))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": 0}, "steps is 0; it must be at least 1"),
+        ({"spurious_probability": 1.5}, "between 0 and 1"),
+        ({"preset": "nanno"}, "preset is 'nanno'; allowed: nano"),
+    ],
+)
+def test_settings_out_of_range_are_named(settings, change, message):
+    with pytest.raises(ConfigError, match=message):
+        TrainingConfig(**{**settings, **change})

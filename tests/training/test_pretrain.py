@@ -1,0 +1,79 @@
+"""Rendered pairs: where they come from and what colours do to them."""
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.catalog.partitions import pool  # noqa: E402
+from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.training import pretrain  # noqa: E402
+from openvima.training.schedule import learning_rate_share, step_generator  # noqa: E402
+
+TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
+
+
+def test_pairs_show_training_objects_only(monkeypatch):
+    shown = []
+    original = pretrain._prompt_image
+
+    def spy(placement, *rest):
+        shown.append((placement.object, placement.texture))
+        return original(placement, *rest)
+
+    monkeypatch.setattr(pretrain, "_prompt_image", spy)
+    pairs = pretrain.render_pairs(TASKS, num_scenes=30, seed=0, assets="procedural")
+    pools = [pool(task, "train") for task in TASKS]
+    objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
+    objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
+    textures = {name for entry in pools for name in (*entry.dragged_textures, *entry.base_textures)}
+    assert len(pairs.looks) == len(shown)
+    assert {name for name, _ in shown} <= objects
+    assert {texture for _, texture in shown} <= textures
+
+
+def test_pairs_follow_from_the_seed():
+    first, second, other = (
+        pretrain.render_pairs(TASKS, num_scenes=4, seed=seed, assets="procedural") for seed in (0, 0, 1)
+    )
+    assert torch.equal(first.scene_crops, second.scene_crops)
+    assert first.scene_crops.shape != other.scene_crops.shape or not torch.equal(
+        first.scene_crops, other.scene_crops
+    )
+
+
+def test_mixed_colours_leave_grey_alone():
+    generator = step_generator(0, "colours", 0)
+    mixings = torch.stack([pretrain.colour_mixing(generator) for _ in range(50)])
+    torch.testing.assert_close(mixings.sum(dim=2), torch.ones(50, 3))
+    assert (mixings >= 0).all()
+    unchanged = (mixings == torch.eye(3)).all(dim=2).all(dim=1).float().mean()
+    assert 0.3 < unchanged < 0.8
+
+
+def test_the_matching_loss_falls_when_pairs_are_told_apart():
+    torch.manual_seed(0)
+    encoder = ObjectEncoder(
+        ObjectEncoderConfig(ConvConfig(8, 16), box_width=4, width=8, fuse_views=True, appearance_width=16)
+    )
+    pairs = pretrain.render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural")
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
+    losses = []
+    for step in range(30):
+        loss, _ = pretrain.matching_loss(
+            encoder, pairs, temperature=0.1, generator=step_generator(0, "test", step)
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
+    assert pretrain.scene_accuracy(encoder, pairs) > 0.7
+
+
+def test_the_learning_rate_rises_and_falls_to_zero():
+    shares = [learning_rate_share(step, steps=100, warmup_steps=10) for step in range(101)]
+    assert shares[:10] == sorted(shares[:10])
+    assert max(shares) == shares[10] == 1.0
+    assert shares[10:] == sorted(shares[10:], reverse=True)
+    assert shares[100] == 0.0
