@@ -52,8 +52,11 @@ class VimaPolicy:
         """Begin a batch of episodes, one `RenderedPrompt` each.
 
         Raises:
+            PolicyError: There is no prompt.
             PromptError: A word is not in the vocabulary, or placeholders and images do not match.
         """
+        if not prompts:
+            raise PolicyError("reset got no prompts; give one for each episode.")
         fuse_views = self.model.config.objects.fuse_views
         inputs = [read_prompt(prompt, fuse_views=fuse_views) for prompt in prompts]
         stack = CropStack()
