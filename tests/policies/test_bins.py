@@ -1,0 +1,127 @@
+"""The bins of the published policies: which bin a value falls into and what a bin means."""
+
+import math
+from dataclasses import fields, replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from hypothesis import given, settings  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+
+from openvima.policies.vima.heads.base import (  # noqa: E402
+    ACTION_PARTS,
+    ActionTargets,
+    HeadInputs,
+    from_unit_range,
+    to_unit_range,
+)
+from openvima.policies.vima.heads.bins import (  # noqa: E402
+    NUM_BINS,
+    BinsConfig,
+    BinsHead,
+    decode_bins,
+    encode_bins,
+)
+from openvima.scene import Action  # noqa: E402
+
+
+def slow_bin(value: float, count: int) -> int:
+    """Number of boundaries below the value, of `count` ones from 0 to 1, but no more than the last bin."""
+    return min(sum(k / (count - 1) < value for k in range(count)), count - 1)
+
+
+def inputs(query) -> HeadInputs:
+    """The query, and nothing else: the head looks at nothing else."""
+    nothing = torch.zeros(*query.shape[:2], 0)
+    return HeadInputs(**{**{field.name: nothing for field in fields(HeadInputs)}, "query_BTD": query})
+
+
+def head(width: int = 6) -> BinsHead:
+    torch.manual_seed(0)
+    return BinsHead(BinsConfig(hidden_width=8), width)
+
+
+def test_x_has_50_bins_y_100_and_every_quaternion_component_50():
+    assert NUM_BINS == (50, 100, 50, 50, 50, 50) * 2
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.floats(-0.5, 1.5, width=32))
+def test_a_value_falls_into_the_bin_of_the_definition(value):
+    for count in (50, 100):  # whole float32 steps away from any boundary, where rounding would decide
+        if min(abs(value * (count - 1) - k) for k in range(count)) < 1e-4:
+            return
+    bins = encode_bins(torch.full((12,), value))
+    assert bins.tolist() == [slow_bin(value, count) for count in NUM_BINS]
+
+
+@pytest.mark.parametrize(
+    ("value", "of_50", "of_100"),
+    [(-3.0, 0, 0), (0.0, 0, 0), (1e-7, 1, 1), (0.5, 25, 50), (1.0, 49, 99), (1.5, 49, 99)],
+)
+def test_values_at_and_beyond_the_ends_go_to_the_end_bins(value, of_50, of_100):
+    bins = encode_bins(torch.full((2, 3, 12), value))
+    assert bins.shape == (2, 3, 12)
+    assert (bins[..., 0] == of_50).all()
+    assert (bins[..., 1] == of_100).all()
+
+
+def test_a_bin_means_its_share_of_the_number_of_bins():
+    last = decode_bins(torch.tensor([count - 1 for count in NUM_BINS]), torch.float64)
+    assert last.tolist() == [0.98, 0.99, 0.98, 0.98, 0.98, 0.98] * 2
+    assert decode_bins(torch.zeros(12, dtype=torch.int64)).tolist() == [0.0] * 12
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.floats(0.25, 0.75), st.floats(-0.5, 0.5), st.floats(-math.pi, math.pi))
+def test_an_action_comes_back_within_a_bin(x, y, yaw):
+    arrays = Action.planar((x, y), (x, -y), yaw).to_arrays()
+    action = torch.cat([torch.from_numpy(arrays[key]) for key in ACTION_PARTS]).double()
+    back = from_unit_range(decode_bins(encode_bins(to_unit_range(action)), torch.float64))
+    steps = torch.tensor([0.5 / 50, 1 / 100, *[2 / 50] * 4] * 2, dtype=torch.float64)
+    assert ((back - action).abs() <= steps * 1.001).all()
+
+
+def test_a_component_of_zero_comes_back_exactly_and_the_identity_a_little_short():
+    action = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2, dtype=torch.float64)
+    back = from_unit_range(decode_bins(encode_bins(to_unit_range(action)), torch.float64))
+    torch.testing.assert_close(back[:6], torch.tensor([0.5, 0, 0, 0, 0, 0.96], dtype=torch.float64))
+
+
+def test_the_head_takes_the_likeliest_bin_and_stays_within_bounds():
+    network = head()
+    query = 50 * torch.randn(3, 4, 6, generator=torch.Generator().manual_seed(1))
+    decided = network.decide(inputs(query)).detach()
+    assert decided.shape == (3, 4, 12)
+    for component, scores in enumerate(network.logits(query)):
+        value = to_unit_range(decided)[..., component] * NUM_BINS[component]
+        torch.testing.assert_close(value, scores.argmax(-1).float(), atol=1e-4, rtol=0)
+    for vector in decided.flatten(0, 1).numpy():
+        Action.from_arrays({key: vector[part] for key, part in ACTION_PARTS.items()})
+
+
+def test_the_loss_of_evenly_likely_bins_is_the_logarithm_of_their_number():
+    network = head()
+    for parameter in network.parameters():
+        torch.nn.init.zeros_(parameter)
+    actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).expand(2, 3, 12)
+    exists = torch.ones(2, 3, dtype=torch.bool)
+    slots = torch.zeros(2, 3, dtype=torch.int64)
+    loss, _ = network.loss(inputs(torch.zeros(2, 3, 6)), ActionTargets(actions, slots, slots, exists))
+    position = (math.log(50) + math.log(100)) / 2
+    assert loss.item() == pytest.approx(2 * position + 2 * math.log(50), rel=1e-5)
+
+
+def test_steps_that_do_not_exist_have_no_loss():
+    network = head()
+    generator = torch.Generator().manual_seed(2)
+    query, actions = torch.randn(1, 3, 6, generator=generator), torch.rand(1, 3, 12, generator=generator)
+    slots = torch.zeros(1, 3, dtype=torch.int64)
+    targets = ActionTargets(actions, slots, slots, torch.tensor([[True, True, False]]))
+    loss, metrics = network.loss(inputs(query), targets)
+    query[0, 2], actions[0, 2] = 7.0, 0.7
+    changed, changed_metrics = network.loss(inputs(query), replace(targets, actions_BTC=actions))
+    assert changed == loss
+    assert changed_metrics == metrics
