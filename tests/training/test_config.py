@@ -1,0 +1,55 @@
+"""Settings: those out of range are named, all at once, with what would be allowed."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from openvima.errors import ConfigError
+from openvima.training import TrainingConfig
+
+FOLDERS = {"data": Path("demos"), "out": Path("run")}
+BAD = {
+    "steps": (0, -1),
+    "batch": (0,),
+    "learning_rate": (-1e-3, math.nan),
+    "warmup_steps": (-1,),
+    "weight_decay": (-0.1,),
+    "clip_norm": (-1.0,),
+    "spurious_probability": (-0.1, 1.1, math.nan),
+    "pretraining_steps": (-1,),
+    "pretraining_scenes": (0,),
+    "pretraining_batch": (1,),
+    "pretraining_learning_rate": (-1.0,),
+    "temperature": (0.0,),
+    "seed": (-1,),
+    "validation_share": (-0.1, 1.0),
+    "checkpoint_every": (0,),
+    "threads": (0, -2),
+    "preset": ("huge", ""),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name in BAD for value in BAD[name]])
+def test_a_value_out_of_range_is_named_with_what_is_allowed(name: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=rf"^{name} is .+(it must be|allowed: nano)"):
+        TrainingConfig(**FOLDERS, **{name: value})
+
+
+def test_all_problems_are_in_one_message() -> None:
+    with pytest.raises(ConfigError) as caught:
+        TrainingConfig(**FOLDERS, steps=0, batch=0, preset="huge", validation_share=2.0)
+    message = str(caught.value)
+    assert all(f"{name} is" in message for name in ("steps", "batch", "preset", "validation_share"))
+    assert "\n" not in message
+
+
+def test_defaults_and_extreme_but_possible_values_are_taken() -> None:
+    assert TrainingConfig(**FOLDERS).threads is None
+    TrainingConfig(**FOLDERS, steps=1, batch=1, pretraining_steps=0, validation_share=0.0, threads=1)
+
+
+def test_settings_cannot_be_changed_afterwards() -> None:
+    config = TrainingConfig(**FOLDERS)
+    with pytest.raises(AttributeError):
+        config.steps = 3  # type: ignore[misc]

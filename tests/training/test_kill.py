@@ -1,0 +1,96 @@
+"""Runs that end at any moment: by Ctrl-C, or by a signal that leaves no time to tidy up."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+
+TRAIN = """
+import json, sys
+from pathlib import Path
+from openvima.policies import presets
+from openvima.policies.vima.config import VimaConfig
+from openvima.training import TrainingConfig, train
+
+sizes, settings = json.loads(sys.argv[1])
+presets.PRESETS["tiny"] = lambda: VimaConfig.from_dict(sizes)
+folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
+train(TrainingConfig(**folders, **settings), lambda done, total, note: print(note, flush=True))
+"""
+
+
+@pytest.fixture
+def config(settings) -> TrainingConfig:
+    return TrainingConfig(**{**settings, "checkpoint_every": 1})
+
+
+@pytest.fixture
+def whole(settings, tmp_path) -> Path:
+    """A run that was never interrupted."""
+    return train(TrainingConfig(**{**settings, "checkpoint_every": 1, "out": tmp_path / "whole"}))
+
+
+def assert_same(run: Path, whole: Path) -> None:
+    """Checkpoints and metrics are equal, bit for bit."""
+    checkpoints = {path.name for path in (whole / "checkpoints").iterdir()}
+    assert {path.name for path in (run / "checkpoints").iterdir()} == checkpoints
+    for file in whole.rglob("*.safetensors"):
+        ours, theirs = load_file(run / file.relative_to(whole)), load_file(file)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    for name in ("metrics.jsonl", "config.yaml"):
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
+
+
+def interrupted(config: TrainingConfig, at: str) -> None:
+    """Train, and press Ctrl-C at the second report whose note begins so."""
+    seen = 0
+
+    def report(done: int, total: int, note: str) -> None:
+        nonlocal seen
+        seen += note.startswith(at)
+        if seen == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, report)
+
+
+@pytest.mark.parametrize("stages", [("1-matching",), ("2-cloning",), ("1-matching", "2-cloning")])
+def test_a_run_stopped_by_the_keyboard_goes_on_as_if_it_had_not_been(config, whole, stages) -> None:
+    for stage in stages:
+        interrupted(config, stage)
+    assert_same(train(config), whole)
+
+
+def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(config, settings, whole) -> None:
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+    plain["checkpoint_every"] = 1
+    argument = json.dumps([presets.PRESETS["tiny"]().to_dict(), plain])
+    for stage in ("1-matching", "2-cloning"):
+        process = subprocess.Popen([sys.executable, "-c", TRAIN, argument], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        seen = 0
+        for line in process.stdout:  # a report comes right before a checkpoint is written
+            seen += line.startswith(stage)
+            if seen == 3:
+                process.kill()
+                break
+        process.stdout.close()
+        assert process.wait() == -signal.SIGKILL
+        for checkpoint in (config.out / "checkpoints").iterdir():
+            if checkpoint.is_dir() and checkpoint.suffix != ".partial":
+                load_policy(str(checkpoint))
+                load_file(checkpoint / "optimizer.safetensors")
+                json.loads((checkpoint / "state.json").read_text())
+    assert_same(train(config), whole)

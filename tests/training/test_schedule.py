@@ -1,0 +1,48 @@
+"""Learning rates and seeds: functions of the step alone."""
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.training.schedule import learning_rate_share, step_generator, step_seed  # noqa: E402
+
+
+def shares(steps: int, warmup_steps: int) -> list[float]:
+    return [learning_rate_share(step, steps=steps, warmup_steps=warmup_steps) for step in range(steps)]
+
+
+@pytest.mark.parametrize(("steps", "warmup_steps"), [(1, 0), (1, 100), (2, 1), (7, 100), (300, 20), (300, 0)])
+def test_the_rate_rises_to_its_peak_and_then_only_falls(steps: int, warmup_steps: int) -> None:
+    values = shares(steps, warmup_steps)
+    peak = values.index(max(values))
+    assert values[peak] == 1
+    assert peak == min(warmup_steps, steps // 3)
+    assert values[: peak + 1] == sorted(values[: peak + 1])
+    assert values[peak:] == sorted(values[peak:], reverse=True)
+    assert all(0 < value <= 1 for value in values)
+
+
+def test_the_rise_is_a_line_and_the_fall_half_a_cosine() -> None:
+    values = shares(100, 9)
+    assert values[:9] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
+    assert learning_rate_share(55, steps=101, warmup_steps=9) == pytest.approx(0.5)
+    assert learning_rate_share(100, steps=100, warmup_steps=9) == pytest.approx(0)
+    assert learning_rate_share(1000, steps=100, warmup_steps=9) == pytest.approx(0)
+
+
+def test_seeds_differ_between_runs_purposes_and_steps_and_stay_the_same_for_ever() -> None:
+    drawn = {
+        step_seed(seed, purpose, step) for seed in (0, 1) for purpose in ("a", "b") for step in range(50)
+    }
+    assert len(drawn) == 200
+    assert all(0 <= seed < 2**63 for seed in drawn)
+    assert step_seed(0, "order", 0) == 3471081512423777433  # resumed runs rely on it
+
+
+def test_generators_are_independent_of_the_global_one() -> None:
+    torch.manual_seed(1)
+    first = torch.rand(3, generator=step_generator(4, "test", 2))
+    torch.manual_seed(2)
+    second = torch.rand(3, generator=step_generator(4, "test", 2))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, torch.rand(3, generator=step_generator(4, "test", 3)))
