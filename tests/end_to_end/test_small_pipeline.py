@@ -1,0 +1,93 @@
+"""From nothing to a report on the command line, in small."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.policies import presets  # noqa: E402
+from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
+
+TASKS = "rotate,sweep_without_exceeding"
+
+
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Name of a preset of a narrow network."""
+
+    def sizes():
+        nano = presets.nano()
+        return replace(nano, objects=replace(nano.objects, crop=ConvConfig(width=4, output_width=16)))
+
+    monkeypatch.setitem(presets.PRESETS, "tiny", sizes)
+    return "tiny"
+
+
+def run(*words: object) -> None:
+    assert main([str(word) for word in words]) == 0
+
+
+def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, capsys) -> None:
+    demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
+    run("generate", "--tasks", TASKS, "--episodes", 3, "--out", demos)
+    train = ["train", "--data", demos, "--preset", tiny, "--out", trained, "--batch", 4, "--steps", 3]
+    train += ["--pretraining-steps", 0, "--checkpoint-every", 2, "--threads", 1]
+    run(*train)
+    policies = f"mine={trained},oracle,random"
+    evaluate = ["evaluate", "--policy", policies, "--tasks", TASKS, "--levels", "L1", "--episodes", 2]
+    run(*evaluate, "--videos", 0, "--out", results)
+
+    rows = json.loads((results / "results.json").read_text(encoding="utf-8"))["rows"]
+    assert {(row["policy"], row["task"]) for row in rows} == {
+        (policy, task) for policy in ("mine", "oracle", "random") for task in TASKS.split(",")
+    }
+    assert all(row["episodes"] == 2 and 0 <= row["successes"] <= 2 for row in rows)
+    page = (results / "report.html").read_text(encoding="utf-8")
+    assert all(name in page for name in ("mine", "oracle", "random"))
+
+    weights = (trained / "checkpoints" / "2-cloning-000003" / "model.safetensors").read_bytes()
+    capsys.readouterr()
+    run(*train)  # again: nothing is left to do
+    assert (trained / "checkpoints" / "2-cloning-000003" / "model.safetensors").read_bytes() == weights
+    assert capsys.readouterr().out.strip().endswith("trained")
+
+
+def test_wrong_input_to_each_verb_ends_in_one_line_that_says_so(tmp_path: Path, capsys) -> None:
+    nothing, out = str(tmp_path / "nothing"), str(tmp_path / "out")
+    for words in (
+        ["generate", "--tasks", "rotat", "--out", out],
+        ["train", "--data", nothing, "--out", out],
+        ["evaluate", "--policy", nothing, "--out", out, "--episodes", "1"],
+    ):
+        assert main(words) == 2
+        shown = capsys.readouterr().err.strip()
+        assert shown.splitlines()[-1].startswith("openvima: ")
+        assert "Error: " in shown.splitlines()[-1]
+        assert "Traceback" not in shown
+    assert not (tmp_path / "out").exists()
+
+
+def openvima(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "import sys; from openvima.cli.main import main; sys.exit(main())"]
+    return subprocess.run([*command, *words], capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_quickstart_explains_its_options_in_a_process_of_its_own() -> None:
+    shown = openvima("quickstart", "--help")
+    assert shown.returncode == 0, shown.stderr
+    for option in ("--out", "--demonstrations", "--episodes", "--seed", "--workers"):
+        assert option in shown.stdout
+
+
+@pytest.mark.parametrize("words", [("--episodes", "many"), ("--speed", "3")])
+def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], tmp_path: Path) -> None:
+    shown = openvima("quickstart", "--out", str(tmp_path / "quick"), *words)
+    assert shown.returncode == 2
+    assert words[0] in shown.stdout + shown.stderr
+    assert not (tmp_path / "quick").exists()
