@@ -1,13 +1,13 @@
 """Decoded and drawn images on disk, so that each is made once per machine."""
 
-import contextlib
 import logging
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from openvima.files import whole_file
 
 _logger = logging.getLogger(__name__)
 
@@ -51,12 +51,5 @@ def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.nd
 def _write(path: Path, array: np.ndarray) -> None:
     """Write under another name, then rename: readers see a whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            np.save(file, array, allow_pickle=False)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    with whole_file(path) as file:
+        np.save(file, array, allow_pickle=False)

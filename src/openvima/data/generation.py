@@ -11,9 +11,10 @@ from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, index_bytes, manif
 from openvima.data.reader import Shard
 from openvima.data.records import Demonstration, package_versions, rollout_oracle
 from openvima.data.schema import INDEX_COLUMNS
-from openvima.data.writer import ShardWriter, remove_leftovers, write_whole
+from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
+from openvima.files import write_whole
 from openvima.processes import in_processes
 from openvima.tasks import list_tasks, task_spec
 

@@ -87,6 +87,9 @@ def one_thread(batch: Batch) -> Iterator[None]:
     if batch.source in ("oracle", "random"):  # no network
         yield
         return
+    from openvima.policies.base import require_torch
+
+    require_torch(f"policy {batch.policy!r}")
     import torch
 
     threads = torch.get_num_threads()

@@ -16,6 +16,7 @@ from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPol
 from openvima.policies.base import checkpoint_folder
 from openvima.policies.presets import PRESETS
 from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.seeding import MAX_SEED
 
 ORACLE = "oracle"
 NAMED_POLICIES = (ORACLE, "random", "untrained")
@@ -68,6 +69,8 @@ class EvaluationConfig:
             )
             if value < least
         ]
+        if self.seed + self.episodes - 1 > MAX_SEED:
+            problems.append(f"seed is {self.seed}; seeds of all episodes must lie within 0 to 2**63 - 1.")
         problems += [
             f"{name} is empty; give at least one."
             for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
@@ -131,6 +134,8 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     for given in policies:
         name, equals, source = given.partition("=")
         sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
+    if unfinished := [source.name for source in sources if not source.source]:
+        raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
     names = [source.name for source in sources]
     if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
         raise ConfigError(

@@ -1,7 +1,6 @@
 """What an evaluation found: outcomes of single episodes, counted by policy, task and level."""
 
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from typing import Any
 
 from openvima.errors import DatasetError
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
+from openvima.files import write_whole
 
 SCHEMA = 1
 FILE_NAME = "results.json"
@@ -159,7 +159,7 @@ class Results:
 
     def write(self, path: Path) -> Path:
         """Write `results.json`; an interrupted write leaves the old file or none."""
-        return write_text(path, self.to_json())
+        return write_whole(path, self.to_json())
 
     @staticmethod
     def read(path: Path) -> "Results":
@@ -192,21 +192,6 @@ def failure_kind(reason: str) -> str:
         'object left the workspace'
     """
     return re.sub(r"\bobject \d+( \([^)]*\))?", "object", reason).strip().rstrip(".") or "unknown"
-
-
-def write_text(path: Path, text: str) -> Path:
-    """Write a whole text file or nothing: to a temporary name first, then renamed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
 
 
 def _in_order(names: Iterable[str]) -> list[str]:

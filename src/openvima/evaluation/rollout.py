@@ -36,7 +36,7 @@ class _Seat:
         except ActionError as error:
             return self._end(str(error), BAD_ACTION)
         self.steps += 1
-        self.has_grasped |= info["grasped"] is not None
+        self.has_grasped |= info["grasped"] != 0
         if info["success"]:
             self.observation, self.outcome = None, EpisodeOutcome(self.seed, True, self.steps)
         elif terminated:

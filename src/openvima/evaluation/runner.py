@@ -13,8 +13,9 @@ from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.finish import finish, require_extra
 from openvima.evaluation.players import load_player, one_thread
 from openvima.evaluation.protocol import Batch, EvaluationConfig, plan, policy_sources
-from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row, write_text
+from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row
 from openvima.evaluation.versions import versions
+from openvima.files import write_whole
 from openvima.processes import in_processes
 from openvima.tasks.registry import task_spec
 
@@ -130,7 +131,7 @@ def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, 
         ]
         outcomes = tuple(play(envs, batch.seeds, player))
     count(len(outcomes))
-    write_text(job.part, json.dumps([asdict(outcome) for outcome in outcomes], ensure_ascii=False) + "\n")
+    write_whole(job.part, json.dumps([asdict(outcome) for outcome in outcomes], ensure_ascii=False) + "\n")
     return outcomes
 
 
@@ -164,4 +165,4 @@ def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> No
         "workers": config.workers,
         "policies": {source.name: source.source for source in policy_sources(config.policies)},
     }
-    write_text(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")
+    write_whole(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")

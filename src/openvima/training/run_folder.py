@@ -10,7 +10,6 @@ Every file and checkpoint is written under a temporary name and renamed when it 
 """
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from openvima.errors import CheckpointError, ConfigError
+from openvima.files import write_whole
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
 from openvima.policies.vima.checkpoint import WEIGHTS_FILE, load_weights, save_checkpoint
 from openvima.policies.vima.model import Vima
@@ -77,7 +77,7 @@ class RunFolder:
         self.checkpoints.mkdir(parents=True, exist_ok=True)
         for leftover in self.checkpoints.glob(f"*{_PARTIAL}"):
             shutil.rmtree(leftover)
-        _write_whole(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
+        write_whole(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def latest(self) -> Path | None:
         """Return the last whole checkpoint, or None if there is none."""
@@ -97,7 +97,7 @@ class RunFolder:
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
         if progress.best_checkpoint:
-            _write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
+            write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
         for other in self.checkpoints.iterdir():
             if other.is_dir() and other.name not in (name, progress.best_checkpoint):
                 shutil.rmtree(other)
@@ -152,7 +152,7 @@ class RunFolder:
                 continue
             if (values["stage"], values["step"]) <= (progress.stage, progress.step):
                 kept.append(line + "\n")
-        _write_whole(file, "".join(kept))
+        write_whole(file, "".join(kept))
 
     def _differences(self, settings: dict[str, Any]) -> list[str]:
         file = self.path / CONFIG_FILE
@@ -208,9 +208,3 @@ def _flattened(values: Any, prefix: str = "") -> dict[str, Any]:
     for name, value in values.items():
         result |= _flattened(value, f"{prefix}.{name}" if prefix else str(name))
     return result
-
-
-def _write_whole(file: Path, text: str) -> None:
-    partial = file.with_name(file.name + _PARTIAL)
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, file)

@@ -8,7 +8,8 @@ from openvima.evaluation.clips import Clip
 from openvima.evaluation.report import sections
 from openvima.evaluation.report.curves import read_charts
 from openvima.evaluation.report.wording import headline, prose
-from openvima.evaluation.results import Results, write_text
+from openvima.evaluation.results import Results
+from openvima.files import write_whole
 
 
 def write_report(
@@ -45,7 +46,7 @@ def write_report(
         sections.level_meanings(results),
         sections.reproduction(results, command or default_command(results)),
     )
-    return write_text(out, _page(results, "\n".join(part for part in body if part)))
+    return write_whole(out, _page(results, "\n".join(part for part in body if part)))
 
 
 def default_command(results: Results) -> str:
