@@ -1,5 +1,7 @@
 """The program's frame: overview, unknown verbs, exit codes."""
 
+from pathlib import Path
+
 import pytest
 
 from openvima import __version__
@@ -47,3 +49,42 @@ def test_an_error_about_input_is_one_line_and_status_2(capsys: pytest.CaptureFix
     message = capsys.readouterr().err.strip()
     assert "Did you mean 'rotate'?" in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["generate", "--tasks", "rotate", "--episodes", "1", "--out"],
+        ["evaluate", "--policy", "oracle", "--tasks", "rotate", "--levels", "L1", "--no-report", "--out"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_path_that_cannot_be_used_is_one_line_and_status_2(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert main([*words, str(file)]) == 2
+    message = capsys.readouterr().err.strip()
+    assert f"cannot use {file}" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["demo", "rotate", "--out", "film.gif"],
+        ["report", "evaluation", "--out", "report.pdf"],
+        ["quickstart", "--demonstrations", "0"],
+        ["quickstart", "--workers", "0"],
+        ["evaluate", "--policy", "mine="],
+        ["evaluate", "--policy", "oracle", "--seed", str(2**63 - 1)],
+    ],
+)
+def test_wrong_input_is_refused_before_any_work(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    assert "\n" not in capsys.readouterr().err.strip()
+    assert not list(tmp_path.iterdir())

@@ -1,12 +1,13 @@
 """`openvima demo`: film the oracle or a policy at work on one task."""
 
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 
 def main(
-    task: tyro.conf.Positional[str],
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")],
     *,
     out: Path = Path("demo.mp4"),
     seed: int = 0,
@@ -29,9 +30,12 @@ def main(
     Returns:
         Exit status; it does not tell whether the task was solved.
     """
+    from openvima.errors import ConfigError
     from openvima.tasks import task_spec
 
     task_spec(task).pool(level)  # before what takes a second to load
+    if out.suffix.lower() != ".mp4":
+        raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
     from openvima.env.tabletop import TabletopEnv
     from openvima.evaluation.film import film_episode
     from openvima.evaluation.players import load_player

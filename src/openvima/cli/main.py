@@ -1,5 +1,6 @@
 """The `openvima` program: finds the verb, imports only what it needs, runs it, reports errors in one line."""
 
+import errno
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -71,6 +72,12 @@ def _run(verb: str, rest: list[str]) -> int:
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         sys.stderr.close()
         return 1
+    except OSError as error:  # a path that cannot be used, or a full disk
+        if error.filename is None:
+            return _fail(f"{type(error).__name__}: {error}", 1)
+        reason = error.strerror or type(error).__name__
+        message = f"cannot use {error.filename}: {reason}. Give a path that can be read and written."
+        return _fail(message, 1 if error.errno == errno.ENOSPC else 2)
 
 
 def _fail(message: str, status: int) -> int:

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from openvima.cli.progress import progress_bar
+from openvima.errors import ConfigError
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 LEVELS = ("L1", "L2", "L3")
@@ -22,7 +23,9 @@ def main(
     """Write demonstrations, train a small VIMA policy on them, score it, and leave a report.
 
     Takes at most ten minutes on two cores. It can be interrupted at any time; the same command goes on where
-    it stopped. Example: openvima quickstart --out quickstart
+    it stopped.
+
+    Example: openvima quickstart --out quickstart
 
     Args:
         out: Folder for everything that is made.
@@ -34,6 +37,12 @@ def main(
     Returns:
         Exit status.
     """
+    from openvima.evaluation.finish import require_extra
+    from openvima.policies.base import require_torch
+
+    _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
+    require_torch("training")
+    require_extra()
     workers = workers or min(8, os.cpu_count() or 1)
     out.mkdir(parents=True, exist_ok=True)
     _first_look(out / "first_look.png", seed)
@@ -42,6 +51,17 @@ def main(
     _evaluate(run, out, episodes, seed, workers)
     _summary(out)
     return 0
+
+
+def _check(**counts: int | None) -> None:
+    """Refuse before any work what would only be found out when its turn comes.
+
+    Raises:
+        ConfigError: A number is below 1.
+    """
+    for name, count in counts.items():
+        if count is not None and count < 1:
+            raise ConfigError(f"{name} is {count}; it must be at least 1.")
 
 
 def _first_look(path: Path, seed: int) -> None:

@@ -25,12 +25,14 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.errors import DatasetError
+    from openvima.errors import ConfigError, DatasetError
     from openvima.evaluation.clips import load_clips
     from openvima.evaluation.finish import REPORT_NAME, require_extra
     from openvima.evaluation.report import write_report
     from openvima.evaluation.results import Results
 
+    if out is not None and out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"--out is {str(out)!r}; give the name of an HTML file, such as report.html.")
     require_extra()
     found = Results.read(results)
     if metrics is not None and not metrics.is_file():
