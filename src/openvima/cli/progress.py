@@ -42,4 +42,9 @@ def progress_bar(label: str) -> Iterator[Report]:
         def report(done: int, total: int, note: str) -> None:
             progress.update(task, completed=done, total=total, note=note)
 
-        yield report
+        try:
+            yield report
+        except BaseException:
+            if progress.tasks[0].total is None:  # nothing had begun: the message that follows says it all
+                progress.update(task, visible=False)
+            raise
