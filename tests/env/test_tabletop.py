@@ -227,13 +227,26 @@ def test_info_names_what_is_on_the_table(rotate: TabletopEnv) -> None:
     seen = set(np.unique(observation["segm"]["top"]).tolist())
     assert set(info["objects"]) <= seen <= set(info["objects"]) | {0, 1, 255}
     assert info["reason"] == ""
-    assert info["grasped"] is None
+    assert info["grasped"] == 0
 
 
 def test_the_object_that_was_lifted_is_reported(rotate: TabletopEnv) -> None:
     rotate.reset(seed=5)
     decision = rotate.oracle_decision()
     assert rotate.step(decision.action)[4]["grasped"] == decision.pick_id
+
+
+def test_vector_environments_take_infos_of_hits_and_misses() -> None:
+    envs = gymnasium.make_vec("openvima/rotate-v0", num_envs=2, vectorization_mode="sync")
+    envs.reset(seed=[5, 5])
+    hit = TabletopEnv("rotate")
+    hit.reset(seed=5)
+    decision = hit.oracle_decision()
+    miss = Action.planar((0.25, -0.5), (0.25, -0.5)).to_arrays()
+    actions = {key: np.stack([value, miss[key]]) for key, value in decision.action.to_arrays().items()}
+    info = envs.step(actions)[4]
+    envs.close()
+    assert info["grasped"].tolist() == [decision.pick_id, 0]
 
 
 def test_an_object_thrown_out_of_the_game_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ class Env:
             "success": False,
             "failure": False,
             "reason": "",
-            "grasped": None,
+            "grasped": 0,
             "end_effector": self.end_effector,
         }
         info |= self.script[self.steps]

@@ -103,7 +103,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image), `success`,
     `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
-    None), `num_steps`, `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of
+    0), `num_steps`, `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of
     object and texture). The images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` gives episode number k of the environment's domain, task and level: always
@@ -330,7 +330,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "success": run.outcome.success,
             "failure": run.outcome.failure,
             "reason": run.outcome.reason,
-            "grasped": run.grasped,
+            "grasped": run.grasped or 0,  # never None: vector environments collect numbers in arrays
             "num_steps": run.num_steps,
             "task": episode.task,
             "level": episode.level,
