@@ -81,3 +81,9 @@ def test_only_the_heading_of_a_tilted_tool_matters() -> None:
     tilted = np.array([0.1, 0.0, half, half], np.float32)
     yaw = Action.from_arrays(arrays(pose1_rotation=tilted)).yaw1_rad
     assert math.degrees(yaw) == pytest.approx(90, abs=10)
+
+
+@pytest.mark.parametrize("given", [None, 3, "abc", np.zeros(4, np.float32)], ids=repr)
+def test_what_is_no_mapping_is_refused_as_an_action(given: object) -> None:
+    with pytest.raises(ActionError, match=r"an action is a mapping.*Nothing was moved"):
+        Action.from_arrays(given)  # pyright: ignore[reportArgumentType]

@@ -66,6 +66,9 @@ class Action:
             ActionError: A key is missing or unknown, or an array has a wrong shape or dtype, a value that is
                 not finite, or one out of bounds. All problems are in one message.
         """
+        if not isinstance(action, Mapping):
+            keys, given = ", ".join(ACTION_SHAPES), type(action).__name__
+            raise ActionError(f"an action is a mapping with keys {keys}, not {given}. Nothing was moved.")
         problems = _key_problems(action)
         values: dict[str, tuple[float, ...]] = {}
         for key, length in ACTION_SHAPES.items():
@@ -108,8 +111,6 @@ def _workspace() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _key_problems(action: Mapping[str, object]) -> list[str]:
-    if not isinstance(action, Mapping):
-        return [f"an action is a mapping with keys {', '.join(ACTION_SHAPES)}, not {type(action).__name__}."]
     missing = [key for key in ACTION_SHAPES if key not in action]
     unknown = [str(key) for key in action if key not in ACTION_SHAPES]
     problems = [f"{', '.join(missing)} missing."] if missing else []
