@@ -63,3 +63,13 @@ def test_pictures_of_another_size_are_refused(tmp_path):
 def test_a_film_without_pictures_is_refused(tmp_path):
     with pytest.raises(ShapeError, match="at least one"):
         write_video(tmp_path / "film.mp4", [])
+
+
+def test_a_film_that_is_broken_off_leaves_the_earlier_one(tmp_path):
+    path = write_video(tmp_path / "film.mp4", [plain((9, 9, 9))] * 3)
+    whole = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), VideoWriter(path, 64, 48) as film:
+        film.write(plain((200, 9, 9)))
+        raise KeyboardInterrupt
+    assert path.read_bytes() == whole
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,5 +1,7 @@
 """Films: pictures to H.264 in an MP4 file that every browser plays."""
 
+import contextlib
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +19,7 @@ class VideoWriter:
     """Writes one film, picture by picture.
 
     The file is H.264 with 4:2:0 colours, its index in front, the same bytes for the same pictures.
+    It gets its name when it is whole.
 
     Args:
         path: The file; its folder is made.
@@ -40,9 +43,12 @@ class VideoWriter:
             raise ShapeError(f"a film of {width} × {height} pixels cannot be encoded; both must be even.")
         av = _av()
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._path, self._partial = path, path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._shape = (height, width, 3)
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
-        self._container: Any = av.open(str(path), "w", format="mp4", options=options)  # Any: PyAV is optional
+        self._container: Any = av.open(  # Any: PyAV is optional
+            str(self._partial), "w", format="mp4", options=options
+        )
         self._stream: Any = self._container.add_stream("libx264", rate=frames_per_second)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         # x264's macroblock tree gave other bytes in about 1 of 200 equal runs, in one thread as well
@@ -68,9 +74,16 @@ class VideoWriter:
             self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the film and give it its name."""
         self._container.mux(self._stream.encode(None))
         self._container.close()
+        os.replace(self._partial, self._path)
+
+    def discard(self) -> None:
+        """Leave nothing, where the rest of the pictures will not come; an earlier film stays."""
+        with contextlib.suppress(OSError):  # a container without pictures cannot be finished
+            self._container.close()
+        self._partial.unlink(missing_ok=True)
 
     def __enter__(self) -> "VideoWriter":
         return self
@@ -78,7 +91,10 @@ class VideoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
 
 
 def write_video(
