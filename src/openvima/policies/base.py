@@ -127,7 +127,7 @@ def require_torch(what: str) -> None:
             import_module(module)
         except ImportError as error:
             raise MissingExtraError(
-                f"{what} needs {module}, which is not installed. Run: pip install openvima[train]"
+                f"{what} needs {module}; install it with: pip install 'openvima[train]'"
             ) from error
 
 
