@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
 
-from openvima.errors import CheckpointError, ConfigError, DatasetError  # noqa: E402
+from openvima.errors import AssetError, CheckpointError, ConfigError, DatasetError  # noqa: E402
 from openvima.policies import load_policy  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.run_folder import RunFolder  # noqa: E402
@@ -185,3 +185,9 @@ def test_an_empty_run_folder_has_nothing_to_go_on_from(tmp_path):
 def test_settings_out_of_range_are_named(settings, change, message):
     with pytest.raises(ConfigError, match=message):
         TrainingConfig(**{**settings, **change})
+
+
+def test_an_unknown_asset_pack_leaves_no_run_folder(settings):
+    with pytest.raises(AssetError, match="nosuch"):
+        train(TrainingConfig(**settings, assets="nosuch"))
+    assert not settings["out"].exists()
