@@ -12,7 +12,7 @@ FOLDERS = {"data": Path("demos"), "out": Path("run")}
 BAD = {
     "steps": (0, -1),
     "batch": (0,),
-    "learning_rate": (-1e-3, math.nan),
+    "learning_rate": (-1e-3, math.nan, math.inf),
     "warmup_steps": (-1,),
     "weight_decay": (-0.1,),
     "clip_norm": (-1.0,),
@@ -25,7 +25,7 @@ BAD = {
     "seed": (-1,),
     "validation_share": (-0.1, 1.0),
     "checkpoint_every": (0,),
-    "threads": (0, -2),
+    "threads": (0, -2, 100_000),
     "preset": ("huge", ""),
 }
 

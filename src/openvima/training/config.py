@@ -10,7 +10,7 @@ from openvima.policies.presets import PRESETS
 _BOUNDS: dict[str, tuple[float, float | None]] = {
     "steps": (1, None),
     "batch": (1, None),
-    "learning_rate": (0, None),
+    "learning_rate": (0, 1),
     "warmup_steps": (0, None),
     "weight_decay": (0, None),
     "clip_norm": (0, None),
@@ -18,12 +18,12 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "pretraining_steps": (0, None),
     "pretraining_scenes": (1, None),
     "pretraining_batch": (2, None),
-    "pretraining_learning_rate": (0, None),
+    "pretraining_learning_rate": (0, 1),
     "temperature": (1e-3, None),
-    "seed": (0, None),
+    "seed": (0, 2**63 - 1),
     "validation_share": (0, 0.9),
     "checkpoint_every": (1, None),
-    "threads": (1, None),
+    "threads": (1, 1024),
 }
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError
@@ -52,6 +53,7 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
         raise ConfigError(
             f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0."
         )
+    load_assets(config.assets)  # a wrong name is found before there is a run folder
     dataset = Dataset(config.data)
     run = RunFolder(config.out, _settings(config, dataset), force=config.force)
     with _threads(config.threads):
