@@ -14,6 +14,14 @@ def test_tasks_lists_prompt_tool_levels_and_steps(capsys):
     assert "sweep_without_exceeding" in shown and "spatula" in shown and "train L1 L2" in shown
 
 
+def test_tasks_breaks_no_placeholder_on_a_narrow_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["tasks"]) == 0
+    shown = capsys.readouterr().out
+    assert "{angle_in_degree}" in shown and "family" not in shown
+
+
 def test_tasks_speaks_json(capsys):
     assert main(["tasks", "--json"]) == 0
     tasks = {task["name"]: task for task in json.loads(capsys.readouterr().out)}

@@ -8,6 +8,9 @@ import tyro
 if TYPE_CHECKING:
     from openvima.tasks import TaskSpec
 
+FULL_WIDTH = 110  # columns of the terminal that all columns of the table need
+PROMPT_WIDTH = 20  # characters that the longest placeholder and a full stop need
+
 
 def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
     """List the tasks: what the robot is told, its tool, the levels, the steps.
@@ -34,12 +37,22 @@ def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int
     if not console.is_terminal:  # a file or a pipe takes long lines
         console = Console(width=150)
     table = Table(title=f"{len(specs)} tasks", show_lines=True)
-    for name in ("task", "family", "prompt", "tool", "levels", "steps"):
-        table.add_column(name, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
+    columns = ["task", "family", "prompt", "tool", "levels", "steps"]
+    if console.width < FULL_WIDTH:  # else words of the prompts would break
+        columns.remove("family")
+    for name in columns:
+        width = PROMPT_WIDTH if name == "prompt" else None
+        table.add_column(name, min_width=width, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
     for spec in specs:
-        family, steps = spec.family.replace("_", " "), f"{spec.oracle_max_steps} + 2"
-        # prompts hold braces and brackets that rich would read as markup
-        table.add_row(spec.name, family, Text(spec.template), spec.end_effector, " ".join(spec.levels), steps)
+        cells = {
+            "task": spec.name,
+            "family": spec.family.replace("_", " "),
+            "prompt": Text(spec.template),  # rich would read its braces and brackets as markup
+            "tool": spec.end_effector,
+            "levels": " ".join(spec.levels),
+            "steps": f"{spec.oracle_max_steps} + 2",
+        }
+        table.add_row(*(cells[name] for name in columns))
     console.print(table)
     console.print("steps: those that the oracle may take, and what a policy is given on top")
     return 0
