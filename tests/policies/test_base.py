@@ -23,7 +23,7 @@ def test_a_folder_without_checkpoint_is_refused(tmp_path):
 
 def test_without_torch_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match=r"pip install openvima\[train\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'openvima\[train\]'"):
         load_policy("untrained")
 
 

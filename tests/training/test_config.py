@@ -45,7 +45,7 @@ def test_all_problems_are_in_one_message() -> None:
 
 
 def test_defaults_and_extreme_but_possible_values_are_taken() -> None:
-    assert TrainingConfig(**FOLDERS).threads is None
+    assert TrainingConfig(**FOLDERS).threads == 1
     TrainingConfig(**FOLDERS, steps=1, batch=1, pretraining_steps=0, validation_share=0.0, threads=1)
 
 

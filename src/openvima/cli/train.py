@@ -17,7 +17,7 @@ def main(
     pretraining_steps: int | None = None,
     checkpoint_every: int | None = None,
     seed: int = 0,
-    threads: int | None = None,
+    threads: int = 1,
     assets: str = "procedural",
     force: bool = False,
 ) -> int:
@@ -32,14 +32,14 @@ def main(
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder for checkpoints, settings and metrics; `openvima evaluate --policy` takes it.
-        preset: Network sizes: nano (3 M parameters, points at objects) or nano-bins (the published bins).
+        preset: Network sizes: nano (2.5 M parameters, points at objects) or nano-bins (the published bins).
         steps: Steps of behaviour cloning; by default what the preset needs.
         batch: Demonstrations a step.
         learning_rate: Highest learning rate of cloning.
         pretraining_steps: Steps of matching prompt and scene; 0 leaves it out.
         checkpoint_every: Steps between checkpoints.
         seed: Decides weights, order of the data and augmentation.
-        threads: Threads to compute with; by default torch chooses. Equal numbers give equal weights.
+        threads: Threads to compute with; equal numbers give equal weights.
         assets: Asset pack of the demonstrations: "procedural", or the folder of the original one.
         force: Throw away a run with other settings that is in the run folder.
     """

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def nano() -> "VimaConfig":
-    """About 3 M parameters: small enough to train on two cores within minutes. It points."""
+    """2.5 M parameters: small enough to train on two cores within minutes. It points."""
     from openvima.policies.layers.conv_encoder import ConvConfig
     from openvima.policies.layers.decoder import DecoderConfig
     from openvima.policies.layers.object_encoder import ObjectEncoderConfig
@@ -25,7 +25,7 @@ def nano() -> "VimaConfig":
             crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
         ),
         text=TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256),
-        decoder=DecoderConfig(width=128, num_layers=3, num_self_heads=4, num_cross_heads=4),
+        decoder=DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4),
         prompt_object_width=128,
         action_width=64,
         vocabulary_size=vocabulary_size(),

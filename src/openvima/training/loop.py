@@ -186,9 +186,9 @@ def _settings(config: TrainingConfig, dataset: Dataset) -> dict[str, Any]:  # An
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def _threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(count or before)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
