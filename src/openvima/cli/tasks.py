@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from openvima.tasks import TaskSpec
 
 FULL_WIDTH = 110  # columns of the terminal that all columns of the table need
-PROMPT_WIDTH = 20  # characters that the longest placeholder and a full stop need
 
 
 def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
@@ -41,8 +40,9 @@ def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int
     if console.width < FULL_WIDTH:  # else words of the prompts would break
         columns.remove("family")
     for name in columns:
-        width = PROMPT_WIDTH if name == "prompt" else None
-        table.add_column(name, min_width=width, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
+        table.add_column(name, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
+        if name == "levels" and console.width < FULL_WIDTH:
+            table.columns[-1].max_width = len("train L1")  # in two lines, which prompts need anyway
     for spec in specs:
         cells = {
             "task": spec.name,
