@@ -213,6 +213,12 @@ def test_settings_are_checked_together(tmp_path: Path) -> None:
         generate(config(tmp_path, level="L7"))
 
 
+@pytest.mark.parametrize(("name", "value"), [("episodes", 10**19), ("start_seed", 2**63), ("workers", 10**6)])
+def test_numbers_beyond_all_reason_are_refused(name: str, value: int, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"is {value}; it must lie within"):
+        GenerateConfig(out=tmp_path, **{name: value})
+
+
 def test_every_episode_is_a_solved_one_as_the_environment_shows_it(whole: Path) -> None:
     dataset = Dataset(whole)
     assert len(dataset) == 6

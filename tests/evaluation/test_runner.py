@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from openvima.errors import ConfigError
+from openvima.errors import AssetError, ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 
 ORACLE = EvaluationConfig(
@@ -107,3 +107,9 @@ def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
     )
     evaluate(config, lambda *call: calls.append(call))
     assert calls == [(0, 3, ""), (2, 3, "oracle rotate L1"), (3, 3, "oracle rotate L1")]
+
+
+def test_an_unknown_asset_pack_is_named_before_anything_is_written(tmp_path):
+    with pytest.raises(AssetError, match="nosuch"):
+        evaluate(replace(ORACLE, out=tmp_path / "out", assets="nosuch"))
+    assert not (tmp_path / "out").exists()

@@ -17,6 +17,7 @@ from openvima.errors import ConfigError, DatasetError, OracleError, SamplingErro
 from openvima.files import write_whole
 from openvima.processes import in_processes
 from openvima.tasks import list_tasks, task_spec
+from openvima.tasks.seeding import MAX_SEED
 
 DOMAIN = "train"
 LARGEST_SHARD = 1000  # episodes, about 25 MB
@@ -26,6 +27,9 @@ SHARDS_PER_TASK = 8  # of a small data set, so that several workers have somethi
 # solves so few needs repair rather than patience.
 SEEDS_PER_EPISODE = 4
 SPARE_SEEDS = 12
+MAX_EPISODES = 10**7  # of a task, in one folder
+MAX_WORKERS = 1024
+MAX_FIRST_SEED = MAX_SEED - 10**9  # leaves room for the seeds of all shards
 
 Report = Callable[[int, int, str], None]
 
@@ -58,14 +62,14 @@ class GenerateConfig:
 
     def __post_init__(self) -> None:
         problems = [
-            f"{name} is {value}; it must be at least {least}."
-            for name, value, least in (
-                ("episodes", self.episodes, 1),
-                ("start_seed", self.start_seed, 0),
-                ("shard_size", self.shard_size, 1),
-                ("workers", self.workers, 1),
+            f"{name} is {value}; it must lie within {least} … {most}."
+            for name, value, least, most in (
+                ("episodes", self.episodes, 1, MAX_EPISODES),
+                ("seed", self.start_seed, 0, MAX_FIRST_SEED),
+                ("shard_size", self.shard_size, 1, MAX_EPISODES),
+                ("workers", self.workers, 1, MAX_WORKERS),
             )
-            if value is not None and value < least
+            if value is not None and not least <= value <= most
         ]
         if not self.tasks:
             problems.append("tasks is empty; name some, or 'all'.")

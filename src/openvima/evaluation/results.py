@@ -181,7 +181,7 @@ class Results:
             rows = tuple(_row_from_record(record) for record in content["rows"])
             return Results(rows, content["config"], content["versions"], content["policies"])
         except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-            raise DatasetError(f"{path} is damaged ({error!r}); evaluate again.") from error
+            raise DatasetError(f"{path} is damaged ({error!r}); evaluate again with --force.") from error
 
 
 def failure_kind(reason: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError
 from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.finish import finish, require_extra
@@ -58,6 +59,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
     if results is None:
+        load_assets(config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         outcomes = _play_all(config, batches, policies, found, report)
         results = Results(_rows(batches, outcomes), config.record(), found, policies)
