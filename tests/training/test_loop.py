@@ -61,6 +61,20 @@ def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_
     assert (whole.out / "config.yaml").read_bytes() == (torn.out / "config.yaml").read_bytes()
 
 
+def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
+    config = TrainingConfig(**settings)
+    train_until(config, 7)
+    with (config.out / "metrics.jsonl").open("a") as lines:
+        lines.write('{"stage": 1, "step": 3, "name": "2-cloning", "loss": 1.0}\n{"stage": 1, "st')
+    train(config)
+    steps = [
+        (line["stage"], line["step"])
+        for line in map(json.loads, (config.out / "metrics.jsonl").read_text().splitlines())
+        if "loss" in line
+    ]
+    assert steps == [(0, 2), (0, 4), (1, 2), (1, 4), (1, 6)]
+
+
 def test_a_finished_run_is_left_as_it_is(settings):
     config = TrainingConfig(**settings)
     train(config)
