@@ -13,12 +13,12 @@ from openvima.training.schedule import learning_rate_share, step_generator  # no
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 
 
-def test_pairs_show_training_objects_only(monkeypatch):
+def test_pairs_show_training_objects_in_textures_of_their_role_only(monkeypatch):
     shown = []
     original = pretrain._prompt_image
 
     def spy(placement, *rest):
-        shown.append((placement.object, placement.texture))
+        shown.append((placement.object, placement.texture, placement.fixed))
         return original(placement, *rest)
 
     monkeypatch.setattr(pretrain, "_prompt_image", spy)
@@ -26,10 +26,15 @@ def test_pairs_show_training_objects_only(monkeypatch):
     pools = [pool(task, "train") for task in TASKS]
     objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
     objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
-    textures = {name for entry in pools for name in (*entry.dragged_textures, *entry.base_textures)}
+    textures = {
+        (name, fixed)
+        for entry in pools
+        for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
+        for name in names
+    }
     assert len(pairs.looks) == len(shown)
-    assert {name for name, _ in shown} <= objects
-    assert {texture for _, texture in shown} <= textures
+    assert {name for name, _, _ in shown} <= objects
+    assert {(texture, fixed) for _, texture, fixed in shown} <= textures
 
 
 def test_pairs_follow_from_the_seed():

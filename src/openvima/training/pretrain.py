@@ -1,8 +1,8 @@
 """Pairs of one object, alone in a prompt image and among others in a scene, and the loss that matches them.
 
 Scenes are drawn for this purpose from the training partition: sampled like episodes of the tasks in the data,
-then every object gets another training texture and a prompt image of its own. Nothing of the test levels is
-ever shown.
+then every object gets another texture of its role in training and a prompt image of its own. Nothing of the
+test levels is ever shown.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ import torch
 from torch.nn import functional as F
 
 from openvima.catalog.packs import load_assets
-from openvima.catalog.partitions import pool
+from openvima.catalog.partitions import Pool, pool
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.perception import observe_prompt_image, see_objects
 from openvima.render.rasteriser import Rasteriser
@@ -67,7 +67,6 @@ def render_pairs(tasks: Sequence[str], *, num_scenes: int, seed: int, assets: st
         report: Called with scenes done, scenes in all, and a note.
     """
     rasteriser = Rasteriser(load_assets(assets))
-    textures = _training_textures(tasks)
     looks: dict[tuple[str, str], int] = {}
     columns: list[tuple] = []
     for number in range(num_scenes):
@@ -76,6 +75,7 @@ def render_pairs(tasks: Sequence[str], *, num_scenes: int, seed: int, assets: st
         episode = sample_episode(
             task, level="train", seed=episode_seed, domain=_DOMAIN, assets=rasteriser.assets
         )
+        textures = pool(task, "train")
         scene = _retextured(episode.problem.scene, textures, np.random.default_rng(episode_seed))
         columns += _pairs_of_scene(scene, _magnifications(episode), rasteriser, looks, number)
         if report and number % 50 == 0:
@@ -152,17 +152,18 @@ def colour_mixing(generator: torch.Generator) -> torch.Tensor:
     return (1 - share) * permutation + share * blending / blending.sum(1, keepdim=True)
 
 
-def _training_textures(tasks: Sequence[str]) -> tuple[str, ...]:
-    pools = [pool(task, "train") for task in tasks]
-    names = [name for entry in pools for name in (*entry.dragged_textures, *entry.base_textures)]
-    return tuple(dict.fromkeys(names))
+def _retextured(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
+    """Give every object a training texture; few different ones, so that many differ in shape alone.
 
-
-def _retextured(scene: Scene, textures: Sequence[str], rng: np.random.Generator) -> Scene:
-    """Give every object a training texture; few different ones, so that many differ in shape alone."""
-    palette = rng.choice(len(textures), size=max(2, len(scene.placements) - 1), replace=False)
-    chosen = rng.choice(palette, size=len(scene.placements))
-    placements = [replace(p, texture=textures[i]) for p, i in zip(scene.placements, chosen, strict=True)]
+    Movable objects get textures of dragged objects and fixed ones those of bases, so that the combinations
+    of level L2, in which the two sets are swapped, stay unseen.
+    """
+    size = max(2, len(scene.placements) - 1)
+    palettes = {
+        fixed: rng.choice(names, size=size, replace=False) if names else ()
+        for fixed, names in ((False, textures.dragged_textures), (True, textures.base_textures))
+    }
+    placements = [replace(p, texture=str(rng.choice(palettes[p.fixed]))) for p in scene.placements]
     return replace(scene, placements=tuple(placements))
 
 
