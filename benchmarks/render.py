@@ -64,7 +64,7 @@ def measure(assets: Assets, num_rounds: int) -> dict[str, dict[str, float]]:
     for title, names in SCENES.items():
         scene = random_scene(names, assets, rng)
         lone = Prompt("{a}", (("a", ObjectImage(scene.placements[0])),))
-        whole = Prompt("{s}", (("s", SceneImage(scene)),))
+        whole = Prompt("{s}", (("s", SceneImage.of(scene.placements)),))
         works[title, "observation"] = lambda scene=scene: rasteriser.scene(scene)
         works[title, "object image"] = lambda prompt=lone: rasteriser.prompt(prompt)
         works[title, "scene image"] = lambda prompt=whole: rasteriser.prompt(prompt)

@@ -151,7 +151,8 @@ def test_magnification_enlarges_the_whole_object(rasteriser) -> None:
 def test_a_scene_image_numbers_its_objects_from_2(rasteriser) -> None:
     scene = Scene((boxed(5, 0.4, -0.2), boxed(8, 0.6, 0.2, texture="blue")))
     prompt = Prompt(
-        "Make it {s}, not {a}.", (("s", SceneImage(scene)), ("a", ObjectImage(boxed(5, 0.4, 0.0))))
+        "Make it {s}, not {a}.",
+        (("s", SceneImage.of(scene.placements)), ("a", ObjectImage(boxed(5, 0.4, 0.0)))),
     )
     rendered = rasteriser.prompt(prompt)
     image = rendered.images["s"]

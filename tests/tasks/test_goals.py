@@ -5,9 +5,12 @@ from dataclasses import replace
 
 import pytest
 
+from openvima.errors import SceneError
 from openvima.scene import (
     AtPose,
     DistractorsApart,
+    EveryStepCounts,
+    InOrder,
     InZone,
     NeverTouches,
     Outcome,
@@ -35,9 +38,7 @@ def put_problem(**changes: object) -> Problem:
         (placed(BASE, 0.5, 0.2, fixed=True), placed(TARGET, 0.4, -0.2), placed(DISTRACTOR, 0.6, -0.4))
     )
     goal = AtPose(TARGET, BASE_POSE, Tolerance(0.1), relative_to=BASE)
-    problem = Problem(
-        scene, Prompt("", ()), (goal,), (DistractorsApart((DISTRACTOR,)),), goal_order="sequential"
-    )
+    problem = Problem(scene, Prompt("", ()), (goal,), (DistractorsApart((DISTRACTOR,)),))
     return replace(problem, **changes)
 
 
@@ -125,7 +126,7 @@ def test_in_any_order_all_goals_met_at_once_count() -> None:
 
 
 def test_in_sequence_only_the_first_open_goal_counts_in_a_step() -> None:
-    problem = two_goals(goal_order="sequential")
+    problem = two_goals(stages=(1, 1))
     both = problem.scene.with_poses({TARGET: BASE_POSE, SECOND: BASE_POSE})
     progress, outcome = advance(problem, begin(problem), both)
     assert progress.open_goals == (1,) and outcome == Outcome()
@@ -133,7 +134,7 @@ def test_in_sequence_only_the_first_open_goal_counts_in_a_step() -> None:
 
 
 def test_in_sequence_the_second_goal_does_not_count_first() -> None:
-    problem = two_goals(goal_order="sequential")
+    problem = two_goals(stages=(1, 1))
     progress, _ = advance(problem, begin(problem), problem.scene.with_poses({SECOND: BASE_POSE}))
     assert progress.open_goals == (0, 1)
 
@@ -146,10 +147,72 @@ def test_a_goal_once_met_stays_met_and_its_object_may_leave() -> None:
     assert progress == Progress(()) and outcome.success
 
 
-def test_in_sequence_only_the_awaited_object_must_stay() -> None:
+def test_objects_of_all_open_goals_must_stay() -> None:
     lost_second = {SECOND: Pose.planar(0.9, 0.0)}
-    assert judged(two_goals(goal_order="sequential"), lost_second) == Outcome()
+    assert judged(two_goals(stages=(1, 1)), lost_second).failure
     assert judged(two_goals(), lost_second).failure
+
+
+def test_the_goals_of_a_later_stage_are_tested_from_the_next_step_on() -> None:
+    back = (AtPose(TARGET, Pose.planar(0.4, -0.2), Tolerance(0.1)), AtPose(SECOND, BASE_POSE, Tolerance(0.1)))
+    problem = two_goals(goals=(*two_goals().goals, *back), stages=(2, 2))
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses({TARGET: BASE_POSE}))
+    assert progress.open_goals == (1, 2, 3)
+    home_and_there = problem.scene.with_poses({SECOND: BASE_POSE})
+    progress, outcome = advance(problem, progress, home_and_there)
+    assert progress.open_goals == (2, 3) and outcome == Outcome()
+    assert advance(problem, progress, home_and_there)[1].success
+
+
+def test_stages_have_to_add_up() -> None:
+    with pytest.raises(SceneError, match=r"stages \(1, 2\) must add up to the number of goals, 2"):
+        two_goals(stages=(1, 2))
+
+
+def test_distractors_tested_at_the_end_may_be_anywhere_before() -> None:
+    problem = two_goals(
+        scene=Scene((*two_goals().scene.placements, placed(9, 0.6, 0.4))),
+        constraints=(DistractorsApart((9,), at_end=True),),
+    )
+    progress, outcome = advance(
+        problem, begin(problem), problem.scene.with_poses({9: BASE_POSE, TARGET: BASE_POSE})
+    )
+    assert outcome == Outcome() and progress.open_goals == (1,)
+    done = {TARGET: BASE_POSE, SECOND: BASE_POSE}
+    assert advance(problem, progress, problem.scene.with_poses({**done, 9: BASE_POSE}))[1].failure
+    assert advance(problem, progress, problem.scene.with_poses(done))[1].success
+
+
+def test_a_goal_that_has_to_wait_must_not_come_first() -> None:
+    problem = two_goals(constraints=(InOrder((1,)),))
+    outcome = judged(problem, {SECOND: BASE_POSE})
+    assert outcome.failure
+    assert outcome.reason == "object 8 (red block) came before object 6 (red block)"
+    assert judged(problem, {TARGET: BASE_POSE}) == Outcome()
+    assert judged(problem, {TARGET: BASE_POSE, SECOND: BASE_POSE}).success
+
+
+def test_an_object_must_not_skip_a_place() -> None:
+    places = [Pose.planar(0.5, y) for y in (-0.3, 0.0, 0.3)]
+    goals = tuple(AtPose(TARGET, place, Tolerance(0.05)) for place in places)
+    problem = two_goals(goals=goals, stages=(1, 1, 1), constraints=(InOrder((1,)),))
+    assert judged(problem, {TARGET: places[1].moved(dy=0.049)}).failure
+    assert judged(problem, {TARGET: places[1].moved(dy=0.051)}) == Outcome()
+    assert judged(problem, {TARGET: places[2]}) == Outcome()  # the last goal may be visited early
+    assert judged(problem, {TARGET: places[0]}) == Outcome()
+
+
+def test_where_every_step_counts_the_first_idle_one_is_a_failure() -> None:
+    problem = two_goals(stages=(1, 1), constraints=(EveryStepCounts(),))
+    idle = judged(problem, {SECOND: BASE_POSE})
+    assert idle.failure and idle.reason == (
+        "the step did not bring object 6 (red block) to where it had to go next"
+    )
+    first = problem.scene.with_poses({TARGET: BASE_POSE})
+    progress, outcome = advance(problem, begin(problem), first)
+    assert outcome == Outcome()
+    assert advance(problem, progress, first)[1].failure
+    assert advance(problem, progress, first.with_poses({SECOND: BASE_POSE}))[1].success
 
 
 ZONE, LINE = Zone(0.5, 0.0, 0.1, 0.27), Zone(0.41, 0.0, 0.04, 0.34)
@@ -158,7 +221,7 @@ FRONT = {4: (0.65, -0.1), 5: (0.65, 0.0), 6: (0.65, 0.1), 7: (0.7, 0.1)}
 
 def sweep_problem(num_required: int) -> Problem:
     blocks = tuple(
-        Placement(object_id, "small block", "red", (0.03,) * 3, Pose.planar(x, y, z=0.014))
+        Placement(object_id, "small block", "red", (0.03, 0.03, 0.03), Pose.planar(x, y, z=0.014))
         for object_id, (x, y) in FRONT.items()
     )
     return Problem(

@@ -29,7 +29,7 @@ from openvima.tasks import (
     sample_episode,
     task_spec,
 )
-from openvima.tasks.sampling import CELL_M, is_in_hollow
+from openvima.tasks.table import CELL_M, is_in_hollow
 from strategies import seeds
 
 EVERYWHERE = [(task, level) for task in list_tasks() for level in task_spec(task).levels]

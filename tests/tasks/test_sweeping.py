@@ -17,7 +17,7 @@ def problem_with(
     swept: dict[int, tuple[float, float]], distractors: dict[int, tuple[float, float]]
 ) -> Problem:
     blocks = tuple(
-        Placement(object_id, "small block", "red", (0.03,) * 3, Pose.planar(x, y, z=0.014))
+        Placement(object_id, "small block", "red", (0.03, 0.03, 0.03), Pose.planar(x, y, z=0.014))
         for object_id, (x, y) in sorted((swept | distractors).items())
     )
     goals = tuple(InZone(object_id, ZONE) for object_id in swept)

@@ -208,7 +208,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         run.frames = []
         execution = run.world.execute(
             checked,
-            watch=run.watch if run.episode.problem.constraints else None,
+            watch=run.watch if goals.needs_watching(run.episode.problem) else None,
             record=run.record if self.realtime else None,
             frames_per_second=FRAMES_PER_SECOND,
         )

@@ -32,7 +32,6 @@ FLOOR_RGB = (255, 255, 255)
 SHEET_RGB = (51, 51, 51)
 SHEET_SIZE = (0.501, 0.999)  # m, x and y, about (0.5, 0)
 PROMPT_POSE = Pose.planar(0.5, 0.0, math.pi / 2)  # where prompt images show a lone object
-FIRST_PROMPT_SCENE_ID = 2  # after floor and sheet; prompt scenes have no arm
 LARGEST_ID = 254  # 255 means nothing
 
 Rgb = tuple[int, int, int]
@@ -137,12 +136,10 @@ class Rasteriser:
         return PromptImage(name, "object", _rgb_of(drawn), _segm_of(drawn), records)
 
     def _scene_image(self, name: str, fill: SceneImage) -> PromptImage:
-        bodies, records = [], []
-        for object_id, shown in enumerate(fill.scene.placements, start=FIRST_PROMPT_SCENE_ID):
-            bodies.append(self._drawable(shown, object_id=object_id))
-            records.append(ObjectRecord(object_id, shown.object, shown.texture))
-        drawn = self._draw(bodies, VIEWS, table=True)
-        return PromptImage(name, "scene", _rgb_of(drawn), _segm_of(drawn), tuple(records))
+        shown = fill.scene.placements
+        drawn = self._draw([self._drawable(placement) for placement in shown], VIEWS, table=True)
+        records = tuple(ObjectRecord(p.id, p.object, p.texture) for p in shown)
+        return PromptImage(name, "scene", _rgb_of(drawn), _segm_of(drawn), records)
 
     def _drawable(
         self,

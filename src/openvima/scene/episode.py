@@ -1,13 +1,11 @@
 """One sampled problem, and how it stands."""
 
 from dataclasses import dataclass
-from typing import Literal
 
-from openvima.scene.goal import Constraint, Goal
+from openvima.errors import SceneError
+from openvima.scene.goal import AtPose, Constraint, Goal
 from openvima.scene.prompt import Prompt
 from openvima.scene.scene import Scene
-
-GoalOrder = Literal["any", "sequential"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,17 +16,39 @@ class Problem:
         scene: All objects at their start, at rest.
         prompt: What the robot is told.
         goals: The conditions to fulfil, in the order in which the oracle works on them unless it may choose.
-        constraints: What must not happen.
-        goal_order: "any": every open goal is tested after each step; "sequential": only the first open one.
+        constraints: What must not happen, in the order in which they are tested.
+        stages: Sizes of groups of consecutive goals. After a step only goals of the first group with an open
+            one are tested, so a step never completes goals of two groups. Empty: all goals are one group.
         num_required: Exact number of goals to fulfil (more at once is a failure); None means all.
+        oracle_first: Moves that the oracle makes before it works on the goals, such as clearing a target. A
+            policy need not make them.
+        oracle_max_steps: Steps within which the oracle must be done; None: as registered for the task.
+
+    Raises:
+        SceneError: The stages do not add up to the number of goals.
     """
 
     scene: Scene
     prompt: Prompt
     goals: tuple[Goal, ...]
     constraints: tuple[Constraint, ...] = ()
-    goal_order: GoalOrder = "any"
+    stages: tuple[int, ...] = ()
     num_required: int | None = None
+    oracle_first: tuple[AtPose, ...] = ()
+    oracle_max_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.stages and sum(self.stages) != len(self.goals):
+            raise SceneError(f"stages {self.stages} must add up to the number of goals, {len(self.goals)}.")
+
+    def stage_of(self, goal_index: int) -> range:
+        """Indices of the goals that are tested together with one."""
+        first = 0
+        for size in self.stages or (len(self.goals),):
+            if goal_index < first + size:
+                return range(first, first + size)
+            first += size
+        raise SceneError(f"there is no goal {goal_index}; the problem has {len(self.goals)}.")
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,9 +116,14 @@ class DistractorsApart:
     Tested after every step, against all goals of the episode, met or not: a distractor within the goal's
     `tolerance.position_m` of its target, or the goal's object matching the distractor's pose within the
     goal's whole tolerance, is a violation.
+
+    Args:
+        object_ids: The distractors.
+        at_end: Test only when all goals are met.
     """
 
     object_ids: tuple[int, ...]
+    at_end: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,4 +156,20 @@ class NeverTouches:
         return None
 
 
-Constraint = DistractorsApart | ZoneKeptClear | NeverTouches
+@dataclass(frozen=True, slots=True)
+class InOrder:
+    """None of these goals is fulfilled while an earlier goal of the episode is open; tested after every step.
+
+    Args:
+        goals: Indices of the goals that have to wait.
+    """
+
+    goals: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EveryStepCounts:
+    """Each step has to fulfil a goal; the first one that does not ends the episode."""
+
+
+Constraint = DistractorsApart | ZoneKeptClear | NeverTouches | InOrder | EveryStepCounts

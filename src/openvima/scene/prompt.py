@@ -1,7 +1,8 @@
 """Multimodal prompts: text interleaved with images of objects and scenes."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from openvima.errors import PromptError
 from openvima.scene.scene import Placement, Scene
 
+FIRST_IMAGE_ID = 2  # after floor and sheet; the pictures of prompts show no arm
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
@@ -27,9 +29,20 @@ class ObjectImage:
 
 @dataclass(frozen=True, slots=True)
 class SceneImage:
-    """An image of several objects on the table, at the poses of `scene`; ids count from 2."""
+    """An image of several objects on the table, at the poses of `scene`.
+
+    The ids are those of the image alone and count from 2; `SceneImage.of` gives them.
+    """
 
     scene: Scene
+
+    @staticmethod
+    def of(placements: Sequence[Placement]) -> "SceneImage":
+        """Show these objects where they are, under the ids 2, 3, … in the order given.
+
+        An object keeps its id over several images if it has the same place in each list.
+        """
+        return SceneImage(Scene(tuple(replace(p, id=n) for n, p in enumerate(placements, FIRST_IMAGE_ID))))
 
 
 PromptFill = ObjectImage | SceneImage

@@ -3,8 +3,9 @@
 from openvima.tasks.goals import Progress, advance, begin, watch
 from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.registry import TaskSpec, list_tasks, register_task, task_spec
-from openvima.tasks.sampling import TableSampler, sample_episode
+from openvima.tasks.sampling import sample_episode
 from openvima.tasks.seeding import DOMAINS, stream
+from openvima.tasks.table import TableSampler
 
 __all__ = [
     "DOMAINS",

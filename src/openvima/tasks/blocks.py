@@ -6,7 +6,7 @@ from openvima.catalog import Vector3
 from openvima.errors import SamplingError
 from openvima.scene import Placement, Pose, Zone, block_points, in_workspace
 from openvima.tasks.footprints import Rectangle
-from openvima.tasks.sampling import TableSampler
+from openvima.tasks.table import TableSampler
 
 BLOCK = "small block"
 _COMPAT_TRIES = 10

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from openvima.scene import (
     AtPose,
     DistractorsApart,
+    EveryStepCounts,
+    InOrder,
     NeverTouches,
     Outcome,
     Problem,
@@ -32,6 +34,11 @@ class Progress:
 def begin(problem: Problem) -> Progress:
     """Return the progress at the start: all goals open, nothing broken."""
     return Progress(tuple(range(len(problem.goals))))
+
+
+def needs_watching(problem: Problem) -> bool:
+    """Whether something has to be watched while objects move, not only when they have come to rest."""
+    return any(isinstance(constraint, NeverTouches) for constraint in problem.constraints)
 
 
 def watch(problem: Problem, progress: Progress, scene: Scene) -> Progress:
@@ -72,19 +79,18 @@ def advance(problem: Problem, progress: Progress, scene: Scene) -> tuple[Progres
         The new progress and the outcome.
     """
     progress = watch(problem, progress, scene)
-    progress = replace(progress, open_goals=_still_open(problem, progress.open_goals, scene))
-    return progress, _outcome(problem, progress, scene)
+    open_before = progress.open_goals
+    progress = replace(progress, open_goals=_still_open(problem, open_before, scene))
+    return progress, _outcome(problem, open_before, progress, scene)
 
 
 def _still_open(problem: Problem, open_goals: tuple[int, ...], scene: Scene) -> tuple[int, ...]:
-    if problem.goal_order == "sequential":
-        met = bool(open_goals) and problem.goals[open_goals[0]].is_met(scene)
-        return open_goals[1:] if met else open_goals  # at most one a step
-    return tuple(index for index in open_goals if not problem.goals[index].is_met(scene))
+    stage = problem.stage_of(open_goals[0]) if open_goals else range(0)
+    return tuple(i for i in open_goals if i not in stage or not problem.goals[i].is_met(scene))
 
 
-def _outcome(problem: Problem, progress: Progress, scene: Scene) -> Outcome:
-    reason = progress.violation or _disturbance(problem, scene)
+def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> Outcome:
+    reason = progress.violation or _disturbance(problem, progress, scene)
     if reason:
         return Outcome(failure=True, reason=reason)
     num_met = len(problem.goals) - len(progress.open_goals)
@@ -95,19 +101,21 @@ def _outcome(problem: Problem, progress: Progress, scene: Scene) -> Outcome:
         )
     if num_met > num_required:
         return Outcome(failure=True, reason=f"{_count(num_met)} instead of {num_required}")
-    left = _left_workspace(problem, progress, scene)
-    return Outcome(failure=True, reason=left) if left else Outcome()
+    reason = _wasted_step(problem, open_before, progress, scene) or _left_workspace(problem, progress, scene)
+    return Outcome(failure=True, reason=reason) if reason else Outcome()
 
 
-def _disturbance(problem: Problem, scene: Scene) -> str:
+def _disturbance(problem: Problem, progress: Progress, scene: Scene) -> str:
     """One sentence on the first constraint that the scene at rest breaks, or nothing."""
     for constraint in problem.constraints:
+        reason = ""
         if isinstance(constraint, DistractorsApart):
-            reason = _distractor_too_near(problem, constraint.object_ids, scene)
+            if not (constraint.at_end and progress.open_goals):
+                reason = _distractor_too_near(problem, constraint.object_ids, scene)
         elif isinstance(constraint, ZoneKeptClear):
             reason = _distractor_in_zone(constraint, scene)
-        else:
-            reason = ""  # latched by `watch`
+        elif isinstance(constraint, InOrder):
+            reason = _out_of_order(problem, constraint, progress, scene)
         if reason:
             return reason
     return ""
@@ -133,9 +141,28 @@ def _distractor_in_zone(constraint: ZoneKeptClear, scene: Scene) -> str:
     return ""
 
 
+def _out_of_order(problem: Problem, constraint: InOrder, progress: Progress, scene: Scene) -> str:
+    for index in constraint.goals:
+        has_to_wait = bool(progress.open_goals) and progress.open_goals[0] < index
+        goal = problem.goals[index]
+        if has_to_wait and (index not in progress.open_goals or goal.is_met(scene)):
+            awaited = _called(scene, problem.goals[progress.open_goals[0]].object_id)
+            moved = _called(scene, goal.object_id)
+            return (
+                f"{moved} is where it belongs later" if moved == awaited else f"{moved} came before {awaited}"
+            )
+    return ""
+
+
+def _wasted_step(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> str:
+    if EveryStepCounts() not in problem.constraints or progress.open_goals != open_before:
+        return ""
+    awaited = problem.goals[open_before[0]].object_id
+    return f"the step did not bring {_called(scene, awaited)} to where it had to go next"
+
+
 def _left_workspace(problem: Problem, progress: Progress, scene: Scene) -> str:
-    awaited = progress.open_goals[:1] if problem.goal_order == "sequential" else progress.open_goals
-    for index in awaited:
+    for index in progress.open_goals:
         object_id = problem.goals[index].object_id
         if not in_workspace(scene[object_id].pose):
             return f"{_called(scene, object_id)} left the workspace"

@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 from openvima.catalog import Pool
 from openvima.errors import ConfigError, unknown_name
-from openvima.tasks.sampling import TableSampler
+from openvima.tasks.table import TableSampler
 
 Difficulty = Literal["easy", "medium", "hard"]
 """Published results are all at "easy"."""

@@ -39,7 +39,9 @@ def oracle_action(
     rng: np.random.Generator,
     compat: bool = False,
 ) -> OracleDecision:
-    """Return the next action towards the first open goal; of blocks to sweep, towards the easiest one's.
+    """Return the next action: what has to be done first, then towards the first open goal.
+
+    Of blocks to sweep the easiest one comes first.
 
     Args:
         problem: The episode's problem.
@@ -59,7 +61,8 @@ def oracle_action(
     goals = [problem.goals[index] for index in progress.open_goals]
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
-    goal = goals[0]
+    chores = [goal for goal in problem.oracle_first if not goal.is_met(scene)]
+    goal = (chores or goals)[0]
     if isinstance(goal, AtPose):
         point = visible_point(scene, goal.object_id, assets=assets, rng=rng if compat else None)
         action = _pick_and_place(goal, scene[goal.object_id].pose, point, compat=compat)

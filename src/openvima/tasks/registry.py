@@ -12,6 +12,7 @@ from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
 
+EXTRA_STEPS = 2  # that a policy is given beyond the oracle's
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
 
 
@@ -47,7 +48,7 @@ class TaskSpec:
     @property
     def max_steps(self) -> int:
         """Steps that a policy is given: two more than the oracle."""
-        return self.oracle_max_steps + 2
+        return self.oracle_max_steps + EXTRA_STEPS
 
     @property
     def options(self) -> dict[str, Any]:  # Any: options are of whatever type the task declares

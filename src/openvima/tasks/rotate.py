@@ -13,7 +13,7 @@ from openvima.errors import ConfigError
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Problem, Prompt, Tolerance
 from openvima.tasks.options import check_count, check_difficulty
 from openvima.tasks.registry import register_task
-from openvima.tasks.sampling import TableSampler
+from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Rotate the {dragged_obj} {angle_in_degree} degrees."
 ANGLES_DEG = (30, 60, 90, 120, 150)  # clockwise seen from above, i.e. negative yaw

@@ -24,7 +24,7 @@ from openvima.scene import (
 from openvima.tasks.blocks import scattered_blocks
 from openvima.tasks.options import check_difficulty
 from openvima.tasks.registry import register_task
-from openvima.tasks.sampling import TableSampler
+from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without exceeding {constraint}."
 MAGNIFICATION = 7  # of the small block in the prompt

@@ -10,7 +10,7 @@ Source:   VIMA paper, task list of the appendix, "Simple object manipulation".
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Problem, Prompt, Tolerance
 from openvima.tasks.options import check_count, textures_by_difficulty
 from openvima.tasks.registry import register_task
-from openvima.tasks.sampling import TableSampler
+from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Put the {dragged_obj_1} into the {base_obj}."
 TOLERANCE = Tolerance(position_m=0.1)
@@ -60,5 +60,4 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
         prompt=Prompt.parse(TEMPLATE, dragged_obj_1=ObjectImage(target), base_obj=ObjectImage(base)),
         goals=(AtPose(target.id, base.pose, TOLERANCE, relative_to=base.id),),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
-        goal_order="sequential",
     )

@@ -1,0 +1,352 @@
+"""A table being laid: free places, sizes, and who stands in whose way."""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from openvima.catalog import Assets, Pool, Vector3, object_spec
+from openvima.errors import SamplingError
+from openvima.scene import (
+    FIRST_OBJECT_ID,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    EndEffector,
+    Placement,
+    Pose,
+    Scene,
+)
+
+T = TypeVar("T")
+Reject = Callable[[Placement], bool]
+
+CELL_M = 0.003125  # side of a raster cell; the benchmark's resolution for placing and picking
+NO_SCALE = (1.0, 1.0, 1.0)
+HOLLOW_OBJECTS = ("frame", "square")  # bases whose inside looks free from above
+_CROWDING_MARGIN_M = 0.01
+_FOOTPRINT_TRIES = 20
+
+
+def never(placement: Placement) -> bool:
+    """Accept every place: the default of `reject`."""
+    return False
+
+
+class TableSampler:
+    """A table being laid: draws objects and places from one generator and remembers what stands where.
+
+    Objects of the pool's base list are fixed, all others can be moved.
+
+    Args:
+        rng: Every draw comes from here.
+        pool: What the task may draw from.
+        assets: Where shapes come from.
+        end_effector: Tool of the arm; it decides the first object's id.
+        compat: Sample as the original benchmark does.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        pool: Pool,
+        *,
+        assets: Assets,
+        end_effector: EndEffector = "suction",
+        compat: bool = False,
+    ) -> None:
+        from openvima.render.labels import empty_labels  # compiled code: not for a mere list of tasks
+
+        self.rng = rng
+        self.pool = pool
+        self.compat = compat
+        self.placements: list[Placement] = []
+        self._assets = assets
+        self._end_effector: EndEffector = end_effector
+        self._labels, self._heights = empty_labels()
+
+    def choose(self, options: Sequence[T]) -> T:
+        """Draw one of several things with equal probability."""
+        return options[int(self.rng.integers(len(options)))]
+
+    def sample_size(self, object_name: str) -> Vector3:
+        """Draw a nominal size in metres, each axis on its own."""
+        spec = object_spec(object_name)
+        x, y, z = self.rng.uniform(spec.size_min, spec.size_max).tolist()
+        return (x, y, z)
+
+    def place(
+        self,
+        what: str,
+        draw: Callable[[], tuple[str, str]],
+        *,
+        count: int = 1,
+        tries: int = 10,
+        size: Vector3 | None = None,
+        scale: Vector3 = NO_SCALE,
+        apart_m: float = 0.0,
+        reject: Reject = never,
+    ) -> list[Placement]:
+        """Put objects on free places of the table, at any heading.
+
+        Args:
+            what: Role of the objects, for the message of an error.
+            draw: Draws an object's name and texture, anew in each try.
+            count: How many objects to place.
+            tries: Tries for all of them together.
+            size: Nominal size in metres; by default drawn for each object.
+            scale: Factor per axis on top of the size.
+            apart_m: Keep the link frames this far from those of all other objects; not with `compat`.
+            reject: Whether a place that was drawn will not do.
+
+        Returns:
+            The objects placed.
+
+        Raises:
+            SamplingError: The tries were used up.
+        """
+        placed: list[Placement] = []
+        for _ in range(tries):
+            if len(placed) == count:
+                break
+            object_name, texture = draw()
+            drawn_size = size or self.sample_size(object_name)
+            pose = self.free_pose(object_name, drawn_size)
+            if pose is None:
+                continue
+            new = self._at_rest(object_name, texture, drawn_size, pose, scale)
+            if not self._is_crowded(new, apart_m) and not reject(new):
+                placed.append(self._put(new))
+        if len(placed) < count:
+            raise SamplingError(f"only {len(placed)} of {count} × {what} found a place in {tries} tries.")
+        return placed
+
+    def place_one(
+        self,
+        what: str,
+        draw: Callable[[], tuple[str, str]],
+        *,
+        tries: int = 10,
+        size: Vector3 | None = None,
+        scale: Vector3 = NO_SCALE,
+        apart_m: float = 0.0,
+        reject: Reject = never,
+    ) -> Placement:
+        """Put one object on a free place; see `place`."""
+        placed = self.place(what, draw, tries=tries, size=size, scale=scale, apart_m=apart_m, reject=reject)
+        return placed[0]
+
+    def find_place(
+        self,
+        what: str,
+        placement: Placement,
+        *,
+        tries: int = 10,
+        apart_m: float = 0.0,
+        reject: Reject = never,
+    ) -> Placement:
+        """Look for another free place of an object, and a new heading; the table stays as it is.
+
+        Where the object stands now is not free, as if another one of its kind stood there.
+
+        Args:
+            what: Role of the object, for the message of an error.
+            placement: The object.
+            tries: How often to draw a place.
+            apart_m: As for `place`.
+            reject: As for `place`.
+
+        Returns:
+            The object at the place found.
+
+        Raises:
+            SamplingError: The tries were used up.
+        """
+        for _ in range(tries):
+            pose = self.free_pose(placement.object, placement.size)
+            found = pose and placement.at(Pose((pose.x, pose.y, placement.pose.z), pose.quaternion))
+            if found is not None and not self._is_crowded(found, apart_m) and not reject(found):
+                return found
+        raise SamplingError(f"{what} found no other place in {tries} tries.")
+
+    def move(self, placement: Placement, place: Placement) -> Placement:
+        """Take an object of the table to another place, as `find_place` returned it; returns it there."""
+        self.placements[self.placements.index(placement)] = place
+        self._labels, self._heights = self._stamped(self.placements)
+        return place
+
+    def add(
+        self,
+        object_name: str,
+        texture: str,
+        *,
+        size: Vector3,
+        pose: Pose,
+        fixed: bool | None = None,
+        scale: Vector3 = NO_SCALE,
+        z: float | None = None,
+        on_top: bool = False,
+    ) -> Placement:
+        """Put an object at a given pose.
+
+        Args:
+            object_name: Display name in the catalogue.
+            texture: Display name in the catalogue.
+            size: Nominal size in metres.
+            pose: Where it goes; its height does not count.
+            fixed: Whether it is welded to the table; by default if the pool lists it as a base.
+            scale: Factor per axis on top of the size.
+            z: Height of its link frame in metres; by default that of rest on the table (with `compat`: half
+                the nominal height).
+            on_top: It lies on whatever is already there, instead of on the table.
+
+        Returns:
+            The object.
+        """
+        new = self._at_rest(object_name, texture, size, pose, scale, fixed)
+        if on_top:
+            height_m = self._height_below(new)
+            new = new.at(new.pose.moved(dz=height_m)) if height_m else new
+        return self._put(new if z is None else new.at(Pose((pose.x, pose.y, z), pose.quaternion)))
+
+    def blank(self) -> "TableSampler":
+        """Return an empty table for a scene of the prompt, with the same generator, pool and assets."""
+        return TableSampler(
+            self.rng, self.pool, assets=self._assets, end_effector=self._end_effector, compat=self.compat
+        )
+
+    def free_pose(self, object_name: str, size: Vector3) -> Pose | None:
+        """Draw a place whose surroundings are free, and a heading.
+
+        A square window around the place, as wide as the diagonal of the nominal footprint, holds no object
+        and stays clear of the table's edge. What is drawn of some bases is larger than their nominal
+        footprint; for these the cells that they would cover must be free as well (not with `compat`).
+
+        Args:
+            object_name: Display name in the catalogue.
+            size: Nominal size in metres.
+
+        Returns:
+            The pose, its height 0, or None if no place is left.
+        """
+        from openvima.tasks.kernels import mark_free_centres, nth_centre
+
+        side = round(float(np.hypot(size[0], size[1])) / CELL_M)
+        centres = np.empty(self._labels.shape, np.uint8)
+        counts, run = np.empty(len(centres), np.int32), np.empty(len(centres.T), np.int32)
+        num_free = mark_free_centres(self._labels, side, run, centres, counts)
+        if num_free == 0:
+            return None
+        is_larger = not self.compat and _reach_m(self._assets, object_name, size) > (side / 2 + 1) * CELL_M
+        for _ in range(_FOOTPRINT_TRIES if is_larger else 1):
+            row, column = nth_centre(centres, counts, int(self.rng.integers(num_free)))
+            pose = Pose.planar(
+                WORKSPACE_LOW[0] + column * CELL_M,
+                WORKSPACE_LOW[1] + row * CELL_M,
+                self.rng.uniform(0.0, 2 * np.pi),
+            )
+            if not is_larger or self._footprint_is_free(object_name, size, pose):
+                return pose
+        return None
+
+    def scene(self) -> Scene:
+        """Return everything placed so far."""
+        return Scene(tuple(self.placements), self._end_effector)
+
+    def _at_rest(
+        self,
+        object_name: str,
+        texture: str,
+        size: Vector3,
+        pose: Pose,
+        scale: Vector3,
+        fixed: bool | None = None,
+    ) -> Placement:
+        hover_z = size[2] * scale[2] / 2
+        z = hover_z if self.compat else self._assets.geometry(object_name, size, scale).rest_z_m
+        return Placement(
+            id=FIRST_OBJECT_ID[self._end_effector] + len(self.placements),
+            object=object_name,
+            texture=texture,
+            size=size,
+            pose=Pose((pose.x, pose.y, z), pose.quaternion),
+            fixed=object_name in self.pool.base_objects if fixed is None else fixed,
+            scale=scale,
+        )
+
+    def _put(self, placement: Placement) -> Placement:
+        self._stamp(self._labels, self._heights, placement)
+        self.placements.append(placement)
+        return placement
+
+    def _stamp(self, labels: np.ndarray, heights: np.ndarray, placement: Placement) -> None:
+        from openvima.render.labels import stamp
+
+        stamp(labels, heights, placement, self._assets)
+
+    def _stamped(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
+        """Labels and heights of a table with these objects."""
+        from openvima.render.labels import empty_labels
+
+        labels, heights = empty_labels()
+        for placement in placements:
+            self._stamp(labels, heights, placement)
+        return labels, heights
+
+    def _covered(self, placement: Placement) -> np.ndarray:
+        """Cells that an object covers, wherever its link frame's height puts it; shape (320, 160), bool."""
+        geometry = self._assets.geometry(placement.object, placement.size, placement.scale)
+        pose = placement.pose
+        raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
+        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
+
+    def _height_below(self, placement: Placement) -> float:
+        """Height in metres of the highest point of the table's objects under an object."""
+        return float(self._heights[self._covered(placement)].max(initial=0.0))
+
+    def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
+        geometry = self._assets.geometry(object_name, size)
+        corners = pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
+        if (corners < WORKSPACE_LOW).any() or (corners > WORKSPACE_HIGH).any():
+            return False
+        if not self.placements:
+            return True
+        return not self._labels[self._covered(Placement(1, object_name, "", size, pose))].any()
+
+    def _is_crowded(self, new: Placement, apart_m: float) -> bool:
+        for other in self.placements:
+            if other.id == new.id:
+                continue
+            if not self.compat and new.pose.planar_distance(other.pose) < apart_m:
+                return True
+            base, movable = (new, other) if new.fixed else (other, new)
+            if base.fixed and not movable.fixed and is_in_hollow(movable, base):
+                return True
+        return False
+
+
+def is_in_hollow(placement: Placement, base: Placement) -> bool:
+    """Whether an object counts as inside a frame or a square, whose inside looks free from above.
+
+    Args:
+        placement: The object; its nominal size and its place count.
+        base: The base; only frame and square are hollow.
+    """
+    return base.object in HOLLOW_OBJECTS and is_in_the_way(placement, base)
+
+
+def is_in_the_way(placement: Placement, other: Placement) -> bool:
+    """Whether two objects count as crowding each other, by their nominal sizes and places alone.
+
+    Source: the benchmark's test; its square windows are not turned with the objects.
+    """
+    reach = max((placement.size[axis] + other.size[axis]) / 2 + _CROWDING_MARGIN_M for axis in (0, 1))
+    return placement.pose.planar_distance(other.pose) <= reach
+
+
+@functools.lru_cache(maxsize=1024)
+def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
+    """Largest planar distance of anything drawn of an object from its link frame, in metres."""
+    vertices = assets.geometry(object_name, size).visual.vertices
+    return float(np.hypot(vertices[..., 0], vertices[..., 1]).max())
