@@ -51,16 +51,21 @@ def wooden() -> np.ndarray:
 
 
 def granite() -> np.ndarray:
-    """Pale grey-green stone, mottled, with irregular dark specks."""
+    """Pale grey-green stone, softly mottled, with irregular specks that gather in clouds."""
     shape = (_SIDE_PX, _SIDE_PX)
-    mottle = layered_noise(shape, (16, 16), seed=41, num_layers=3)
-    cloud = 0.22 * layered_noise(shape, (12, 12), seed=45, num_layers=1)
-    specks = layered_noise(shape, (64, 48), seed=42, num_layers=2) + cloud
-    dark = layered_noise(shape, (48, 40), seed=43, num_layers=2) + cloud
-    stone = np.array((197.0, 210.0, 204.0)) + 44 * (mottle[..., None] - 0.5)
-    stone = np.where(specks[..., None] > 0.75, (136.0, 147.0, 150.0), stone)
-    stone = np.where(dark[..., None] > 0.86, (62.0, 58.0, 74.0), stone)
-    return _to_image(stone + 10 * hashed(*np.indices(shape), seed=44)[..., None] - 5)
+    cloud = layered_noise(shape, (5, 5), seed=45, num_layers=2) - 0.5
+    mottle = layered_noise(shape, (20, 24), seed=41, num_layers=3) - 0.5
+    stone = np.array((200.0, 213.0, 207.0)) + 40 * mottle[..., None] + 22 * cloud[..., None]
+    # Colour, cells of the noise, the value from which it shows, and over how much of it that fades in.
+    for seed, colour, cells, start, fade, strength in (
+        (47, (150, 165, 168), (26, 30), 0.60, 0.16, 0.9),
+        (42, (124, 136, 143), (58, 50), 0.60, 0.14, 0.9),
+        (43, (58, 54, 72), (72, 60), 0.70, 0.12, 1.0),
+    ):
+        specks = layered_noise(shape, cells, seed=seed, num_layers=2) + 0.25 * cloud
+        share = strength * np.clip((specks - start) / fade, 0, 1)
+        stone += (np.array(colour, dtype=np.float64) - stone) * share[..., None]
+    return _to_image(stone + 12 * hashed(*np.indices(shape), seed=44)[..., None] - 6)
 
 
 def plastic() -> np.ndarray:

@@ -39,6 +39,7 @@ _RAINBOW = (
     (149, (254, 0, 0)),
 )
 _PAISLEY_PX, _PAISLEY_GRID = 256, 6
+_PAISLEY_THINNEST = 6  # radius in sixteenths of a pixel: thinner tips would break into single pixels
 _PAISLEY_WHITE: Colour = (254, 247, 240)
 
 
@@ -144,13 +145,14 @@ def _paint_drop(canvas: np.ndarray, index: int) -> None:
 def _paint_tapered(
     canvas: np.ndarray, centre: tuple[int, int], heading: int, bend: int, radius: int, value: bool
 ) -> None:
-    """Paint discs that get smaller along a path that curls."""
+    """Paint discs that get smaller along a path that curls more and more."""
     x, y = centre
-    steps = 14
+    steps = 20
     for step in range(steps):
-        _paint_disc(canvas, (x, y), radius * (steps - step) // steps, value)
-        dx, dy = _HEADINGS[(heading + bend * (step // 3)) % 16]
-        stride = radius // 6
+        size = radius * (steps - step) // steps
+        _paint_disc(canvas, (x, y), max(size, _PAISLEY_THINNEST) if value else size, value)
+        dx, dy = _HEADINGS[(heading + bend * (step * step // 56)) % 16]
+        stride = radius * 3 // 20
         x, y = x + dx * stride // 1000, y + dy * stride // 1000
 
 
