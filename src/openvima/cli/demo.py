@@ -11,7 +11,7 @@ def main(
     *,
     out: Path = Path("demo.mp4"),
     seed: int = 0,
-    level: str = "train",
+    level: str | None = None,
     policy: str = "oracle",
     assets: str = "procedural",
 ) -> int:
@@ -23,7 +23,7 @@ def main(
         task: Name of the task; `openvima tasks` lists them.
         out: MP4 file to write.
         seed: Number of the episode.
-        level: train, L1, L2, L3 or L4.
+        level: train, L1, L2, L3 or L4; by default the task's first.
         policy: oracle, random, untrained, or the folder of a training run.
         assets: procedural, or the folder of a checkout of the original benchmark.
 
@@ -33,7 +33,7 @@ def main(
     from openvima.errors import ConfigError
     from openvima.tasks import task_spec
 
-    task_spec(task).pool(level)  # before what takes a second to load
+    level = task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
     from openvima.env.tabletop import TabletopEnv

@@ -1,6 +1,7 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any  # observations and infos are nested dictionaries
@@ -11,7 +12,8 @@ from gymnasium import spaces
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
-from openvima.errors import ConfigError, EpisodeError
+from openvima.env.object_names import ObjectNames
+from openvima.errors import ConfigError, EpisodeError, SamplingError
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Image, Rasteriser
 from openvima.scene import (
@@ -115,7 +117,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     Args:
         task: Name of the task, such as "rotate".
-        level: "train", "L1", "L2", "L3" or "L4": which objects, textures and tasks may occur.
+        level: "train", "L1", "L2", "L3" or "L4": which objects, textures and tasks may occur. By default
+            "train", or the only level of a task held out for L4.
         domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
         compat: Follow the original benchmark also where it is odd: objects hover at the start, ids follow
@@ -128,6 +131,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
+        ConfigError: The domain, the render mode, or an option of the task or its value, is not allowed.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
@@ -136,7 +140,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self,
         task: str,
         *,
-        level: str = "train",
+        level: str | None = None,
         domain: str = "user",
         assets: str | Path | Assets = "procedural",
         compat: bool = False,
@@ -145,9 +149,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         render_mode: str | None = None,
         **task_options: Any,
     ) -> None:
-        _check(task, level, render_mode)
+        _check_render_mode(render_mode)
         self.task = task
-        self.level = level
+        self.level = task_spec(task).checked_level(level)
+        stream(domain, task, self.level, 0, purpose="scene")  # refuses an unknown domain
         self.domain = domain
         self.assets = load_assets(assets)
         self.compat = compat
@@ -159,6 +164,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self.action_space = _action_space()
         self._rasteriser = Rasteriser(self.assets)
         self._run: _Run | None = None
+        if task_options:
+            with suppress(SamplingError):  # bad luck in this draw says nothing about the next
+                self._sample(0)  # only the task itself knows which values it takes
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -337,7 +345,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "domain": episode.domain,
             "seed": episode.seed,
             "end_effector": problem.scene.end_effector,
-            "objects": {p.id: {"object": p.object, "texture": p.texture} for p in problem.scene.placements},
+            "objects": ObjectNames(problem.scene),
         }
 
 
@@ -357,8 +365,7 @@ def _action_space() -> spaces.Dict:
     )
 
 
-def _check(task: str, level: str, render_mode: str | None) -> None:
-    task_spec(task).pool(level)
+def _check_render_mode(render_mode: str | None) -> None:
     modes = TabletopEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")

@@ -56,18 +56,26 @@ class TaskSpec:
         parameters = inspect.signature(self.sample).parameters.values()
         return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
-    def pool(self, level: str) -> Pool:
-        """Return what the task may draw from at a level.
+    def checked_level(self, level: str | None) -> Level:
+        """Return the level, or the first one of the task for None.
 
         Raises:
             LevelError: There is no such level, or the task is not defined there.
         """
-        for known, entry in self.pools.items():
-            if known == level:
-                return entry
+        for known in self.levels:
+            if level is None or level == known:
+                return known
         if level not in LEVELS:
-            raise LevelError(unknown_name("level", level, LEVELS))
+            raise LevelError(unknown_name("level", str(level), LEVELS))
         raise LevelError(f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}.")
+
+    def pool(self, level: str | None = None) -> Pool:
+        """Return what the task may draw from at a level, by default at its first.
+
+        Raises:
+            LevelError: There is no such level, or the task is not defined there.
+        """
+        return self.pools[self.checked_level(level)]
 
 
 _TASKS: dict[str, TaskSpec] = {}

@@ -14,7 +14,7 @@ MAX_REDRAWS = 100
 def sample_episode(
     task: str,
     *,
-    level: str = "train",
+    level: str | None = None,
     seed: int,
     domain: str = "user",
     assets: "str | Assets" = "procedural",
@@ -25,7 +25,7 @@ def sample_episode(
 
     Args:
         task: Name of the task.
-        level: "train" or "L1" to "L4".
+        level: "train" or "L1" to "L4"; by default "train", or the only level of a task held out for L4.
         seed: The episode's number, 0 … 2⁶³ − 1.
         domain: "train", "eval" or "user"; equal seeds of two domains give unrelated episodes.
         assets: Asset pack: "procedural", a folder with the original pack, or a pack already loaded.
@@ -49,9 +49,9 @@ def sample_episode(
     from openvima.catalog.packs import load_assets
 
     spec = task_spec(task)
-    pool, number = spec.pool(level), checked_seed(seed)
+    level, number = spec.checked_level(level), checked_seed(seed)
     _check_options(spec, options)
-    pack = load_assets(assets)
+    pool, pack = spec.pool(level), load_assets(assets)
     reason = SamplingError()
     for attempt in range(MAX_REDRAWS + 1):
         rng = stream(domain, task, level, number, "scene", attempt=attempt)
