@@ -1,0 +1,51 @@
+"""`sweep_without_touching`: sweep some of the small blocks into a U-shaped area, around a line at its mouth.
+
+Scene:    one to three blocks to sweep, as many of another texture, the area open towards the blocks, a line
+          across its mouth.
+Prompt:   "Sweep two {swept_obj} into {bounds} without touching {constraint}."
+Success:  exactly the asked number lies in the area, while no such block ever touched the line and no other
+          block is there. "Any" means one, "all" all of one texture. What bounds the area is drawn, not solid.
+Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction".
+"""
+
+from openvima.scene import Problem, Zone
+from openvima.tasks.registry import register_task
+from openvima.tasks.sweep_table import draw_cast, lay_flat, sweep_problem
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without touching {constraint}."
+AREA_X = 0.39  # m, centre of the area
+AREA_SCALE = (0.86, 1.5)
+LINE_X = 0.496  # m, just outside the mouth
+LINE_SCALE = {"easy": (0.75, 1.0), "medium": (1.35, 1.0), "hard": (1.85, 1.0)}
+DISTRACTOR_SPREAD_M = 0.18
+
+
+@register_task(
+    "sweep_without_touching",
+    family="constraint_satisfaction",
+    template=TEMPLATE,
+    end_effector="spatula",
+    oracle_max_steps=14,
+)
+def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        difficulty: "easy": the line leaves a gap at either end of the mouth; "medium" and "hard": it is
+            longer than the mouth is wide, and there are more often two or three blocks.
+    """
+    cast = draw_cast(table, difficulty)
+    bounds = lay_flat(table, table.pool.base_objects[0], cast.bounds_texture, x=AREA_X, scale=AREA_SCALE)
+    line = lay_flat(table, "line", cast.line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
+    return sweep_problem(
+        table,
+        cast,
+        template=TEMPLATE,
+        bounds=bounds,
+        line=line,
+        zone=Zone(AREA_X, 0.0, *bounds.size[:2]),
+        zone_marker=bounds,
+        distractor_spread_m=DISTRACTOR_SPREAD_M,
+    )
