@@ -1,0 +1,93 @@
+"""Gathering: put all objects that share something with a base into it, and leave the others where they are."""
+
+from collections.abc import Sequence
+
+from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Problem, Prompt, Tolerance
+from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.table import TableSampler, is_in_the_way
+
+TOLERANCE_M, BOWL_TOLERANCE_M = 0.125, 0.0875
+NUM_DRAGGED = {"easy": 2, "medium": 2, "hard": 3}
+NUM_DISTRACTORS = {"easy": 1, "medium": 2, "hard": 3}
+_TRIES = 20  # for all objects together
+_SPARE_STEPS = 2
+
+
+def object_counts(
+    difficulty: str, num_dragged: int | None, num_distractors: int | None
+) -> tuple[int, int]:
+    """Return how many objects go into the base and how many stay out.
+
+    Args:
+        difficulty: Gives the numbers that are None.
+        num_dragged: 1 … 3.
+        num_distractors: 0 … 3.
+
+    Raises:
+        ConfigError: With what is allowed.
+    """
+    check_difficulty(difficulty)
+    num_dragged = NUM_DRAGGED[difficulty] if num_dragged is None else num_dragged
+    num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
+    check_count("num_dragged", num_dragged, low=1, high=3)
+    check_count("num_distractors", num_distractors, high=3)
+    return num_dragged, num_distractors
+
+
+def gathering_problem(
+    table: TableSampler,
+    template: str,
+    *,
+    base: Placement,
+    dragged_looks: tuple[Sequence[str], Sequence[str]],
+    distractor_objects: Sequence[str],
+    counts: tuple[int, int],
+    after_bowl: bool | None,
+) -> Problem:
+    """Lay the objects around a base and ask for those that belong into it.
+
+    A distractor has a texture of the pool's dragged ones that no dragged object has.
+
+    Args:
+        table: The table; the base stands on it.
+        template: The prompt with the slot `base_obj`.
+        base: Where the dragged objects belong.
+        dragged_looks: Shapes and textures of the dragged objects, each drawn on its own.
+        distractor_objects: Shapes of distractors.
+        counts: Number of dragged objects and of distractors.
+        after_bowl: Whether the bowl's smaller tolerance holds whatever the base. The original keeps it from
+            the first bowl on for as long as an environment lives; so does None with `compat`, where bowls occur.
+
+    Returns:
+        The problem; not with `compat`, nothing in it is decided at the start.
+    """
+    if after_bowl is None:
+        after_bowl = table.compat and "bowl" in table.pool.base_objects
+    tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
+    num_dragged, num_distractors = counts
+    dragged: list[Placement] = []
+
+    def draw() -> tuple[str, str]:
+        dragged[:] = table.placements[1 : 1 + num_dragged]
+        if len(dragged) < num_dragged:
+            objects, textures = dragged_looks
+        else:
+            used = {placement.texture for placement in dragged}
+            objects = distractor_objects
+            textures = [texture for texture in table.pool.dragged_textures if texture not in used]
+        return table.choose(objects), table.choose(textures)
+
+    def reject(new: Placement) -> bool:
+        if is_in_the_way(new, base):
+            return True
+        near = (base, *dragged) if len(dragged) == num_dragged else (base,)
+        return not table.compat and any(tolerance.accepts(new.pose, other.pose) for other in near)
+
+    placed = table.place("object", draw, count=sum(counts), tries=_TRIES, reject=reject)
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(template, base_obj=ObjectImage(base)),
+        goals=tuple(AtPose(p.id, base.pose, tolerance, relative_to=base.id) for p in placed[:num_dragged]),
+        constraints=(DistractorsApart(tuple(p.id for p in placed[num_dragged:])),),
+        oracle_max_steps=num_dragged + _SPARE_STEPS,
+    )

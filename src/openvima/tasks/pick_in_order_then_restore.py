@@ -1,0 +1,95 @@
+"""`pick_in_order_then_restore`: carry an object from base to base in the pictured order, then back home.
+
+Scene:    six bases of one shape, each of another texture, in two rows; an object lies in one of them.
+Prompt:   "Put {dragged_obj} into {base_obj_1} then {base_obj_2}. Finally restore it into its original
+          container."
+Success:  object within 0.05 m of the origin of each pictured base in turn, then of the base that it came from;
+          it must not be in a pictured base before its turn.
+Source:   VIMA paper, task list of the appendix, "Visual memory".
+"""
+
+from openvima.scene import (
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    AtPose,
+    InOrder,
+    ObjectImage,
+    Placement,
+    Pose,
+    Problem,
+    Prompt,
+    Tolerance,
+)
+from openvima.tasks.options import check_difficulty
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Put {{dragged_obj}} into {targets}. Finally restore it into its original container."
+TOLERANCE = Tolerance(position_m=0.05)
+NUM_ROWS, NUM_COLUMNS = 2, 3
+NUM_TARGETS = {"easy": 2, "medium": 2, "hard": 3}
+_DEEP_BASES = ("bowl", "pallet")  # over which the original's object hovers higher
+_SPARE_STEPS = 2
+
+
+def template(num_targets: int) -> str:
+    """Return the prompt with its slots for that many pictured bases."""
+    return TEMPLATE.format(targets=" then ".join(f"{{base_obj_{n + 1}}}" for n in range(num_targets)))
+
+
+@register_task(
+    "pick_in_order_then_restore", family="require_memory", template=template(2), oracle_max_steps=4
+)
+def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "easy") -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        same_bases: Whether all bases have one shape and size, so that only textures tell them apart.
+        difficulty: "easy" and "medium" ask for two bases, "hard" for three.
+    """
+    check_difficulty(difficulty)
+    pool, num_targets = table.pool, NUM_TARGETS[difficulty]
+    centres = [_cell_centre(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
+    centres = [centres[index] for index in table.rng.permutation(len(centres))]
+    name, texture = table.choose(pool.dragged_objects), table.choose(pool.dragged_textures)
+    shapes = [table.choose(pool.base_objects) for _ in centres[: 1 if same_bases else None]]
+    shapes *= len(centres) // len(shapes)
+    textures = table.rng.choice(pool.base_textures, size=len(centres), replace=False).tolist()
+    size = table.sample_size(name)
+    base_sizes = {shape: table.sample_size(shape) for shape in dict.fromkeys(shapes)}
+
+    def add_base(index: int) -> Placement:
+        shape = shapes[index]
+        return table.add(
+            shape, textures[index], size=base_sizes[shape], pose=centres[index], fixed=True
+        )
+
+    def add_dragged() -> Placement:
+        hover_z = (2.0 if shapes[0] in _DEEP_BASES else 0.5) * size[2]
+        z = hover_z if table.compat else None
+        return table.add(name, texture, size=size, pose=centres[0], fixed=False, z=z, on_top=not table.compat)
+
+    if table.compat:
+        dragged, source = add_dragged(), add_base(0)
+    else:
+        source, dragged = add_base(0), add_dragged()
+    targets = [add_base(index) for index in range(1, len(centres))][:num_targets]
+    shown = {f"base_obj_{n}": ObjectImage(target) for n, target in enumerate(targets, 1)}
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(template(num_targets), dragged_obj=ObjectImage(dragged), **shown),
+        goals=tuple(
+            AtPose(dragged.id, base.pose, TOLERANCE, relative_to=base.id) for base in (*targets, source)
+        ),
+        constraints=(InOrder(tuple(range(1, num_targets))),),
+        stages=(1,) * (num_targets + 1),
+        oracle_max_steps=num_targets + _SPARE_STEPS,
+    )
+
+
+def _cell_centre(row: int, column: int) -> Pose:
+    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
+    x = low_x + (row + 0.5) * (high_x - low_x) / NUM_ROWS
+    y = low_y + (column + 1) * (high_y - low_y) / (NUM_COLUMNS + 1)
+    return Pose.planar(x, y)

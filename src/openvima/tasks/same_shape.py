@@ -1,0 +1,66 @@
+"""`same_shape`: put every object that has the base's outline into the base.
+
+Scene:    a base, two objects with its profile (circle or square), and a distractor with another one; letters,
+          flowers and the like have neither.
+Prompt:   "Put all objects with the same profile as {base_obj} into it."
+Success:  those objects within 0.125 m of the base's origin (0.0875 m if it is a bowl), in any order, while no
+          distractor is as near to it or to one of them.
+Source:   VIMA paper, task list of the appendix, "Visual reasoning".
+"""
+
+from openvima.catalog import Pool, object_spec
+from openvima.errors import ConfigError
+from openvima.scene import Problem
+from openvima.tasks.gathering import gathering_problem, object_counts
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Put all objects with the same profile as {base_obj} into it."
+
+
+@register_task("same_shape", family="require_reasoning", template=TEMPLATE, oracle_max_steps=4)
+def sample(
+    table: TableSampler,
+    *,
+    num_dragged: int | None = None,
+    num_distractors: int | None = None,
+    after_bowl: bool | None = None,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        num_dragged: Objects that belong into the base, 1 … 3; by default as many as the difficulty says.
+        num_distractors: Further objects, 0 … 3; by default as many as the difficulty says.
+        after_bowl: Whether the bowl's tolerance holds for every base; see `gathering_problem`.
+        difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
+    """
+    counts = object_counts(difficulty, num_dragged, num_distractors)
+    pool = table.pool
+    by_base = {name: _by_profile(pool, name) for name in pool.base_objects}
+    texture = table.choose(pool.base_textures)
+    base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))
+    alike, different = by_base[base.object]
+    return gathering_problem(
+        table,
+        TEMPLATE,
+        base=base,
+        dragged_looks=(alike, pool.dragged_textures),
+        distractor_objects=different,
+        counts=counts,
+        after_bowl=after_bowl,
+    )
+
+
+def _by_profile(pool: Pool, base_object: str) -> tuple[list[str], list[str]]:
+    """Part the dragged objects into those with the profile of a base and those with another one."""
+    profile = object_spec(base_object).profile
+    alike = [name for name in pool.dragged_objects if object_spec(name).profile == profile]
+    different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]
+    if not alike or not different:
+        raise ConfigError(
+            f"the pool's dragged objects are {', '.join(pool.dragged_objects)}; some must have the profile of "
+            f"the base {base_object!r} ({profile}) and some another one."
+        )
+    return alike, different

@@ -1,0 +1,48 @@
+"""`same_texture`: put every object that has the base's texture into the base.
+
+Scene:    a base, two objects of any shape in its texture, and a distractor in another one.
+Prompt:   "Put all objects with the same texture as {base_obj} into it."
+Success:  those objects within 0.125 m of the base's origin (0.0875 m if it is a bowl), in any order, while no
+          distractor is as near to it or to one of them.
+Source:   VIMA paper, task list of the appendix, "Visual reasoning".
+"""
+
+from openvima.scene import Problem
+from openvima.tasks.gathering import gathering_problem, object_counts
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Put all objects with the same texture as {base_obj} into it."
+
+
+@register_task("same_texture", family="require_reasoning", template=TEMPLATE, oracle_max_steps=4)
+def sample(
+    table: TableSampler,
+    *,
+    num_dragged: int | None = None,
+    num_distractors: int | None = None,
+    after_bowl: bool | None = None,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        num_dragged: Objects that belong into the base, 1 … 3; by default as many as the difficulty says.
+        num_distractors: Further objects, 0 … 3; by default as many as the difficulty says.
+        after_bowl: Whether the bowl's tolerance holds for every base; see `gathering_problem`.
+        difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
+    """
+    counts = object_counts(difficulty, num_dragged, num_distractors)
+    pool = table.pool
+    texture = table.choose(pool.base_textures)
+    base = table.place_one("base", lambda: (table.choose(pool.base_objects), texture))
+    return gathering_problem(
+        table,
+        TEMPLATE,
+        base=base,
+        dragged_looks=(pool.dragged_objects, (texture,)),
+        distractor_objects=pool.dragged_objects,
+        counts=counts,
+        after_bowl=after_bowl,
+    )
