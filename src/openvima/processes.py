@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from typing import Any, Protocol
 
@@ -51,7 +52,7 @@ def in_processes(
     context = multiprocessing.get_context("spawn")
     counters = context.RawArray("q", len(items))  # one slot a job: no lock that a killed worker could keep
     others = set(multiprocessing.active_children())
-    with _one_thread_each():
+    with one_thread_each():
         pool = ProcessPoolExecutor(
             min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
         )
@@ -92,7 +93,7 @@ def _one_after_the_other(
 
 
 @contextlib.contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
     """Let processes that start inside the block use one thread each; it is read before our code is."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
@@ -106,11 +107,34 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Put off Ctrl-C until the end of the block; processes that start inside never receive it.
+
+    It reaches every process of a terminal at once, so a worker that is still importing would print a
+    traceback. On Windows nothing is put off.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it would be started later, and its start lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def become_worker() -> None:
+    """Make this process a worker: it leaves Ctrl-C to its parent, and ends when the parent does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+
+
 def _start_worker(counters: Any) -> None:  # Any: see `_counters`
     global _counters
     _counters = counters
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    become_worker()
 
 
 def _die_with_parent() -> None:

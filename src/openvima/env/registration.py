@@ -32,6 +32,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
+        ConfigError: An option is not known or its value not allowed.
 
     Example:
         >>> env = make("rotate", level="L1")
