@@ -15,7 +15,6 @@ from openvima.errors import AssetError, UnknownObjectError, UnknownTextureError
 
 PACK = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 ASSETS_FOLDER = PACK / "vima_bench/tasks/assets"
-UNUSED = ("stand", "disk")
 
 needs_pack = pytest.mark.skipif(
     not ASSETS_FOLDER.is_dir(), reason=f"{PACK} is absent; OPENVIMA_REFERENCE_ASSETS names another folder"
@@ -57,7 +56,7 @@ def test_golden_pack_is_complete_and_original(pack) -> None:
 @needs_pack
 def test_golden_meshes_have_the_catalogued_bounds(pack, catalogue) -> None:
     for record in catalogue["objects"]:
-        if record["name"] in UNUSED or "bounds_min" not in record:
+        if "bounds_min" not in record:
             continue
         vertices = pack.geometry(record["name"], tuple(record["size_min"])).visual.vertices.reshape(-1, 3)
         np.testing.assert_allclose(vertices.min(axis=0), record["bounds_min"], atol=1e-5)
@@ -83,8 +82,6 @@ def test_golden_images_have_the_catalogued_size_and_colour(pack, catalogue) -> N
 @needs_pack
 def test_golden_pack_has_a_sound_shape_for_every_object(pack) -> None:
     for name, spec in OBJECTS.items():
-        if name in UNUSED:
-            continue
         geometry = pack.geometry(name, spec.size_max)
         visual = geometry.visual
         assert visual.vertices.shape == visual.normals.shape == (*visual.uvs.shape[:2], 3)
@@ -174,13 +171,11 @@ def test_golden_damaged_files_are_named(copied_pack, share) -> None:
 
 
 @needs_pack
-def test_golden_pack_refuses_what_the_catalogue_or_the_tasks_do_not_have(pack) -> None:
+def test_golden_pack_refuses_what_the_catalogue_does_not_have(pack) -> None:
     with pytest.raises(UnknownObjectError, match="letter A"):
         pack.geometry("leter A", (1.0, 1.0, 1.0))
     with pytest.raises(UnknownTextureError, match="red swirl"):
         pack.texture("red swril")
-    with pytest.raises(AssetError, match="no task"):
-        pack.geometry("stand", OBJECTS["stand"].size_max)
 
 
 def test_a_folder_without_a_pack_is_refused(tmp_path) -> None:

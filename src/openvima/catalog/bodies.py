@@ -11,15 +11,13 @@ import numpy as np
 
 from openvima.catalog import boxes
 from openvima.catalog.boxes import Box, box_mesh
-from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
-from openvima.catalog.meshes import TEXTURE_PER_M, prism, scaled, slab_hull
+from openvima.catalog.geometry import CollisionHull, Geometry, Vector3
+from openvima.catalog.hanoi import hanoi_disk, hanoi_stand
+from openvima.catalog.meshes import draped, prism, scaled_geometry, slab_hull
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.outlines import outline, rectangle
 from openvima.catalog.vessels import bowl_collision, bowl_mesh, pan_mesh
 from openvima.errors import AssetError
-
-_SMALLEST_SHARE = 0.25  # of the texture's width; a 3 cm block shows this much instead of a tenth
-_TRIANGLES_PER_BOX = 12
 
 
 def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
@@ -27,13 +25,13 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
 
     Args:
         object_name: Display name.
-        size: Sampled nominal size in metres; kit objects, bowl, pan, pallet and frame have one size and
-            ignore it.
+        size: Sampled nominal size in metres; kit objects, bowl, pan, pallet, frame, stand and disk have one
+            size and ignore it.
         scale: Factor per axis on top of it.
 
     Raises:
         UnknownObjectError: The catalogue has no such object.
-        AssetError: The object has no procedural shape, or a size or factor that it needs is not positive.
+        AssetError: A size or factor that the object needs is not positive.
     """
     spec = object_spec(object_name)
     if not all(factor > 0 for factor in scale):
@@ -41,9 +39,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
     if spec.kind == "kit":
         return _kit(spec, scale)
     if object_name in _FIXED_SIZE:
-        return _scaled_geometry(_FIXED_SIZE[object_name](), scale)
-    if object_name not in _BOXES:
-        raise AssetError(f"there is no procedural shape for {object_name!r}; no released task uses it.")
+        return scaled_geometry(_FIXED_SIZE[object_name](), scale)
     build, needed_lengths = _BOXES[object_name]
     product = (size[0] * scale[0], size[1] * scale[1], size[2] * scale[2])
     if not all(length > 0 for length in product[:needed_lengths]):
@@ -51,18 +47,18 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
             f"size of {object_name} is {product} m; its first {needed_lengths} lengths must be above 0."
         )
     geometry = build(product)
-    return replace(geometry, visual=_draped(geometry.visual))
+    return replace(geometry, visual=draped(geometry.visual))
 
 
 def has_fixed_size(object_name: str) -> bool:
     """Whether an object's shape ignores the sampled size."""
-    return object_spec(object_name).kind in ("kit", "mesh")
+    return object_spec(object_name).kind == "kit" or object_name in _FIXED_SIZE
 
 
 def _kit(spec: ObjectSpec, scale: Vector3) -> Geometry:
     loops = outline(spec.name)
     height = spec.size_max[2] / boxes.HEIGHT_DIVISOR
-    return _scaled_geometry(
+    return scaled_geometry(
         Geometry(prism(loops, 0.0, height), (slab_hull(loops[0], 0.0, height),), 0.0), scale
     )
 
@@ -89,7 +85,7 @@ def _pallet() -> Geometry:
     parts += [Box((length, 0.007, height - 2 * thickness), (0.0, y, 0.0)) for y in (-0.084, 0.0, 0.084)]
     plan = np.array(rectangle((0.0, 0.0), (length / 2, width / 2)))
     hull = slab_hull(plan, -height / 2, height / 2)
-    return Geometry(_draped(box_mesh(parts)), (hull,), rest_z_m=height / 2)
+    return Geometry(draped(box_mesh(parts)), (hull,), rest_z_m=height / 2)
 
 
 def _bowl() -> Geometry:
@@ -103,36 +99,13 @@ def _pan() -> Geometry:
     return Geometry(visual, (hull,), rest_z_m=float(-visual.vertices[..., 2].min()))
 
 
-def _scaled_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
-    if scale == (1.0, 1.0, 1.0):
-        return geometry
-    hulls = tuple(
-        CollisionHull(shape.points * scale)
-        for shape in geometry.collision
-        if isinstance(shape, CollisionHull)
-    )
-    return Geometry(scaled(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
-
-
-def _draped(mesh: TriangleMesh) -> TriangleMesh:
-    """Lay one texture over a group of boxes from above, finer on small ones, never beyond its borders.
-
-    Args:
-        mesh: Boxes of 12 triangles each, as `box_mesh` builds them.
-    """
-    tops = mesh.vertices.reshape(-1, _TRIANGLES_PER_BOX * 3, 3)[..., 2].max(axis=1)
-    drop = np.repeat(tops, _TRIANGLES_PER_BOX)[:, None] - mesh.vertices[..., 2]
-    flat = mesh.vertices[..., :2] + drop[..., None] * mesh.normals[..., :2]
-    extents = np.ptp(mesh.vertices[..., :2].reshape(-1, 2), axis=0)
-    density = min(max(TEXTURE_PER_M, _SMALLEST_SHARE / extents.max()), 0.5 / np.abs(flat).max())
-    return TriangleMesh(mesh.vertices, mesh.normals, 0.5 + density * flat)
-
-
 _FIXED_SIZE: dict[str, Callable[[], Geometry]] = {
     "pallet": _pallet,
     "frame": _frame,
     "bowl": _bowl,
     "pan": _pan,
+    "stand": hanoi_stand,
+    "disk": hanoi_disk,
 }
 _BOXES: dict[str, tuple[Callable[[Vector3], Geometry], int]] = {
     "block": (boxes.block, 3),

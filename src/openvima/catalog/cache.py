@@ -1,7 +1,9 @@
 """Decoded and drawn images on disk, so that each is made once per machine."""
 
+import io
 import logging
 import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +12,8 @@ import numpy as np
 from openvima.files import whole_file
 
 _logger = logging.getLogger(__name__)
+
+_CHECKSUM_BYTES = 4  # CRC-32 of all before it; at the end of a file, readers of .npy do not mind it
 
 
 def cache_dir() -> Path:
@@ -35,7 +39,7 @@ def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.nd
     """
     path = cache_dir() / group / f"{key}.npy"
     try:
-        return np.load(path, allow_pickle=False)
+        return _read(path)
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError, EOFError) as error:
@@ -48,8 +52,20 @@ def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.nd
     return array
 
 
+def _read(path: Path) -> np.ndarray:
+    content = path.read_bytes()
+    body, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
+    if zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
+        raise ValueError("its checksum is wrong")
+    return np.load(io.BytesIO(body), allow_pickle=False)
+
+
 def _write(path: Path, array: np.ndarray) -> None:
     """Write under another name, then rename: readers see a whole file or none."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    body = buffer.getvalue()
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:
-        np.save(file, array, allow_pickle=False)
+        file.write(body)
+        file.write(zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little"))

@@ -8,11 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from openvima.catalog.geometry import CollisionHull, TriangleMesh, Vector3
+from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
 from openvima.catalog.triangulation import triangulate
 
 TEXTURE_PER_M = 3.5
 """Texture widths per metre of surface, much as on the kit objects of the original pack."""
+
+_SMALLEST_SHARE = 0.25  # of the texture's width; a 3 cm block shows this much instead of a tenth
+_TRIANGLES_PER_BOX = 12
 
 
 def prism(
@@ -84,6 +87,18 @@ def scaled(mesh: TriangleMesh, scale: Vector3) -> TriangleMesh:
     return TriangleMesh(mesh.vertices * factors, normals, mesh.uvs)
 
 
+def scaled_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
+    """Stretch a shape along the axes: what is drawn, its hulls and the height at which it rests."""
+    if scale == (1.0, 1.0, 1.0):
+        return geometry
+    hulls = tuple(
+        CollisionHull(shape.points * scale)
+        for shape in geometry.collision
+        if isinstance(shape, CollisionHull)
+    )
+    return Geometry(scaled(geometry.visual, scale), hulls, geometry.rest_z_m * scale[2])
+
+
 def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
     """Raise each point by `slope` metres per metre that it lies beyond `from_x`."""
     vertices = mesh.vertices.copy()
@@ -92,6 +107,20 @@ def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
     normals[..., 0] -= slope * normals[..., 2]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     return TriangleMesh(vertices, normals, mesh.uvs)
+
+
+def draped(mesh: TriangleMesh) -> TriangleMesh:
+    """Lay one texture over a group of boxes from above, finer on small ones, never beyond its borders.
+
+    Args:
+        mesh: Boxes of 12 triangles each, as `box_mesh` builds them.
+    """
+    tops = mesh.vertices.reshape(-1, _TRIANGLES_PER_BOX * 3, 3)[..., 2].max(axis=1)
+    drop = np.repeat(tops, _TRIANGLES_PER_BOX)[:, None] - mesh.vertices[..., 2]
+    flat = mesh.vertices[..., :2] + drop[..., None] * mesh.normals[..., :2]
+    extents = np.ptp(mesh.vertices[..., :2].reshape(-1, 2), axis=0)
+    density = min(max(TEXTURE_PER_M, _SMALLEST_SHARE / extents.max()), 0.5 / np.abs(flat).max())
+    return TriangleMesh(mesh.vertices, mesh.normals, 0.5 + density * flat)
 
 
 def convex_outline(points: np.ndarray) -> np.ndarray:

@@ -24,6 +24,22 @@ class ObjMesh:
     uvs: np.ndarray
     parts: np.ndarray
 
+    def to_array(self) -> np.ndarray:
+        """Return everything as one array, a row a triangle, shape (F, 25), float64."""
+        rows = (self.vertices, self.normals, self.uvs, self.parts)
+        return np.concatenate([part.reshape(len(self.parts), -1) for part in rows], axis=1)
+
+    @classmethod
+    def from_array(cls, array: np.ndarray) -> "ObjMesh":
+        """Undo `to_array`, bit for bit."""
+        vertices, normals, uvs, parts = np.split(array, (9, 18, 24), axis=1)
+        return cls(
+            np.ascontiguousarray(vertices).reshape(-1, 3, 3),
+            np.ascontiguousarray(normals).reshape(-1, 3, 3),
+            np.ascontiguousarray(uvs).reshape(-1, 3, 2),
+            parts[:, 0].astype(np.int32),
+        )
+
 
 def parse_obj(text: str, name: str) -> ObjMesh:
     """Parse the text of an .obj file; materials, smoothing groups and line elements are skipped.

@@ -1,12 +1,9 @@
-"""The original asset pack, read from a checkout of VIMA-Bench: meshes, textures and body shapes.
+"""The original asset pack: meshes, textures and body shapes of VIMA-Bench, from a checkout or an import.
 
-With it, images are those of the benchmark. The files are checked against known hashes, so that a pack which
-is incomplete or differs is reported instead of giving other pixels.
+With it, images are those of the benchmark.
 """
 
-import hashlib
 import io
-import json
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -16,12 +13,14 @@ import numpy as np
 from openvima.catalog import boxes
 from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
+from openvima.catalog.hanoi import LONG_RODS_Z, hanoi_stand
+from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.obj_file import ObjMesh, parse_obj
 from openvima.catalog.objects import ObjectSpec, object_spec
+from openvima.catalog.pack_files import CheckoutFiles, PackFiles, known_hashes
 from openvima.catalog.textures import TextureSpec, texture_spec
 from openvima.errors import AssetError
 
-PACK_FOLDER = Path("vima_bench/tasks/assets")  # inside a checkout
 _KIT_FILES = {
     "letter A": "capital_letter_a",
     "letter E": "capital_letter_e",
@@ -48,6 +47,7 @@ _FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
     "pallet": ("pallet/pallet.obj", (0.175, 0.175, 0.175), 0.0131),
     "frame": ("zone/zone.obj", (0.009, 0.009, 0.000075), 0.0),
     "pan": ("google/meshes_fixed/frypan.obj", (0.825, 0.825, 0.825 / 1.1), 0.0137),
+    "disk": ("hanoi/disk0.obj", (0.0015, 0.0015, 0.003), 0.015),
 }
 _BOWL_PARTS = ("bowl/cup.obj", (2.2, 2.2, 0.4))  # 14 convex parts, a fifth flatter than what is drawn
 _BOX_SHAPES: dict[str, Callable[[Vector3], Geometry]] = {
@@ -71,7 +71,8 @@ _SPECIAL_IMAGES = {
     "magma": "magma.jpg",
     "rainbow": "rainbow.jpg",
 }
-_DECODED_GROUP = "original-textures-1"
+# Decoders of JPEG files differ by a level or two: what was decoded once stays.
+_IMAGE_GROUP, _MESH_GROUP = "original-images-2", "original-meshes-1"
 _PATTERN_FOLDERS = {
     "stripe": ("stripes", "stripe"),
     "polka_dot_2": ("polka_dots", "polka_dot"),
@@ -81,10 +82,11 @@ _PATTERN_FOLDERS = {
 
 
 class OriginalAssets:
-    """The shapes and textures of a checkout of VIMA-Bench; implements `Assets`.
+    """The shapes and textures of VIMA-Bench; implements `Assets`.
 
     Args:
-        checkout: Folder of the checkout (it holds `vima_bench/tasks/assets`), or that assets folder itself.
+        source: Folder of a checkout of VIMA-Bench (it holds `vima_bench/tasks/assets`), or that assets folder
+            itself, or the files of a pack.
 
     Raises:
         AssetError: The folder holds no asset pack.
@@ -92,28 +94,20 @@ class OriginalAssets:
 
     name = "original"
 
-    def __init__(self, checkout: str | Path) -> None:
-        checkout = Path(checkout)
-        candidates = (checkout / PACK_FOLDER, checkout)
-        folder = next((path for path in candidates if (path / "textures").is_dir()), None)
-        if folder is None:
-            raise AssetError(
-                f"{checkout} holds no original asset pack ({PACK_FOLDER}/textures is missing); "
-                "give the folder of a VIMABench checkout."
-            )
-        self.folder = folder.resolve()
+    def __init__(self, source: "str | Path | PackFiles") -> None:
+        self.files = CheckoutFiles.within(source) if isinstance(source, str | Path) else source
 
     def __repr__(self) -> str:
-        return f"OriginalAssets({str(self.folder)!r})"
+        return f"OriginalAssets({self.files!r})"
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return the shape of a catalogue object; see `Assets.geometry`.
 
         Raises:
             UnknownObjectError: The catalogue has no such object.
-            AssetError: A mesh is missing or damaged, or no task uses the object.
+            AssetError: A mesh is missing or damaged.
         """
-        return _protected_geometry(self.folder, object_name, size, scale)
+        return _protected_geometry(self.files, object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image, shape (H, W, 3), uint8; see `Assets.texture`.
@@ -122,53 +116,72 @@ class OriginalAssets:
             UnknownTextureError: The catalogue has no such texture.
             AssetError: The image is missing or damaged.
         """
-        return _protected_texture(self.folder, texture_name)
+        return _protected_texture(self.files, texture_name)
 
     def problems(self) -> list[str]:
-        """Check every file of the pack that tasks use.
+        """Check every file of the pack.
 
         Returns:
             One sentence for each file that is missing or differs from the original; empty if all is well.
         """
         found = []
-        for relative_path in _known_hashes():
+        for relative_path in known_hashes():
             try:
-                _read(self.folder, relative_path)
+                self.files.read(relative_path)
             except AssetError as error:
                 found.append(str(error))
         return found
 
 
+def decode_file(files: PackFiles, relative_path: str) -> None:
+    """Check a file of the pack and decode it into the cache, if it is one to be decoded.
+
+    The body descriptions (.urdf) are checked only: the catalogue states their few numbers.
+
+    Raises:
+        AssetError: The file is missing or damaged, or cannot be decoded.
+    """
+    if relative_path.endswith(".obj"):
+        _mesh(files, relative_path)
+    elif relative_path.startswith("textures/"):
+        _image(files, relative_path)
+    else:
+        files.read(relative_path)
+
+
 @lru_cache(maxsize=1024)
-def _protected_geometry(folder: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
-    return protect(_geometry(folder, object_name, size, scale))
-
-
-def _geometry(folder: Path, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+def _protected_geometry(files: PackFiles, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     spec = object_spec(object_name)
-    if object_name in _BOX_SHAPES:
-        return _BOX_SHAPES[object_name](_product(size, scale))
-    if object_name in _KIT_FILES:
-        return _kit(folder, spec, scale)
-    if object_name in _FIXED_MESHES:
-        return _fixed_mesh(folder, object_name, scale)
-    raise AssetError(f"object {object_name!r} is used by no task and not imported from the original pack.")
+    try:
+        return protect(_geometry(files, spec, size, scale))
+    except AssetError as error:
+        raise AssetError(f"object {object_name!r} cannot be used: {error}") from error
 
 
-def _kit(folder: Path, spec: ObjectSpec, scale: Vector3) -> Geometry:
+def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3) -> Geometry:
+    if spec.name in _BOX_SHAPES:
+        return _BOX_SHAPES[spec.name](_product(size, scale))
+    if spec.name in _KIT_FILES:
+        return _kit(files, spec, scale)
+    if spec.name == "stand":  # which has no mesh file
+        return scaled_geometry(hanoi_stand(LONG_RODS_Z), scale)
+    return _fixed_mesh(files, spec.name, scale)
+
+
+def _kit(files: PackFiles, spec: ObjectSpec, scale: Vector3) -> Geometry:
     kit_scale = spec.kit_scale or 1.0
     metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
-    visual = _scaled(_mesh(folder, f"kitting/{_KIT_FILES[spec.name]}.obj"), metres)
+    visual = _scaled(_mesh(files, f"kitting/{_KIT_FILES[spec.name]}.obj"), metres)
     return Geometry(visual, (_hull(visual.vertices),), 0.0)
 
 
-def _fixed_mesh(folder: Path, object_name: str, scale: Vector3) -> Geometry:
+def _fixed_mesh(files: PackFiles, object_name: str, scale: Vector3) -> Geometry:
     file, metres, rest_z_m = _FIXED_MESHES[object_name]
-    visual = _scaled(_mesh(folder, file), _product(metres, scale))
+    visual = _scaled(_mesh(files, file), _product(metres, scale))
     collision = (_hull(visual.vertices),)
     if object_name == "bowl":
         parts_file, parts_metres = _BOWL_PARTS
-        parts = _mesh(folder, parts_file)
+        parts = _mesh(files, parts_file)
         vertices = parts.vertices * _product(parts_metres, scale)
         collision = tuple(_hull(vertices[parts.parts == part]) for part in np.unique(parts.parts))
     return Geometry(visual, collision, rest_z_m * scale[2])
@@ -188,38 +201,48 @@ def _product(a: Vector3, b: Vector3) -> Vector3:
 
 
 @lru_cache(maxsize=64)
-def _mesh(folder: Path, relative_path: str) -> ObjMesh:
-    text = _read(folder, relative_path).decode("utf-8", errors="replace")
-    return parse_obj(text, str(folder / relative_path))
+def _mesh(files: PackFiles, relative_path: str) -> ObjMesh:
+    content = files.read(relative_path)
+
+    def parsed() -> np.ndarray:
+        return parse_obj(content.decode("utf-8", errors="replace"), relative_path).to_array()
+
+    return ObjMesh.from_array(cached_array(_MESH_GROUP, _cache_key(relative_path), parsed))
 
 
 @lru_cache(maxsize=128)
-def _protected_texture(folder: Path, texture_name: str) -> np.ndarray:
-    texture = _texture(folder, texture_name)
+def _protected_texture(files: PackFiles, texture_name: str) -> np.ndarray:
+    spec = texture_spec(texture_name)
+    if spec.texel is not None:
+        texture = np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
+    else:
+        try:
+            texture = _image(files, image_file(spec))
+        except AssetError as error:
+            raise AssetError(f"texture {texture_name!r} cannot be used: {error}") from error
     texture.setflags(write=False)
     return texture
 
 
-def _texture(folder: Path, texture_name: str) -> np.ndarray:
-    spec = texture_spec(texture_name)
-    if spec.texel is not None:
-        return np.array(spec.texel, dtype=np.uint8).reshape(1, 1, 3)
-    relative_path = image_file(spec)
-    content = _read(folder, relative_path)
-    # Decoders of JPEG files differ by a level or two: what was decoded once stays.
-    return cached_array(
-        _DECODED_GROUP, _known_hashes()[relative_path][:32], lambda: _decoded(content, folder / relative_path)
-    )
+def _image(files: PackFiles, relative_path: str) -> np.ndarray:
+    content = files.read(relative_path)
+    return cached_array(_IMAGE_GROUP, _cache_key(relative_path), lambda: _decoded(content, relative_path))
 
 
-def _decoded(content: bytes, path: Path) -> np.ndarray:
+def _cache_key(relative_path: str) -> str:
+    return known_hashes()[relative_path][:32]
+
+
+def _decoded(content: bytes, relative_path: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(io.BytesIO(content)) as image:
             return np.array(image.convert("RGB"))
     except (UnidentifiedImageError, OSError) as error:
-        raise AssetError(f"{path} cannot be decoded ({error}); restore the file.") from error
+        raise AssetError(
+            f"{relative_path} cannot be decoded ({error}); is Pillow installed with support for it?"
+        ) from error
 
 
 def image_file(texture: TextureSpec) -> str:
@@ -230,24 +253,3 @@ def image_file(texture: TextureSpec) -> str:
     subfolder, suffix = _PATTERN_FOLDERS[texture.category]
     stem = "_".join([*(["dark"] if texture.is_dark else []), *texture.base_colours, suffix])
     return f"textures/{subfolder}/{stem}.jpg"
-
-
-def _read(folder: Path, relative_path: str) -> bytes:
-    """Read a file of the pack and make sure that it is the original one."""
-    path = folder / relative_path
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"{path} is missing or unreadable; complete the checkout of VIMABench.") from error
-    if hashlib.sha256(content).hexdigest() != _known_hashes()[relative_path]:
-        raise AssetError(
-            f"{path} differs from the file of the original benchmark (damaged, or another version); "
-            "restore it from a fresh checkout of VIMABench."
-        )
-    return content
-
-
-@lru_cache(maxsize=1)
-def _known_hashes() -> dict[str, str]:
-    """SHA-256 of the 88 files that tasks use, by path in the pack."""
-    return json.loads(Path(__file__).with_name("original_files.json").read_text(encoding="utf-8"))

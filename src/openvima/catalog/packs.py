@@ -2,12 +2,16 @@
 
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import AssetError, unknown_name
 
-ASSET_PACKS = ("procedural",)
+if TYPE_CHECKING:
+    from openvima.catalog.pack_files import PackFiles
+
+ASSET_PACKS = ("procedural", "original")
 """Packs that have a name; any other is the path of a checkout of the original benchmark."""
 
 
@@ -15,11 +19,12 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
     """Return an asset pack; each is loaded once per process.
 
     Args:
-        assets: "procedural" for the shapes and textures made by code, the path of a checkout of the original
-            benchmark for its meshes and images, or a pack, which is returned as it is.
+        assets: "procedural" for the shapes and textures made by code; "original" for those of the original
+            benchmark, once `openvima assets import` has read them, or the path of a checkout of it; or a
+            pack, which is returned as it is.
 
     Raises:
-        AssetError: The name is unknown, or the folder holds no complete original pack.
+        AssetError: The name is unknown, the folder holds no original pack, or none was imported.
 
     Example:
         >>> load_assets("procedural").texture("blue")
@@ -29,9 +34,13 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         return assets
     if assets == "procedural":
         return _procedural()
+    if assets == "original":
+        from openvima.catalog.pack_files import ImportedFiles
+
+        return _original(ImportedFiles.present())
     folder = Path(assets).expanduser()
     if not folder.is_dir():
-        hint = "Allowed: 'procedural', or the folder of a checkout of the original benchmark."
+        hint = "Allowed: 'procedural', 'original', or the folder of a checkout of the original benchmark."
         raise AssetError(unknown_name("asset pack or folder", str(assets), ASSET_PACKS, hint))
     return _original(folder.resolve())
 
@@ -42,7 +51,7 @@ def _procedural() -> Assets:
 
 
 @lru_cache(maxsize=4)
-def _original(checkout: Path) -> Assets:
-    from openvima.catalog.original import OriginalAssets  # reads image files, which the default pack does not
+def _original(source: "Path | PackFiles") -> Assets:
+    from openvima.catalog.original import OriginalAssets  # reads files, which the default pack does not
 
-    return OriginalAssets(checkout)
+    return OriginalAssets(source)

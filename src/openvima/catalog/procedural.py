@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.catalog import images, materials, noise, patterns, textures
+from openvima.catalog import cache, images, materials, noise, patterns, textures
 from openvima.catalog.bodies import build_geometry, has_fixed_size
 from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import Geometry, Vector3, protect
 from openvima.catalog.textures import texture_spec
 
-_DRAWING_MODULES = (images, materials, noise, patterns, textures)
+_DRAWING_MODULES = (cache, images, materials, noise, patterns, textures)  # cache: the form of its files
 _GEOMETRIES_KEPT = 1024  # containers come in any size, so the memory of shapes needs a bound
 
 

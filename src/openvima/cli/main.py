@@ -15,6 +15,7 @@ VERBS = {
     "demo": "film the oracle or a policy at work on one task",
     "generate": "write demonstrations with the oracle",
     "data": "look into a folder of demonstrations",
+    "assets": "show all objects and textures, or import those of the original benchmark",
     "train": "train a policy on demonstrations",
     "evaluate": "score policies on levels L1 to L4",
     "report": "make the HTML report of evaluation results",

@@ -1,0 +1,97 @@
+"""Look at the shapes and textures, and import those of the original benchmark."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openvima.cli.progress import progress_bar
+
+
+def gallery(*, out: Path, assets: str = "procedural") -> int:
+    """Write a web page that shows every object and every texture.
+
+    Example: openvima assets gallery --out gallery
+
+    Args:
+        out: Folder to write index.html and its pictures to.
+        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.catalog import load_assets
+    from openvima.render.gallery import write_gallery
+
+    with progress_bar("pictures") as report:
+        page, problems = write_gallery(out, load_assets(assets), report=report)
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    print(page)
+    return 1 if problems else 0
+
+
+def import_(
+    checkout: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CHECKOUT")],
+) -> int:
+    """Import the asset pack of the original benchmark; then "--assets original" uses it everywhere.
+
+    The checkout is read once and not needed afterwards. Files that are missing or damaged are listed and the
+    rest is imported. Importing again replaces what was imported before.
+
+    Example: openvima assets import ~/VIMABench
+
+    Args:
+        checkout: Folder of a checkout of the original benchmark.
+
+    Returns:
+        Exit status: 0 everything was imported, 1 files are missing.
+    """
+    from openvima.catalog.importing import import_pack
+
+    with progress_bar("original assets") as report:
+        pack = import_pack(checkout, report)
+    total = len(pack.files) + len(pack.problems)
+    print(f"{len(pack.files)} of {total} files imported into {pack.archive}")
+    if pack.is_complete:
+        print("--assets original uses them.", file=sys.stderr)
+        return 0
+    _list_problems(pack.problems)
+    print("What needs no missing file works with --assets original.", file=sys.stderr)
+    return 1
+
+
+def info() -> int:
+    """Show which asset packs there are, and what the cache holds.
+
+    Example: openvima assets info
+
+    Returns:
+        Exit status.
+    """
+    from openvima.catalog import OBJECTS, TEXTURES
+    from openvima.catalog.cache import cache_dir
+    from openvima.catalog.importing import imported_pack
+
+    pack = imported_pack()
+    print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
+    if pack is None:
+        print("original    not imported; `openvima assets import CHECKOUT` reads it from a checkout")
+    else:
+        total = len(pack.files) + len(pack.problems)
+        print(f"original    {len(pack.files)} of {total} files imported: {pack.archive}")
+    size_mb = sum(file.stat().st_size for file in cache_dir().rglob("*") if file.is_file()) / 1e6
+    print(f"cache       {size_mb:.0f} MB in {cache_dir()}; all but the import is made anew when needed")
+    _list_problems(pack.problems if pack else ())
+    return 0
+
+
+def _list_problems(problems: tuple[str, ...]) -> None:
+    if problems:
+        print(f"{len(problems)} not imported:", file=sys.stderr)
+    for problem in problems:
+        print(f"  {problem}", file=sys.stderr)
+
+
+COMMANDS = {"gallery": gallery, "import": import_, "info": info}
