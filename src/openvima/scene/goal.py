@@ -113,17 +113,19 @@ Goal = AtPose | InZone
 class DistractorsApart:
     """No distractor comes near a goal's target, and no goal's object near a distractor.
 
-    Tested after every step, against all goals of the episode, met or not: a distractor within the goal's
+    Tested after every step, whether the goals are met or not: a distractor within a goal's
     `tolerance.position_m` of its target, or the goal's object matching the distractor's pose within the
     goal's whole tolerance, is a violation.
 
     Args:
         object_ids: The distractors.
-        at_end: Test only when all goals are met.
+        at_end: Test only once, in the step that fulfils the last of the goals.
+        goals: Indices of the goals that count; None: all of the episode.
     """
 
     object_ids: tuple[int, ...]
     at_end: bool = False
+    goals: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

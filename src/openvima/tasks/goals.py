@@ -90,7 +90,7 @@ def _still_open(problem: Problem, open_goals: tuple[int, ...], scene: Scene) -> 
 
 
 def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> Outcome:
-    reason = progress.violation or _disturbance(problem, progress, scene)
+    reason = progress.violation or _disturbance(problem, open_before, progress, scene)
     if reason:
         return Outcome(failure=True, reason=reason)
     num_met = len(problem.goals) - len(progress.open_goals)
@@ -105,13 +105,14 @@ def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress,
     return Outcome(failure=True, reason=reason) if reason else Outcome()
 
 
-def _disturbance(problem: Problem, progress: Progress, scene: Scene) -> str:
+def _disturbance(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> str:
     """One sentence on the first constraint that the scene at rest breaks, or nothing."""
     for constraint in problem.constraints:
         reason = ""
         if isinstance(constraint, DistractorsApart):
-            if not (constraint.at_end and progress.open_goals):
-                reason = _distractor_too_near(problem, constraint.object_ids, scene)
+            concerned = range(len(problem.goals)) if constraint.goals is None else constraint.goals
+            if not constraint.at_end or _were_completed(concerned, open_before, progress):
+                reason = _distractor_too_near(problem, constraint.object_ids, concerned, scene)
         elif isinstance(constraint, ZoneKeptClear):
             reason = _distractor_in_zone(constraint, scene)
         elif isinstance(constraint, InOrder):
@@ -121,8 +122,16 @@ def _disturbance(problem: Problem, progress: Progress, scene: Scene) -> str:
     return ""
 
 
-def _distractor_too_near(problem: Problem, object_ids: Iterable[int], scene: Scene) -> str:
-    goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
+def _were_completed(goals: Iterable[int], open_before: tuple[int, ...], progress: Progress) -> bool:
+    """Whether this very step fulfilled the last of these goals."""
+    were_open = [index for index in goals if index in open_before]
+    return bool(were_open) and not any(index in progress.open_goals for index in were_open)
+
+
+def _distractor_too_near(
+    problem: Problem, object_ids: Iterable[int], goal_indices: Iterable[int], scene: Scene
+) -> str:
+    goals = [goal for index in goal_indices if isinstance(goal := problem.goals[index], AtPose)]
     for object_id in object_ids:
         pose, distractor = scene[object_id].pose, f"distractor {_called(scene, object_id)}"
         for goal in goals:

@@ -30,6 +30,16 @@ def check_count(name: str, count: object, *, high: int, low: int = 0) -> None:
         raise ConfigError(f"{name} is {count!r}; give an integer from {low} to {high}.")
 
 
+def check_share(name: str, share: object) -> None:
+    """Refuse anything but a number from 0 to 1.
+
+    Raises:
+        ConfigError: With the range that is allowed.
+    """
+    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
+        raise ConfigError(f"{name} is {share!r}; give a number from 0 to 1.")
+
+
 def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the textures of dragged objects and of bases.
 

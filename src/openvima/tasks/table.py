@@ -211,9 +211,13 @@ class TableSampler:
         return self._put(new if z is None else new.at(Pose((pose.x, pose.y, z), pose.quaternion)))
 
     def blank(self) -> "TableSampler":
-        """Return an empty table for a scene of the prompt, with the same generator, pool and assets."""
+        """Return an empty table for a scene of the prompt, with the same generator and assets.
+
+        Nothing is fixed there, for nothing is done there.
+        """
+        pool = replace(self.pool, base_objects=())
         return TableSampler(
-            self.rng, self.pool, assets=self._assets, end_effector=self._end_effector, compat=self.compat
+            self.rng, pool, assets=self._assets, end_effector=self._end_effector, compat=self.compat
         )
 
     def free_pose(self, object_name: str, size: Vector3) -> Pose | None:
