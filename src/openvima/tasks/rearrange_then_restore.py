@@ -1,0 +1,61 @@
+"""`rearrange_then_restore`: move objects to the places shown in a picture, then back to where they were.
+
+Scene:    as in `rearrange`: one to three objects; a single one has a distractor, often on its target.
+Prompt:   "Rearrange objects to this setup {scene} and then restore."
+Success:  each object was within 0.1 m of its target and, in a later step than the last of these, of its
+          start; at the end the distractor is as near to no object, target or start.
+Source:   VIMA paper, task list of the appendix, "Rearrange then restore".
+"""
+
+from openvima.scene import AtPose, DistractorsApart, Problem, Prompt
+from openvima.tasks.rearranging import CONFLICT_RATE, TOLERANCE, sample_arrangement
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Rearrange objects to this setup {scene} and then restore."
+
+
+@register_task("rearrange_then_restore", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=8)
+def sample(
+    table: TableSampler,
+    *,
+    num_objects: int | None = None,
+    conflict_rate: float = CONFLICT_RATE,
+    distractor_textures: str = "all",
+    restore_distractor: bool = False,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with chances 0.4, 0.4 and 0.2.
+        conflict_rate: Share of single objects whose target is taken by the distractor.
+        distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
+            those of the level.
+        restore_distractor: Ask for the distractor at its original place as well. In the benchmark it has to
+            stay away from there, if that is the object's target.
+        difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
+    """
+    arrangement = sample_arrangement(
+        table,
+        num_objects=num_objects,
+        conflict_rate=conflict_rate,
+        distractor_textures=distractor_textures,
+        difficulty=difficulty,
+    )
+    arrange, starts = arrangement.goals, arrangement.starts
+    to_restore = [starts[index] for index in table.rng.permutation(len(starts))]
+    apart = DistractorsApart(arrangement.distractor_ids, at_end=True)
+    if restore_distractor and arrangement.distractor is not None:
+        to_restore.append(arrangement.distractor)
+        apart = DistractorsApart(arrangement.distractor_ids, at_end=True, goals=tuple(range(len(arrange))))
+    restore = tuple(AtPose(start.id, start.pose, TOLERANCE) for start in to_restore)
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(TEMPLATE, scene=arrangement.picture),
+        goals=(*arrange, *restore),
+        constraints=(apart,),
+        stages=(len(arrange), len(restore)),
+        oracle_first=arrangement.chores,
+    )

@@ -1,0 +1,141 @@
+"""Rearranging: objects, the places where they have to go, and a distractor that may stand in the way."""
+
+from dataclasses import dataclass
+
+from openvima.catalog import TEXTURE_SETS
+from openvima.errors import ConfigError, SamplingError, unknown_name
+from openvima.scene import AtPose, Placement, SceneImage, Tolerance
+from openvima.tasks.options import check_count, check_difficulty, check_share
+from openvima.tasks.table import Reject, TableSampler, is_in_the_way
+
+TOLERANCE = Tolerance(position_m=0.1)
+NUM_OBJECTS_WEIGHTS = (0.4, 0.4, 0.2)
+MAX_OBJECTS = len(NUM_OBJECTS_WEIGHTS)
+CONFLICT_RATE = 0.5  # share of distractors that stand on the target
+_APART_M = TOLERANCE.position_m + 0.01  # of a distractor from starts; 10 mm for an object put down askew
+_TRIES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Arrangement:
+    """What has to be rearranged.
+
+    Args:
+        starts: The objects where they stand.
+        targets: The same objects, in the same order, where they have to go.
+        distractor: A further object, where it stands; only if there is one object to move.
+        parking: The distractor at a place where it is in nobody's way, if it stands on the target.
+    """
+
+    starts: tuple[Placement, ...]
+    targets: tuple[Placement, ...]
+    distractor: Placement | None = None
+    parking: Placement | None = None
+
+    @property
+    def picture(self) -> SceneImage:
+        """The objects where they have to go, without the distractor."""
+        return SceneImage.of(self.targets)
+
+    @property
+    def goals(self) -> tuple[AtPose, ...]:
+        """Each object at its target."""
+        return tuple(AtPose(target.id, target.pose, TOLERANCE) for target in self.targets)
+
+    @property
+    def chores(self) -> tuple[AtPose, ...]:
+        """What the oracle has to clear away first."""
+        return () if self.parking is None else (AtPose(self.parking.id, self.parking.pose, TOLERANCE),)
+
+    @property
+    def distractor_ids(self) -> tuple[int, ...]:
+        """Id of the distractor, if there is one."""
+        return () if self.distractor is None else (self.distractor.id,)
+
+
+def sample_arrangement(
+    table: TableSampler,
+    *,
+    num_objects: int | None,
+    conflict_rate: float,
+    distractor_textures: str,
+    difficulty: str,
+) -> Arrangement:
+    """Lay a table of objects to be rearranged.
+
+    Args:
+        table: The table to lay.
+        num_objects: Objects to move, 1 … 3; None draws the number.
+        conflict_rate: Share of the distractors that stand on the target.
+        distractor_textures: "all", or "pool": those of the objects to move.
+        difficulty: Checked, without effect.
+
+    Returns:
+        The arrangement; its objects and the distractor are on the table, at their starts.
+
+    Raises:
+        ConfigError: An option is not allowed.
+        SamplingError: Something found no place.
+    """
+    check_difficulty(difficulty)
+    check_share("conflict_rate", conflict_rate)
+    textures_of = {"all": TEXTURE_SETS["T"], "pool": table.pool.dragged_textures}
+    if distractor_textures not in textures_of:
+        raise ConfigError(unknown_name("choice of distractor_textures", distractor_textures, textures_of))
+    if num_objects is None:
+        num_objects = 1 + int(table.rng.choice(MAX_OBJECTS, p=NUM_OBJECTS_WEIGHTS))
+    check_count("num_objects", num_objects, low=1, high=MAX_OBJECTS)
+
+    objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
+    targets = table.place(
+        "object at its target",
+        lambda: (table.choose(objects), table.choose(textures)),
+        count=num_objects,
+        tries=num_objects + 10,
+    )
+    in_the_way = _in_the_way_of(targets, table)
+    starts = [
+        table.move(target, table.find_place("start", target, reject=in_the_way))
+        for target in reversed(targets)
+    ][::-1]
+    if num_objects > 1:
+        return Arrangement(tuple(starts), tuple(targets))
+    look = (
+        table.choose([name for name in objects if name != targets[0].object]),
+        table.choose(textures_of[distractor_textures]),
+    )
+    if table.rng.random() < conflict_rate:
+        distractor, parking = _on_target(table, look, starts[0], targets[0])
+    else:
+        distractor = table.place_one(
+            "distractor", lambda: look, tries=_TRIES, apart_m=_APART_M, reject=in_the_way
+        )
+        parking = None
+    return Arrangement(tuple(starts), tuple(targets), distractor, parking)
+
+
+def _on_target(
+    table: TableSampler, look: tuple[str, str], start: Placement, target: Placement
+) -> tuple[Placement, Placement]:
+    """Put the distractor exactly where the object has to go; return it there and where it may be parked."""
+    size = table.sample_size(look[0])
+    z = target.pose.z if table.compat else None  # the benchmark lets it start at the height of the object
+    distractor = table.add(*look, size=size, pose=target.pose, z=z)
+    if not table.compat and is_in_the_way(distractor, start):
+        raise SamplingError("the distractor on the target crowds the object's start.")
+    in_the_way = _in_the_way_of([target], table)
+    parking = table.find_place("parking place", distractor, tries=_TRIES, apart_m=_APART_M, reject=in_the_way)
+    return distractor, parking
+
+
+def _in_the_way_of(targets: list[Placement], table: TableSampler) -> Reject:
+    """Return a test for places that crowd a target or, unless `compat`, count as being there."""
+    reach = 0.0 if table.compat else TOLERANCE.position_m
+
+    def is_blocking(place: Placement) -> bool:
+        return any(
+            is_in_the_way(place, target) or place.pose.planar_distance(target.pose) < reach
+            for target in targets
+        )
+
+    return is_blocking
