@@ -1,0 +1,72 @@
+"""`novel_adj_and_noun`: put a thing into a base, all three words of the request being invented.
+
+Scene:    a base, two twins that differ in height or in shade only, and two distractors of other shapes.
+Prompt:   "This is a wug {dragged_obj}. This is a dax {base_obj}. {demo_blicker_obj_1} is kobar than
+          {demo_less_blicker_obj_1}. …  Put the less kobar wug into the dax." The first two sentences come in
+          either order, their pictures are gray; three comparisons, "less" or not.
+Success:  the right twin within 0.1 m of the base's origin, while nothing else is near either of them.
+Source:   VIMA paper, task list of the appendix, "Novel adjective and noun".
+"""
+
+from collections.abc import Sequence
+
+from openvima.scene import Problem, Prompt
+from openvima.tasks.comparisons import (
+    MEANINGS,
+    NUM_COMPARISONS,
+    comparison_text,
+    place_base_and_twins,
+    sample_lesson,
+)
+from openvima.tasks.into_base import into_base
+from openvima.tasks.novel_words import ADJECTIVES, NOUNS, choose_words, gray_image, in_any_order
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+INTRODUCTIONS = ("This is a {novel_name_1} {dragged_obj}.", "This is a {novel_name_2} {base_obj}.")
+REQUEST = "Put the {adv}{novel_adj} {novel_name_1} into the {novel_name_2}."
+
+
+@register_task(
+    "novel_adj_and_noun",
+    family="novel_concept_grounding",
+    template=" ".join((*INTRODUCTIONS, comparison_text(), REQUEST)),
+    oracle_max_steps=3,
+)
+def sample(
+    table: TableSampler,
+    *,
+    adjectives: str | Sequence[str] = ADJECTIVES,
+    nouns: str | Sequence[str] = NOUNS,
+    meanings: str | Sequence[str] = MEANINGS,
+    num_comparisons: int = NUM_COMPARISONS,
+    num_distractors: int = 2,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        adjectives: Invented adjectives to choose from.
+        nouns: Invented nouns to choose from, at least two.
+        meanings: What the adjectives may mean: "shorter", "taller", "lighter", "darker", "smaller", "larger".
+        num_comparisons: Pairs of objects that show the meaning, 1 … 9.
+        num_distractors: Further objects of other shapes, 0 … 3.
+        difficulty: "easy"; "medium" and "hard" add an object of another shape that is, in what the adjective
+            is about, like the wrong twin or like the right one.
+    """
+    lesson = sample_lesson(table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons)
+    noun, base_noun = choose_words(table, "nouns", nouns, count=2)
+    introductions = in_any_order(table, INTRODUCTIONS)
+    base, target, others = place_base_and_twins(
+        table, lesson, num_distractors=num_distractors, difficulty=difficulty
+    )
+    prompt = Prompt.parse(
+        " ".join((*introductions, lesson.text, REQUEST)),
+        **lesson.fills,
+        novel_name_1=noun,
+        novel_name_2=base_noun,
+        dragged_obj=gray_image(target),
+        base_obj=gray_image(base),
+    )
+    return into_base(table, prompt, target=target, base=base, distractors=others)
