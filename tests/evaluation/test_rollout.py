@@ -1,5 +1,7 @@
 """Playing episodes: who is asked when, and how episodes end."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from openvima.errors import ActionError, OracleError, PolicyError
@@ -16,6 +18,7 @@ class Env:
         self.end_effector = end_effector
         self.prompt = RenderedPrompt("Wait.", {})
         self.actions = []
+        self.episode = SimpleNamespace(num_redraws=2)
 
     def reset(self, seed):
         self.steps = 0

@@ -34,7 +34,7 @@ def _overview(folder: Path, manifest: dict[str, Any]) -> str:  # Any: JSON
         f"{folder}: {counts['episodes']} episodes, {counts['steps']} steps, "
         f"{counts['shards']} shards, {size_mb:.1f} MB",
         f"level {config['level']}, domain {config['domain']}, seeds from {config['start_seed']}, "
-        f"assets {config['assets']}",
+        f"assets {config['assets']}, {config['difficulty']}{', compat' if config['compat'] else ''}",
         ", ".join(f"{name} {version}" for name, version in sorted(manifest["versions"].items())),
         "",
         f"{'task':<28}{'episodes':>10}{'steps':>8}{'seeds tried':>13}{'oracle success':>16}{'redraws':>9}",

@@ -14,6 +14,8 @@ def main(
     level: str | None = None,
     policy: str = "oracle",
     assets: str = "procedural",
+    compat: bool = False,
+    difficulty: str = "easy",
 ) -> int:
     """Film one episode: the prompt above, the table and the arm below.
 
@@ -25,7 +27,9 @@ def main(
         seed: Number of the episode.
         level: train, L1, L2, L3 or L4; by default the task's first.
         policy: oracle, random, untrained, or the folder of a training run.
-        assets: procedural, or the folder of a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        compat: Follow the original benchmark also where it is odd.
+        difficulty: easy, medium or hard.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -36,13 +40,14 @@ def main(
     level = task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
-    from openvima.env.tabletop import TabletopEnv
+    from openvima.env import Setup
     from openvima.evaluation.film import film_episode
     from openvima.evaluation.players import load_player
     from openvima.evaluation.protocol import Batch
 
-    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, assets=assets)
-    env = TabletopEnv(task, level=level, domain="user", assets=assets, realtime=True)
+    setup = Setup(assets, compat, difficulty)
+    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, setup=setup)
+    env = setup.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = film_episode(env, load_player(batch), seed, out, title=title)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"

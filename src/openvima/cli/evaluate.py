@@ -23,6 +23,8 @@ def main(
     workers: int = 1,
     out: Path = Path("evaluation"),
     assets: str = "procedural",
+    compat: bool = False,
+    difficulty: str = "easy",
     batch: int = 16,
     videos: int = 1,
     report: bool = True,
@@ -45,7 +47,9 @@ def main(
         seed: Number of the first episode; evaluation episodes never occur in training.
         workers: Processes.
         out: Folder to write to.
-        assets: procedural, or the folder of a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
+        difficulty: easy, as for all published results, medium or hard.
         batch: Episodes that are played together; a policy decides for all of them at once.
         videos: Solved episodes to film, and unsolved ones, of each trained policy and task.
         report: Whether to film episodes and write report.html.
@@ -55,6 +59,7 @@ def main(
     Returns:
         Exit status.
     """
+    from openvima.env import Setup
     from openvima.evaluation import EvaluationConfig, Results, evaluate
 
     config = EvaluationConfig(
@@ -65,7 +70,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        assets=assets,
+        setup=Setup(assets, compat, difficulty),
         batch=batch,
         videos=videos,
         report=report,

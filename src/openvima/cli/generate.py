@@ -16,6 +16,8 @@ def main(
     seed: int = 0,
     shard_size: int | None = None,
     assets: str = "procedural",
+    compat: bool = False,
+    difficulty: str = "easy",
     force: bool = False,
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
@@ -34,10 +36,13 @@ def main(
         seed: First seed.
         shard_size: Episodes in a file; by default an eighth of them, but 4 to 1000. Give it to be able
             to ask for more episodes later.
-        assets: "procedural", or the folder of the original asset pack.
+        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
+        difficulty: easy, as for all published results, medium or hard.
         force: Delete the data set that is in the folder.
     """
     from openvima.data import GenerateConfig, generate
+    from openvima.env import Setup
 
     config = GenerateConfig(
         out=out,
@@ -47,7 +52,7 @@ def main(
         start_seed=seed,
         shard_size=shard_size,
         workers=workers,
-        assets=assets,
+        setup=Setup(assets, compat, difficulty),
         force=force,
     )
     with progress_bar("demonstrations") as report:

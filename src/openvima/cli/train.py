@@ -40,7 +40,7 @@ def main(
         checkpoint_every: Steps between checkpoints.
         seed: Decides weights, order of the data and augmentation.
         threads: Threads to compute with; equal numbers give equal weights.
-        assets: Asset pack of the demonstrations: "procedural", or the folder of the original one.
+        assets: Pack of the demonstrations: procedural, original, or a checkout of the original benchmark.
         force: Throw away a run with other settings that is in the run folder.
     """
     from openvima.training import TrainingConfig, train

@@ -57,6 +57,8 @@ class ShardInfo:
         first_seed: First seed of the whole data set.
         assets: Name of the asset pack.
         versions: Package name to version.
+        compat: Whether the original benchmark was followed also where it is odd.
+        difficulty: "easy", "medium" or "hard".
     """
 
     task: str
@@ -67,6 +69,8 @@ class ShardInfo:
     first_seed: int
     assets: str
     versions: dict[str, str]
+    compat: bool = False
+    difficulty: str = "easy"
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""

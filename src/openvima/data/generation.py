@@ -13,6 +13,7 @@ from openvima.data.records import Demonstration, package_versions, rollout_oracl
 from openvima.data.schema import INDEX_COLUMNS
 from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.env import TabletopEnv
+from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
 from openvima.files import write_whole
 from openvima.processes import in_processes
@@ -46,7 +47,7 @@ class GenerateConfig:
         start_seed: First seed.
         shard_size: Episodes in a file; None chooses an eighth of `episodes`, but 4 … 1,000.
         workers: Number of processes.
-        assets: "procedural", or the folder of the original asset pack.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         force: Delete a data set that is in the folder.
     """
 
@@ -57,7 +58,7 @@ class GenerateConfig:
     start_seed: int = 0
     shard_size: int | None = None
     workers: int = 1
-    assets: str = "procedural"
+    setup: Setup = DEFAULT_SETUP
     force: bool = False
 
     def __post_init__(self) -> None:
@@ -104,14 +105,14 @@ class Block:
         info: What all its rows have in common.
         episodes: Number of successful episodes.
         seeds: Seeds to try, in order.
-        assets: Asset pack, as `load_assets` takes it.
+        setup: As in `GenerateConfig`.
     """
 
     path: Path
     info: ShardInfo
     episodes: int
     seeds: range
-    assets: str
+    setup: Setup
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
@@ -154,7 +155,7 @@ def plan(config: GenerateConfig) -> list[Block]:
     """Divide the work into blocks; the division depends on the settings alone."""
     size, versions = config.resolved_shard_size(), package_versions()
     stride = SEEDS_PER_EPISODE * size + SPARE_SEEDS
-    assets = load_assets(config.assets).name
+    assets = load_assets(config.setup.assets).name
     blocks = []
     for task in config.resolved_tasks():
         for number, start in enumerate(range(0, config.episodes, size)):
@@ -171,10 +172,12 @@ def plan(config: GenerateConfig) -> list[Block]:
                         first_seed=config.start_seed,
                         assets=assets,
                         versions=versions,
+                        compat=config.setup.compat,
+                        difficulty=config.setup.difficulty,
                     ),
                     episodes=min(size, config.episodes - start),
                     seeds=range(first, first + stride),
-                    assets=config.assets,
+                    setup=config.setup,
                 )
             )
     return blocks
@@ -202,7 +205,7 @@ def demonstrations(block: Block) -> Iterator[tuple[Demonstration, list[Skipped]]
     Raises:
         OracleError: The seeds ran out.
     """
-    env = _env(block.info.task, block.info.level, block.assets)
+    env = _env(block.info.task, block.info.level, block.setup)
     num_found, skipped = 0, []
     for seed in block.seeds:
         demo = attempt(env, seed)
@@ -247,6 +250,8 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         "start_seed": config.start_seed,
         "shard_size": config.resolved_shard_size(),
         "assets": blocks[0].info.assets,
+        "compat": config.setup.compat,
+        "difficulty": config.setup.difficulty,
     }
     write_whole(config.out / INDEX_NAME, index_bytes(rows))
     manifest = manifest_bytes(rows, config=settings, versions=blocks[0].info.versions)
@@ -254,8 +259,8 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 
 
 @lru_cache(maxsize=4)
-def _env(task: str, level: str, assets: str) -> TabletopEnv:
-    return TabletopEnv(task, level=level, domain=DOMAIN, assets=assets)
+def _env(task: str, level: str, setup: Setup) -> TabletopEnv:
+    return setup.make(task, level, domain=DOMAIN)
 
 
 def _is_done(block: Block) -> bool:
@@ -282,7 +287,7 @@ def _check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 
 
 def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
-    names = ("level", "domain", "shard_size", "first_seed", "assets")
+    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty")
     pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
     pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
     return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]

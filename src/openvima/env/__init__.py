@@ -1,17 +1,22 @@
-"""The Gymnasium environment."""
+"""The Gymnasium environment, alone or several at once."""
 
 import importlib
 from typing import TYPE_CHECKING
 
 from openvima.env.registration import make, register_environments
+from openvima.env.setup import Setup
 
 if TYPE_CHECKING:
+    from openvima.env.gate import stack_actions
     from openvima.env.tabletop import Frame, TabletopEnv
+    from openvima.env.vector import make_vec
 
-__all__ = ["Frame", "TabletopEnv", "make", "register_environments"]
+__all__ = ["Frame", "Setup", "TabletopEnv", "make", "make_vec", "register_environments", "stack_actions"]
+
+_HOMES = {"Frame": "tabletop", "TabletopEnv": "tabletop", "make_vec": "vector", "stack_actions": "gate"}
 
 
 def __getattr__(name: str) -> object:  # importing the environment takes MuJoCo and Numba with it
-    if name in ("Frame", "TabletopEnv"):
-        return getattr(importlib.import_module("openvima.env.tabletop"), name)
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"openvima.env.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -97,13 +97,12 @@ def film(job: FilmJob, count: Callable[[int], None]) -> Clip:
     """Film one episode; runs in a worker process."""
     from PIL import Image
 
-    from openvima.env.tabletop import TabletopEnv
     from openvima.evaluation.film import Artist, film_episode
     from openvima.evaluation.players import load_player, one_thread
     from openvima.evaluation.prompt_strip import thumbnail
 
     batch = job.batch
-    env = TabletopEnv(batch.task, level=batch.level, domain="eval", assets=batch.assets, realtime=True)
+    env = batch.setup.make(batch.task, batch.level, domain="eval", realtime=True)
     env.reset(seed=batch.first_seed)
     poster = png(Image.fromarray(Artist(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
@@ -136,7 +135,7 @@ def command_of(config: EvaluationConfig) -> str:
         f"--levels {','.join(config.levels)}",
         f"--episodes {config.episodes}",
         f"--seed {config.seed}",
-        *([] if config.assets == "procedural" else [f"--assets {shlex.quote(str(config.assets))}"]),
+        *config.setup.words(),
         *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
         "--out DIR",
     ]
@@ -160,4 +159,4 @@ def _seeds_to_film(row: Row, number: int, *, unsolved: bool) -> list[int]:
 
 
 def _single(row: Row, source: PolicySource, seed: int, config: EvaluationConfig) -> Batch:
-    return Batch(row.policy, source.source, row.task, row.level, seed, 1, config.assets)
+    return Batch(row.policy, source.source, row.task, row.level, seed, 1, config.setup)

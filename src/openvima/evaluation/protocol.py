@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from openvima.catalog.partitions import LEVELS
+from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
 from openvima.policies.base import checkpoint_folder
 from openvima.policies.presets import PRESETS
@@ -37,7 +38,7 @@ class EvaluationConfig:
         seed: First seed, of domain "eval"; the others follow without gaps.
         workers: Processes; the results do not depend on their number.
         out: Folder to write to.
-        assets: "procedural", or a checkout of the original benchmark.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         batch: Episodes that are played together, so that a policy decides for all of them at once.
         videos: Filmed episodes of each policy and task, for the report.
         report: Whether to film and to write `report.html`; needs the extra `report`.
@@ -51,7 +52,7 @@ class EvaluationConfig:
     seed: int = 0
     workers: int = 1
     out: Path = Path("evaluation")
-    assets: str = "procedural"
+    setup: Setup = DEFAULT_SETUP
     batch: int = DEFAULT_BATCH
     videos: int = 1
     report: bool = True
@@ -89,7 +90,7 @@ class EvaluationConfig:
             "seed": self.seed,
             "domain": "eval",
             "batch": self.batch,
-            "assets": "procedural" if self.assets == "procedural" else "original",
+            **self.setup.record(),
         }
 
 
@@ -177,7 +178,7 @@ class Batch:
         level: Level of the episodes.
         first_seed: Seed of the first one.
         episodes: How many.
-        assets: As in `EvaluationConfig`.
+        setup: As in `EvaluationConfig`.
     """
 
     policy: str
@@ -186,7 +187,7 @@ class Batch:
     level: str
     first_seed: int
     episodes: int
-    assets: str = "procedural"
+    setup: Setup = DEFAULT_SETUP
 
     @property
     def seeds(self) -> range:
@@ -243,7 +244,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             level=level,
             first_seed=config.seed + offset,
             episodes=min(config.batch, config.episodes - offset),
-            assets=config.assets,
+            setup=config.setup,
         )
         for policy in policy_sources(config.policies)
         for task, level in cells(config)

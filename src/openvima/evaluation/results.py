@@ -26,6 +26,7 @@ class EpisodeOutcome:
         steps: Actions taken.
         reason: Empty on success, else one sentence.
         kind: Empty on success, else the reason without names and numbers, for counting.
+        redraws: Unlucky draws that were thrown away before a start was found.
     """
 
     seed: int
@@ -33,6 +34,7 @@ class EpisodeOutcome:
     steps: int
     reason: str = ""
     kind: str = ""
+    redraws: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,11 @@ class Row:
     def mean_steps(self) -> float:
         """Mean number of actions an episode, solved or not."""
         return sum(outcome.steps for outcome in self.outcomes) / max(1, self.episodes)
+
+    @property
+    def redraws(self) -> int:
+        """Number of unlucky draws that were thrown away, over all episodes."""
+        return sum(outcome.redraws for outcome in self.outcomes)
 
     @property
     def failures(self) -> dict[str, int]:
@@ -212,6 +219,7 @@ def _row_record(row: Row) -> dict[str, object]:
         "mean_steps": _rounded(row.mean_steps),
         "seeds": [row.outcomes[0].seed, row.outcomes[-1].seed],
         "failures": row.failures,
+        "redraws": row.redraws,
         "outcomes": [asdict(outcome) for outcome in row.outcomes],
     }
 

@@ -38,7 +38,7 @@ class _Seat:
         self.steps += 1
         self.has_grasped |= info["grasped"] != 0
         if info["success"]:
-            self.observation, self.outcome = None, EpisodeOutcome(self.seed, True, self.steps)
+            self.observation, self.outcome = None, self._outcome(True)
         elif terminated:
             self._end(info["reason"], failure_kind(info["reason"]))
         elif truncated:
@@ -49,7 +49,12 @@ class _Seat:
 
     def _end(self, reason: str, kind: str) -> None:
         self.observation = None
-        self.outcome = EpisodeOutcome(self.seed, False, self.steps, reason, kind)
+        self.outcome = self._outcome(False, reason, kind)
+
+    def _outcome(self, success: bool, reason: str = "", kind: str = "") -> EpisodeOutcome:
+        return EpisodeOutcome(
+            self.seed, success, self.steps, reason, kind, redraws=self.env.episode.num_redraws
+        )
 
 
 def play(

@@ -59,7 +59,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
     if results is None:
-        load_assets(config.assets)  # an unfit pack is named before anything is written
+        load_assets(config.setup.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         outcomes = _play_all(config, batches, policies, found, report)
         results = Results(_rows(batches, outcomes), config.record(), found, policies)
@@ -121,16 +121,12 @@ def _play_all(
 
 def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, ...]:
     """Play one batch and keep its outcomes; runs in a worker process."""
-    from openvima.env.tabletop import TabletopEnv
     from openvima.evaluation.rollout import play
 
     batch = job.batch
     with one_thread(batch):
         player = load_player(batch, job.fingerprint)
-        envs = [
-            TabletopEnv(batch.task, level=batch.level, domain="eval", assets=batch.assets)
-            for _ in batch.seeds
-        ]
+        envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         outcomes = tuple(play(envs, batch.seeds, player))
     count(len(outcomes))
     write_whole(job.part, json.dumps([asdict(outcome) for outcome in outcomes], ensure_ascii=False) + "\n")
