@@ -5,8 +5,9 @@ prompt images with their objects) and `TASK-SEED.npz` (its images). Poses are th
 """
 
 import json
+import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ import numpy as np
 
 from openvima.catalog import Assets, Vector3, object_spec
 from openvima.render import VIEWS, empty_labels, stamp
-from openvima.scene import BACKGROUND_ID, ObjectImage, Placement, Pose, Prompt, Scene
+from openvima.scene import BACKGROUND_ID, ObjectImage, Placement, Pose, Scene
 
 SWEPT_MAGNIFICATION = 7.0  # of the small block in prompt images
 FLAT_THICKNESS_M = 1e-4  # heights that differ by less count as equal
+MIN_PIXELS = 30  # smaller remainders of bodies are not compared: a pixel more or less would decide
 
 Views = dict[str, np.ndarray]
 
@@ -31,6 +33,26 @@ class RecordedImage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class GoldenPrompt:
+    """One recorded prompt image.
+
+    Args:
+        name: Its placeholder in the prompt.
+        image: The benchmark's image.
+        candidates: What an image of one object may show. Its pose is always the same; its size and scale are
+            those of the same object in the scene, of which there may be several, or the scales of any body in
+            the scene where the image is an example for an adjective. Empty for images of scenes.
+        shown: Object and texture names of an image of a scene, in the order of their ids from 2 on. Where
+            they lie is not recorded.
+    """
+
+    name: str
+    image: RecordedImage
+    candidates: tuple[ObjectImage, ...]
+    shown: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class GoldenScene:
     """One recorded scene.
 
@@ -39,46 +61,72 @@ class GoldenScene:
         seed: Seed of the benchmark.
         scene: The objects at their link-frame poses.
         image: The benchmark's images of it.
-        prompt: The object images of the prompt that can be redrawn, under the benchmark's names.
-        prompt_images: The benchmark's images of these.
-        num_not_redrawn: Prompt images that the record does not say enough about: scenes without poses, and
-            examples of adjectives, whose scale is not recorded.
+        prompts: The images of the prompt.
     """
 
     task: str
     seed: int
     scene: Scene
     image: RecordedImage
-    prompt: Prompt
-    prompt_images: dict[str, RecordedImage]
-    num_not_redrawn: int
+    prompts: tuple[GoldenPrompt, ...]
+
+
+class RecordingError(ValueError):
+    """A recording is missing, damaged or of another form."""
+
+
+def scene_files(folder: Path) -> list[Path]:
+    """List the records of a folder of scenes, in the order of their names.
+
+    Raises:
+        RecordingError: There are none.
+    """
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise RecordingError(f"{folder} holds no recorded scenes (TASK-SEED.json); give another folder.")
+    return paths
 
 
 def read_scenes(folder: Path) -> Iterator[GoldenScene]:
-    """Read all scenes of a folder, in the order of their names."""
-    for path in sorted(folder.glob("*.json")):
-        yield read_scene(path)
+    """Read all scenes of a folder; see `scene_files` and `read_scene`."""
+    yield from map(read_scene, scene_files(folder))
 
 
 def read_scene(path: Path) -> GoldenScene:
-    """Read one scene; its images lie beside `path` under the same name, with the suffix .npz."""
-    record = json.loads(path.read_text(encoding="utf-8"))
-    with np.load(path.with_suffix(".npz")) as arrays:
-        images = {name: arrays[name] for name in arrays.files}
+    """Read one scene; its images lie beside `path` under the same name, with the suffix .npz.
+
+    Raises:
+        RecordingError: One of the two files is missing, damaged or lacks something.
+    """
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        with np.load(path.with_suffix(".npz")) as arrays:
+            images = {name: arrays[name] for name in arrays.files}
+        return _golden_scene(record, images)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise RecordingError(f"{path.with_suffix('')}.{{json,npz}}: {error}") from error
+    except KeyError as error:
+        raise RecordingError(f"{path.with_suffix('')}.{{json,npz}} lack the entry {error}.") from error
+
+
+def _golden_scene(record: dict[str, Any], images: Views) -> GoldenScene:
     scene = Scene(tuple(_placement(body) for body in record["objects"]), record["end_effector"])
-    shown = {
-        name: fill
-        for name, asset in record["assets"].items()
-        if (fill := _object_image(name, asset, scene)) is not None
-    }
     return GoldenScene(
         task=record["task"],
         seed=record["seed"],
         scene=scene,
         image=_recorded(images, ""),
-        prompt=Prompt(" ".join("{" + name + "}" for name in shown), tuple(shown.items())),
-        prompt_images={name: _recorded(images, f"asset/{name}/") for name in shown},
-        num_not_redrawn=len(record["assets"]) - len(shown),
+        prompts=tuple(_prompt(name, asset, scene, images) for name, asset in record["assets"].items()),
+    )
+
+
+def _prompt(name: str, asset: dict[str, Any], scene: Scene, images: Views) -> GoldenPrompt:
+    is_object = asset["type"] == "object"
+    return GoldenPrompt(
+        name,
+        _recorded(images, f"asset/{name}/"),
+        _candidates(name, asset["objects"][0], scene) if is_object else (),
+        () if is_object else tuple((body["name"], body["texture"]) for body in asset["objects"]),
     )
 
 
@@ -131,20 +179,21 @@ def size_and_scale(body: dict[str, Any]) -> tuple[Vector3, Vector3]:
     return (x, y, z), (1.0, 1.0, 1.0)
 
 
-def _object_image(name: str, asset: dict[str, Any], scene: Scene) -> ObjectImage | None:
-    if asset["type"] != "object" or name.startswith("demo_"):
-        return None
-    (shown,) = asset["objects"]
+def _candidates(name: str, shown: dict[str, Any], scene: Scene) -> tuple[ObjectImage, ...]:
+    """What the image of one object may show, as far as the record of the scene tells."""
     same_object = [placement for placement in scene.placements if placement.object == shown["name"]]
     same_both = [placement for placement in same_object if placement.texture == shown["texture"]]
-    placement = (same_both or same_object)[0]
-    neutral = shown["texture"] == "gray"
-    # Neutral images do not give away the scale that an adjective stands for.
-    scale = (1.0, 1.0, 1.0) if neutral else placement.scale
-    placement = Placement(
-        0, shown["name"], shown["texture"], placement.size, Pose((0.0, 0.0, 0.0)), scale=scale
-    )
-    return ObjectImage(placement, SWEPT_MAGNIFICATION if shown["name"] == "small block" else 1.0)
+    sizes = [placement.size for placement in same_both or same_object]
+    sizes = sizes or [object_spec(shown["name"]).size_max]  # all sizes that a scene does not tell are fixed
+    scales = [(1.0, 1.0, 1.0)]
+    if name.startswith("demo_"):  # examples have the scales between which the scene's objects differ
+        scales += [placement.scale for placement in scene.placements]
+    elif same_both:  # images in neutral gray do not give away the scale
+        scales = [placement.scale for placement in same_both]
+    magnification = SWEPT_MAGNIFICATION if shown["name"] == "small block" else 1.0
+    body = Placement(0, shown["name"], shown["texture"], sizes[0], Pose((0.0, 0.0, 0.0)))
+    forms = dict.fromkeys((size, scale) for size in sizes for scale in scales)
+    return tuple(ObjectImage(replace(body, size=size, scale=scale), magnification) for size, scale in forms)
 
 
 def interpenetrating(scene: Scene, assets: Assets) -> list[set[int]]:
@@ -171,7 +220,7 @@ def interpenetrating(scene: Scene, assets: Assets) -> list[set[int]]:
 def ious(
     ours: np.ndarray, theirs: np.ndarray, *, first_id: int, groups: list[set[int]]
 ) -> dict[tuple[int, ...], float]:
-    """Compare two segmentation images body by body.
+    """Compare two segmentation images body by body, leaving out what is smaller than 30 pixels in both.
 
     Args:
         ours: Object ids, shape (H, W), uint8.
@@ -180,7 +229,7 @@ def ious(
         groups: Sets of ids to be taken as one body.
 
     Returns:
-        For every object seen in either image its ids (several for a group) and its intersection over union.
+        For every object of that size its ids (several for a group) and its intersection over union.
     """
     grouped = set().union(*groups)
     seen = {int(i) for i in np.union1d(ours, theirs) if first_id <= i < BACKGROUND_ID}
@@ -188,8 +237,8 @@ def ious(
     result = {}
     for ids in bodies:
         a, b = np.isin(ours, ids), np.isin(theirs, ids)
-        if union := (a | b).sum():
-            result[ids] = float((a & b).sum() / union)
+        if max(a.sum(), b.sum()) >= MIN_PIXELS:
+            result[ids] = float((a & b).sum() / (a | b).sum())
     return result
 
 

@@ -109,7 +109,7 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
             super()._check_spaces()
 
     def _raise_if_errors(self, successes: Iterable[bool]) -> None:
-        """Raise the first error of a worker; Gymnasium would show it as a warning first, and drop its type."""
+        """Raise the first error of a worker; Gymnasium would show it as a warning first."""
         if all(successes):
             return
         try:
@@ -140,7 +140,7 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
         codes = [(index, process.exitcode) for index, process in enumerate(self.processes)]
         dead = [f"{index} (exit code {code})" for index, code in codes if code is not None]
         return (
-            f"the worker of sub-environment {', '.join(dead) or '?'} ended by itself; the others were ended too. "
+            f"the worker of sub-environment {', '.join(dead) or '?'} ended by itself; all others were ended. "
             "Exit code -9 often means that memory was short; 1 that it could not start: a script must keep "
             'what it does under `if __name__ == "__main__":`, for workers import it.'
         )

@@ -13,9 +13,7 @@ _TRIES = 20  # for all objects together
 _SPARE_STEPS = 2
 
 
-def object_counts(
-    difficulty: str, num_dragged: int | None, num_distractors: int | None
-) -> tuple[int, int]:
+def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int | None) -> tuple[int, int]:
     """Return how many objects go into the base and how many stay out.
 
     Args:

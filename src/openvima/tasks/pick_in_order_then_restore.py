@@ -61,9 +61,7 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
 
     def add_base(index: int) -> Placement:
         shape = shapes[index]
-        return table.add(
-            shape, textures[index], size=base_sizes[shape], pose=centres[index], fixed=True
-        )
+        return table.add(shape, textures[index], size=base_sizes[shape], pose=centres[index], fixed=True)
 
     def add_dragged() -> Placement:
         hover_z = (2.0 if shapes[0] in _DEEP_BASES else 0.5) * size[2]

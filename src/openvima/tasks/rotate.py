@@ -6,19 +6,16 @@ Success:  yaw within 15 degrees of the asked one, position within 0.1 m of the s
 Source:   VIMA paper, task list of the appendix, "Rotate".
 """
 
-import math
 from collections.abc import Sequence
 
-from openvima.errors import ConfigError
-from openvima.scene import AtPose, DistractorsApart, ObjectImage, Problem, Prompt, Tolerance
+from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
 from openvima.tasks.options import check_count, check_difficulty
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
+from openvima.tasks.turning import ANGLES_DEG, check_angles, check_turnable, turn_goal
 
 TEMPLATE = "Rotate the {dragged_obj} {angle_in_degree} degrees."
-ANGLES_DEG = (30, 60, 90, 120, 150)  # clockwise seen from above, i.e. negative yaw
-TOLERANCE_DEG = 15
-TOLERANCE = Tolerance(position_m=0.1, yaw_rad=math.radians(TOLERANCE_DEG))
+TOLERANCE_M = 0.1
 NUM_DISTRACTORS = {"easy": 1, "medium": 3, "hard": 5}
 
 
@@ -41,7 +38,8 @@ def sample(
     check_difficulty(difficulty)
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     check_count("num_distractors", num_distractors, high=6)
-    _check_angles(angles_deg)
+    check_angles(angles_deg)
+    check_turnable(table.pool)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     angle_deg = table.choose(angles_deg)
@@ -52,21 +50,11 @@ def sample(
         lambda: (table.choose(objects), table.choose(others)),
         count=num_distractors,
         tries=num_distractors + 10,
-        apart_m=TOLERANCE.position_m,
+        apart_m=TOLERANCE_M,
     )
-    turned = target.pose.rotated(-math.radians(angle_deg))
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, dragged_obj=ObjectImage(target), angle_in_degree=round(angle_deg)),
-        goals=(AtPose(target.id, turned, TOLERANCE, relative_to=target.id),),
+        goals=(turn_goal(target, angle_deg, position_m=TOLERANCE_M),),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
     )
-
-
-def _check_angles(angles_deg: Sequence[float]) -> None:
-    small = [angle for angle in angles_deg if abs(math.remainder(angle, 360)) <= TOLERANCE_DEG]
-    if small or not angles_deg:
-        shown = ", ".join(f"{angle:g}" for angle in small) or "nothing"
-        raise ConfigError(
-            f"angles_deg holds {shown}; each angle must turn by more than {TOLERANCE_DEG} degrees."
-        )

@@ -1,0 +1,82 @@
+"""`follow_motion`: repeat, move for move, the motion of an object that frames show.
+
+Scene:    an object on one of five points of a circle, and a distractor in the middle of it.
+Prompt:   "Follow this motion for {dragged_obj}: {frame_0} {frame_1} {frame_2}." In the frames another
+          distractor is in the middle, and the object walks from point to neighbouring point.
+Success:  every step brings the object within 0.1 m of where the next frame shows it; the first step that
+          does not is a failure.
+Source:   VIMA paper, task list of the appendix, "Follow motion".
+"""
+
+import math
+from itertools import accumulate
+
+from openvima.scene import EveryStepCounts, ObjectImage, Placement, Pose, Problem, Prompt
+from openvima.tasks.frames import (
+    NUM_FRAMES,
+    checked_num_frames,
+    frame_images,
+    goals_between,
+    with_frame_slots,
+)
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Follow this motion for {dragged_obj}: {frames}."
+CENTRE = Pose.planar(0.5, 0.0)
+RADIUS_M = 0.19
+NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
+
+
+@register_task(
+    "follow_motion",
+    family="one_shot_imitation",
+    template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
+    oracle_max_steps=NUM_FRAMES["easy"] - 1,
+)
+def sample(table: TableSampler, *, num_frames: int | None = None, difficulty: str = "easy") -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        num_frames: Frames of the motion, 2 … 10; by default as many as the difficulty says.
+        difficulty: "easy", "medium" or "hard": 3, 4 or 5 frames.
+    """
+    num_frames = checked_num_frames(num_frames, difficulty, high=10)
+    looks = [
+        (name, texture) for name in table.pool.dragged_objects for texture in table.pool.dragged_textures
+    ]
+    look = table.choose(looks)
+    other_looks = [other for other in looks if other != look]
+
+    walk = _sample_walk(table, num_frames)
+    dragged = _put(table, look, walk[0])
+    _put(table, table.choose(other_looks), CENTRE)
+    in_frames = _put(table.blank(), table.choose(other_looks), CENTRE)
+
+    frames = [(dragged.at(place.moved(dz=dragged.pose.z)),) for place in walk]
+    images = frame_images([(*frame, in_frames) for frame in frames])
+    goals = goals_between(frames)
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(
+            with_frame_slots(TEMPLATE, num_frames), dragged_obj=ObjectImage(dragged), **images
+        ),
+        goals=goals,
+        constraints=(EveryStepCounts(),),
+        stages=(1,) * len(goals),
+        oracle_max_steps=len(goals),
+    )
+
+
+def _sample_walk(table: TableSampler, num_places: int) -> list[Pose]:
+    """Draw places on the circle, each a neighbour of the one before."""
+    start = int(table.rng.integers(NUM_POINTS))
+    steps = (table.choose((-1, 1)) for _ in range(num_places - 1))
+    angles = (2 * math.pi * point / NUM_POINTS for point in accumulate(steps, initial=start))
+    return [CENTRE.moved(RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle)) for angle in angles]
+
+
+def _put(table: TableSampler, look: tuple[str, str], pose: Pose) -> Placement:
+    size = table.sample_size(look[0])
+    return table.add(*look, size=size, pose=pose, z=size[2] if table.compat else None)

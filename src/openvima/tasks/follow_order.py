@@ -1,0 +1,134 @@
+"""`follow_order`: stack objects in the order that frames show.
+
+Scene:    three or four objects of one shape in a row, and distractors of other shapes.
+Prompt:   "Stack objects in this order {frame_0} {frame_1} {frame_2}." The frames show the row without the
+          distractors; from frame to frame the topmost object of one stack moves onto another.
+Success:  every step brings the right object within 0.1 m of where the next frame shows it, at any height; the
+          first step that does not is a failure.
+Source:   VIMA paper, task list of the appendix, "Follow order".
+"""
+
+import functools
+import itertools
+from collections.abc import Iterator
+
+from openvima.scene import WORKSPACE_LOW, EveryStepCounts, Placement, Pose, Problem, Prompt
+from openvima.tasks.frames import (
+    NUM_FRAMES,
+    Frame,
+    checked_num_frames,
+    frame_images,
+    goals_between,
+    with_frame_slots,
+)
+from openvima.tasks.options import check_count
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+
+TEMPLATE = "Stack objects in this order {frames}."
+NUM_BLOCKS = {"easy": 3, "medium": 4, "hard": 4}
+
+Stacks = tuple[tuple[int, ...], ...]
+"""For each place of the row the blocks there, bottom to top."""
+
+
+@register_task(
+    "follow_order",
+    family="one_shot_imitation",
+    template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
+    oracle_max_steps=NUM_FRAMES["easy"] + 1,
+)
+def sample(
+    table: TableSampler,
+    *,
+    num_blocks: int | None = None,
+    num_frames: int | None = None,
+    num_distractors: int = 1,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        num_blocks: Objects to stack, 2 … 4; by default as many as the difficulty says.
+        num_frames: Frames shown, 2 … 5; by default as many as the difficulty says.
+        num_distractors: Further objects, 0 … 3.
+        difficulty: "easy", "medium" or "hard": 3, 4 or 4 objects in 3, 4 or 5 frames.
+    """
+    num_frames = checked_num_frames(num_frames, difficulty, high=5)
+    num_blocks = NUM_BLOCKS[difficulty] if num_blocks is None else num_blocks
+    check_count("num_blocks", num_blocks, low=2, high=4)
+    check_count("num_distractors", num_distractors, high=3)
+    objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
+
+    shape = table.choose(objects)
+    looks = table.rng.choice(len(textures), num_blocks, replace=False)
+    stackings = table.choose(all_stackings(num_blocks, num_frames - 1))
+    size = table.sample_size(shape)
+    blocks = [
+        table.add(shape, textures[look], size=size, pose=place)
+        for look, place in zip(looks, _row(num_blocks), strict=True)
+    ]
+    other_shapes = [name for name in objects if name != shape]
+    table.place(
+        "distractor",
+        lambda: (table.choose(other_shapes), table.choose(textures)),
+        count=num_distractors,
+        tries=num_distractors + 10,
+    )
+
+    frames = [_stacked(table, blocks, stacks) for stacks in stackings]
+    images = [_by_place(frame) for frame in frames] if table.compat else frames
+    goals = goals_between(frames)
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(with_frame_slots(TEMPLATE, num_frames), **frame_images(images)),
+        goals=goals,
+        constraints=(EveryStepCounts(),),
+        stages=(1,) * len(goals),
+        oracle_max_steps=num_frames + 1,
+    )
+
+
+@functools.cache
+def all_stackings(num_blocks: int, num_moves: int) -> tuple[tuple[Stacks, ...], ...]:
+    """Return every way to make some moves, one topmost block at a time, from a row of single blocks.
+
+    Each way is given by the stacks before the first move and after each; moves may undo earlier ones.
+    """
+    ways: list[tuple[Stacks, ...]] = [(tuple((block,) for block in range(num_blocks)),)]
+    for _ in range(num_moves):
+        ways = [(*way, after) for way in ways for after in _after_one_move(way[-1])]
+    return tuple(ways)
+
+
+def _after_one_move(stacks: Stacks) -> Iterator[Stacks]:
+    for source, target in itertools.permutations(range(len(stacks)), 2):
+        if stacks[source]:
+            changed = list(stacks)
+            changed[source] = stacks[source][:-1]
+            changed[target] = (*stacks[target], stacks[source][-1])
+            yield tuple(changed)
+
+
+def _row(num_places: int) -> list[Pose]:
+    """Places at equal distances from each other and from the ends of the table."""
+    distance_m = -2 * WORKSPACE_LOW[1] / (num_places + 1)
+    return [Pose.planar(0.5, WORKSPACE_LOW[1] + n * distance_m) for n in range(1, num_places + 1)]
+
+
+def _stacked(table: TableSampler, blocks: list[Placement], stacks: Stacks) -> Frame:
+    """Show the blocks in stacks; with `compat` as far apart as their nominal height says."""
+    shown, poses = table.blank(), {}
+    for stack, place in zip(stacks, _row(len(stacks)), strict=True):
+        for level, index in enumerate(stack):
+            block = blocks[index]
+            z = (2 * level + 1) * block.size[2] / 2 if table.compat else None
+            lying = shown.add(block.object, block.texture, size=block.size, pose=place, z=z, on_top=True)
+            poses[index] = lying.pose
+    return [block.at(poses[index]) for index, block in enumerate(blocks)]
+
+
+def _by_place(frame: Frame) -> Frame:
+    """Order blocks along the row, and those of a stack from bottom to top."""
+    return sorted(frame, key=lambda block: (block.pose.y, block.pose.z))

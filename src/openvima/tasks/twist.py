@@ -1,0 +1,103 @@
+"""`twist`: see from pictures by how much "twist" turns an object, then turn all objects of one texture so.
+
+Scene:    one or more objects of one texture to turn, distractors of other textures; no shape has a rotational
+          symmetry.
+Prompt:   '"Twist" is defined as rotating object a specific angle. For examples: From {before_twist_1} to
+          {after_twist_1}. … Now twist all red swirl objects.' Each pair shows an object of the shape, but not
+          of the texture, of one to turn.
+Success:  each yaw within 15 degrees of the asked one, position within 0.05 m of the start.
+Source:   VIMA paper, task list of the appendix, "Twist".
+"""
+
+import math
+from collections.abc import Sequence
+
+from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
+from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.registry import register_task
+from openvima.tasks.table import TableSampler
+from openvima.tasks.turning import ANGLES_DEG, check_angles, check_turnable, turn_goal, turned
+
+TEMPLATE = (
+    '"Twist" is defined as rotating object a specific angle. For examples: {examples} '
+    "Now twist all {twist_obj_texture} objects."
+)
+EXAMPLE = "From {{before_twist_{n}}} to {{after_twist_{n}}}."
+NUM_EXAMPLES = 3
+NUM_OBJECTS = {"easy": 3, "medium": 4, "hard": 5}
+TOLERANCE_M = 0.05
+EXAMPLE_LOW, EXAMPLE_HIGH = (0.4375, -0.375), (0.5625, 0.375)  # m, x and y, of objects in examples
+
+
+def template(num_examples: int) -> str:
+    """Write the slots of the examples into the prompt."""
+    examples = " ".join(EXAMPLE.format(n=n) for n in range(1, num_examples + 1))
+    return TEMPLATE.replace("{examples}", examples)
+
+
+@register_task(
+    "twist",
+    family="novel_concept_grounding",
+    template=template(NUM_EXAMPLES),
+    oracle_max_steps=NUM_OBJECTS["easy"] + 2,
+)
+def sample(
+    table: TableSampler,
+    *,
+    angles_deg: Sequence[float] = ANGLES_DEG,
+    num_examples: int = NUM_EXAMPLES,
+    num_objects: int | None = None,
+    difficulty: str = "easy",
+) -> Problem:
+    """Sample one problem.
+
+    Args:
+        table: The table to lay.
+        angles_deg: Angles to choose from; positive turns clockwise seen from above.
+        num_examples: Pairs of pictures in the prompt, 1 … 6.
+        num_objects: Objects on the table, 2 … 6; by default as many as the difficulty says. At least one has
+            to be turned and at least one is a distractor.
+        difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects.
+    """
+    check_difficulty(difficulty)
+    num_objects = NUM_OBJECTS[difficulty] if num_objects is None else num_objects
+    check_count("num_objects", num_objects, low=2, high=6)
+    check_count("num_examples", num_examples, low=1, high=6)
+    check_angles(angles_deg)
+    check_turnable(table.pool)
+    objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
+
+    num_targets = int(table.rng.integers(1, num_objects))
+    num_distractors = num_objects - num_targets
+    angle_deg, texture = table.choose(angles_deg), table.choose(textures)
+    others = [other for other in textures if other != texture]
+    targets = table.place(
+        "object to turn",
+        lambda: (table.choose(objects), texture),
+        count=num_targets,
+        tries=num_targets + 10,
+    )
+    distractors = table.place(
+        "distractor",
+        lambda: (table.choose(objects), table.choose(others)),
+        count=num_distractors,
+        tries=num_distractors + 10,
+    )
+    examples: dict[str, SceneImage] = {}
+    for n in range(1, num_examples + 1):
+        before = _example(table.blank(), table.choose(targets).object, table.choose(others))
+        examples[f"before_twist_{n}"] = SceneImage.of([before])
+        examples[f"after_twist_{n}"] = SceneImage.of([before.at(turned(before.pose, angle_deg))])
+    return Problem(
+        scene=table.scene(),
+        prompt=Prompt.parse(template(num_examples), twist_obj_texture=texture, **examples),
+        goals=tuple(turn_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
+        constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
+    )
+
+
+def _example(table: TableSampler, object_name: str, texture: str) -> Placement:
+    """Lay an object anywhere near the middle of an empty table, at any heading."""
+    x, y = table.rng.uniform(EXAMPLE_LOW, EXAMPLE_HIGH).tolist()
+    pose = Pose.planar(x, y, table.rng.uniform(0.0, 2 * math.pi))
+    return table.add(object_name, texture, size=table.sample_size(object_name), pose=pose, z=0.0)

@@ -1,0 +1,323 @@
+"""Vector environments: the bytes of single ones, Gymnasium's autoreset, and refusals that change nothing."""
+
+from collections.abc import Iterator
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import iterate
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+
+import openvima
+from openvima.env import TabletopEnv, stack_actions
+from openvima.errors import ActionError, ConfigError, EpisodeError, LevelError, OracleError, UnknownTaskError
+from openvima.policies import RandomPolicy
+from openvima.scene import Action
+
+CORNER = Action.planar((0.25, -0.5), (0.25, -0.5))  # picks in an empty corner and therefore moves nothing
+TASKS = ["rotate", {"task": "visual_manipulation", "level": "L2"}]  # each with a prompt of its own
+
+
+def frozen(value: object) -> object:
+    """A nested observation or info as something that `==` compares byte by byte."""
+    if isinstance(value, dict):
+        return {key: frozen(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [frozen(entry) for entry in value]
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value.shape, value.dtype.str, value.tobytes()
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def rows(envs: VectorEnv, observations: dict) -> list[dict]:
+    """The observation of each sub-environment, as a single one gives it."""
+    return [{**row, "ee": int(row["ee"])} for row in iterate(envs.observation_space, observations)]
+
+
+def info_of(infos: dict, index: int) -> dict:
+    """The info of one sub-environment, as a single one gives it."""
+    return {key: values[index] for key, values in infos.items() if infos.get(f"_{key}", [False] * 9)[index]}
+
+
+def prompt_bytes(prompts: tuple) -> object:
+    return [(p.text, {name: (image.rgb, image.segm) for name, image in p.images.items()}) for p in prompts]
+
+
+def oracle_actions(envs: VectorEnv) -> dict[str, np.ndarray]:
+    return stack_actions([decision.action for decision in envs.call("oracle_decision")])
+
+
+@pytest.fixture(scope="module", params=["sync", "async"])
+def pair(request: pytest.FixtureRequest) -> Iterator[VectorEnv]:
+    """Two sub-environments of different tasks and levels; tests leave them usable."""
+    envs = openvima.make_vec(TASKS, vectorization_mode=request.param, domain="eval")
+    yield envs
+    envs.close()
+
+
+def test_spaces_are_batches_of_the_single_ones(pair: VectorEnv) -> None:
+    single = TabletopEnv("rotate")
+    assert pair.single_observation_space == single.observation_space
+    assert pair.single_action_space == single.action_space
+    observations, _ = pair.reset(seed=0)
+    assert pair.observation_space.contains(observations)
+    assert observations["rgb"]["top"].shape == (2, 3, 128, 256)
+    assert pair.action_space.contains(oracle_actions(pair))
+
+
+def test_a_batch_holds_the_bytes_of_single_environments(pair: VectorEnv) -> None:
+    singles = [TabletopEnv("rotate", domain="eval"), TabletopEnv(**TASKS[1], domain="eval")]
+    observations, infos = pair.reset(seed=[4, 9])
+    expected = [env.reset(seed=seed) for env, seed in zip(singles, [4, 9], strict=True)]
+    assert frozen(rows(pair, observations)) == frozen([observation for observation, _ in expected])
+    assert [frozen(info_of(infos, i)) for i in range(2)] == [frozen(info) for _, info in expected]
+    prompts = prompt_bytes(pair.get_attr("prompt"))
+    assert frozen(prompts) == frozen(prompt_bytes(tuple(env.prompt for env in singles)))
+    for actions in ([CORNER, CORNER], [env.oracle_decision().action for env in singles]):
+        observations, rewards, terminated, truncated, infos = pair.step(stack_actions(actions))
+        results = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        assert frozen(rows(pair, observations)) == frozen([result[0] for result in results])
+        ends = list(zip(rewards.tolist(), terminated.tolist(), truncated.tolist(), strict=True))
+        assert ends == [result[1:4] for result in results]
+        assert [frozen(info_of(infos, i)) for i in range(2)] == [frozen(result[4]) for result in results]
+
+
+def with_row(key: str, value: object) -> dict[str, np.ndarray]:
+    """Two idle actions, of which the second is changed."""
+    actions = stack_actions([CORNER, CORNER])
+    actions[key][1] = value
+    return actions
+
+
+def without(key: str) -> dict[str, np.ndarray]:
+    actions = stack_actions([CORNER, CORNER])
+    del actions[key]
+    return actions
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (with_row("pose0_position", np.nan), r"sub-environment 1: pose0_position is \(nan, nan\)"),
+        (with_row("pose1_position", 0.8), r"sub-environment 1: pose1_position is \(0.8, 0.8\)"),
+        (without("pose1_rotation"), "sub-environment 0, 1: pose1_rotation missing"),
+        (stack_actions([CORNER, CORNER]) | {"gripper": 1}, "0, 1: unknown keys gripper"),
+        (stack_actions([CORNER]), "pose0_position has 1 rows; it must have one for each of the 2"),
+        (stack_actions([CORNER, CORNER]) | {"pose0_rotation": 1.0}, "pose0_rotation has no rows"),
+        (stack_actions([CORNER, CORNER]) | {"pose0_rotation": np.eye(2)}, r"shape \(2,\); it must be \(4,\)"),
+        ([CORNER, CORNER], "one mapping with keys .* not list"),
+    ],
+)
+def test_a_batch_with_a_bad_action_moves_nothing_anywhere(
+    pair: VectorEnv, actions: dict, message: str
+) -> None:
+    pair.reset(seed=[4, 9])
+    before = pair.get_attr("scene")
+    with pytest.raises(ActionError, match=message + ".*Nothing was moved"):
+        pair.step(actions)
+    assert pair.get_attr("scene") == before
+    assert pair.step(oracle_actions(pair))[1].tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": -1}, "seed is -1"),
+        ({"seed": [1, 2.5]}, "seed is 2.5"),
+        ({"seed": [1, 2, 3]}, "3 seeds for 2 sub-environments"),
+        ({"options": {"mask": [True]}}, "no option mask"),
+        ({"options": {"reset_mask": np.zeros(2, bool)}}, "at least one True"),
+        ({"options": {"reset_mask": [True, False]}}, "dtype bool"),
+    ],
+)
+def test_a_bad_reset_is_refused_and_changes_nothing(pair: VectorEnv, arguments: dict, message: str) -> None:
+    pair.reset(seed=[4, 9])
+    with pytest.raises(ConfigError, match=message):
+        pair.reset(**arguments)
+    assert [episode.seed for episode in pair.get_attr("episode")] == [4, 9]
+
+
+def test_an_error_in_a_call_does_no_harm(pair: VectorEnv) -> None:
+    pair.reset(seed=[4, 9])
+    pair.step(oracle_actions(pair))
+    with pytest.raises(OracleError):  # everything is done already
+        pair.call("oracle_decision")
+    with pytest.raises(AttributeError, match="scenery"):
+        pair.get_attr("scenery")
+    assert pair.reset(seed=np.int64(5))[1]["seed"].tolist() == [5, 6]
+
+
+def test_prompts_and_observations_feed_a_policy(pair: VectorEnv) -> None:
+    observations, _ = pair.reset(seed=2)
+    policy = RandomPolicy(seed=1)
+    policy.reset(pair.get_attr("prompt"))
+    actions = policy.act(rows(pair, observations))
+    single = TabletopEnv(**TASKS[1], domain="eval")
+    observation, _ = single.reset(seed=3)
+    policy.reset([single.prompt])
+    assert frozen(actions[1]) == frozen(policy.act([observation])[0])
+    pair.step(stack_actions(actions))
+
+
+def test_a_missing_action_becomes_an_idle_one() -> None:
+    arrays = CORNER.to_arrays()
+    stacked = stack_actions([arrays, None])
+    assert {key: (array.shape, array.dtype) for key, array in stacked.items()} == {
+        key: ((2, len(array)), np.dtype(np.float32)) for key, array in arrays.items()
+    }
+    env = TabletopEnv("rotate")
+    env.reset(seed=0)
+    before = env.scene
+    env.step({key: array[1] for key, array in stacked.items()})
+    assert env.scene == before
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    envs = openvima.make_vec("rotate", 2)
+    with pytest.raises(EpisodeError, match=r"0, 1 have no running episode; call reset\(\)"):
+        envs.step(stack_actions([None, None]))
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_the_next_step_after_an_end_begins_an_episode(kind: str) -> None:
+    envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, seeds=[3, 4, 5, 6])
+    assert envs.reset()[1]["seed"].tolist() == [3, 4]
+    oracle = envs.call("oracle_decision")[0].action
+    _, rewards, terminated, _, infos = envs.step(stack_actions([oracle, None]))
+    assert (rewards.tolist(), terminated.tolist()) == ([1.0, 0.0], [True, False])
+    assert infos["seed"].tolist() == [3, 4]
+    observations, rewards, terminated, _, infos = envs.step(stack_actions([None, None]))
+    assert (rewards.tolist(), terminated.tolist()) == ([0.0, 0.0], [False, False])
+    assert infos["seed"].tolist() == [5, 4]
+    assert infos["num_steps"].tolist() == [0, 2]
+    fresh = TabletopEnv("rotate")
+    assert frozen(rows(envs, observations)[0]) == frozen(fresh.reset(seed=5)[0])
+    assert frozen(prompt_bytes(envs.get_attr("prompt")[:1])) == frozen(prompt_bytes((fresh.prompt,)))
+    envs.close()
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_the_same_step_can_end_an_episode_and_begin_another(kind: str) -> None:
+    envs = openvima.make_vec(
+        "rotate", 2, vectorization_mode=kind, seeds=range(3, 7), autoreset_mode="SameStep"
+    )
+    envs.reset()
+    single = TabletopEnv("rotate")
+    single.reset(seed=3)
+    action = single.oracle_decision().action
+    last_observation, *_, last_info = single.step(action)
+    observations, rewards, terminated, _, infos = envs.step(stack_actions([action, None]))
+    assert (rewards.tolist(), terminated.tolist()) == ([1.0, 0.0], [True, False])
+    assert infos["_final_info"].tolist() == infos["_final_obs"].tolist() == [True, False]
+    assert frozen(infos["final_obs"][0]) == frozen(last_observation)
+    assert frozen(info_of(infos["final_info"], 0)) == frozen(last_info)
+    assert (infos["seed"].tolist(), infos["num_steps"].tolist()) == ([5, 4], [0, 1])
+    observation, _ = single.reset(seed=5)
+    assert frozen(rows(envs, observations)[0]) == frozen(observation)
+    assert envs.get_attr("prompt")[0].text == infos["prompt"][0] == single.prompt.text
+    envs.close()
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_without_autoreset_an_ended_episode_waits_for_its_reset(kind: str) -> None:
+    envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, autoreset_mode=AutoresetMode.DISABLED)
+    envs.reset(seed=[3, 4])
+    oracle = envs.call("oracle_decision")[0].action
+    assert envs.step(stack_actions([oracle, None]))[2].tolist() == [True, False]
+    with pytest.raises(
+        EpisodeError, match=r"sub-environments 0 have no running episode; call reset\(options="
+    ):
+        envs.step(stack_actions([None, None]))
+    observations, infos = envs.reset(seed=[8, None], options={"reset_mask": np.array([True, False])})
+    assert (infos["seed"].tolist(), infos["_seed"].tolist()) == ([8, 0], [True, False])
+    assert frozen(rows(envs, observations)[0]) == frozen(TabletopEnv("rotate").reset(seed=8)[0])
+    assert envs.step(stack_actions([None, None]))[4]["num_steps"].tolist() == [1, 2]
+    envs.close()
+
+
+def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
+    def play(num_envs: int, kind: str) -> dict[int, object]:
+        envs = openvima.make_vec("rotate", num_envs, vectorization_mode=kind, level="L2")
+        episodes = {}
+        for first in range(0, 6, num_envs):
+            observations, infos = envs.reset(seed=first)
+            after, *_ = envs.step(oracle_actions(envs))
+            for i, (before, then) in enumerate(zip(rows(envs, observations), rows(envs, after), strict=True)):
+                episodes[first + i] = frozen([before, then, infos["prompt"][i]])
+        envs.close()
+        return episodes
+
+    expected = play(1, "sync")
+    assert len({str(episode) for episode in expected.values()}) == 6
+    assert play(3, "sync") == play(2, "async") == play(3, "async") == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [("sync", {}), ("async", {}), ("async", {"context": "spawn", "shared_memory": False})],
+)
+def test_gymnasiums_own_function_gives_the_same_bytes(kind: str, settings: dict) -> None:
+    envs = gymnasium.make_vec(
+        "openvima/rotate-v0", num_envs=2, vectorization_mode=kind, vector_kwargs=settings, level="L1"
+    )
+    observations, _ = envs.reset(seed=[4, 9])
+    prompts = envs.get_attr("prompt")
+    after, rewards, *_ = envs.step(oracle_actions(envs))
+    for index, seed in enumerate([4, 9]):
+        single = TabletopEnv("rotate", level="L1")
+        assert frozen(rows(envs, observations)[index]) == frozen(single.reset(seed=seed)[0])
+        assert frozen(prompt_bytes(prompts[index : index + 1])) == frozen(prompt_bytes((single.prompt,)))
+        expected, reward, *_ = single.step(single.oracle_decision().action)
+        assert frozen(rows(envs, after)[index]) == frozen(expected)
+        assert rewards[index] == reward
+    envs.close()
+
+
+def test_gymnasiums_wrappers_take_the_infos() -> None:
+    envs = DictInfoToList(RecordEpisodeStatistics(openvima.make_vec("rotate", 2)))
+    _, infos = envs.reset(seed=[4, 9])
+    single = TabletopEnv("rotate")
+    assert frozen(infos[1]) == frozen(single.reset(seed=9)[1])
+    *_, infos = envs.step(oracle_actions(envs.unwrapped))
+    assert infos[0]["episode"]["r"] == 1.0
+
+
+def test_seeds_are_dealt_in_turn_and_begin_again() -> None:
+    envs = openvima.make_vec("rotate", 2, seeds=range(5))
+    series = [envs.reset()[1]["seed"].tolist() for _ in range(4)]
+    assert series == [[0, 1], [2, 3], [4, 1], [0, 3]]
+    assert envs.reset(seed=[8, None])[1]["seed"].tolist() == [8, 1]
+
+
+def test_tasks_are_taken_in_turn() -> None:
+    envs = openvima.make_vec(TASKS, 3, level="L1")
+    _, infos = envs.reset(seed=0)
+    assert infos["task"].tolist() == ["rotate", "visual_manipulation", "rotate"]
+    assert infos["level"].tolist() == ["L1", "L2", "L1"]
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+def test_what_cannot_be_built_is_refused_at_once(kind: str) -> None:
+    def build(tasks: object, *arguments: object, **options: object) -> None:
+        openvima.make_vec(tasks, *arguments, vectorization_mode=kind, **options)
+
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        build(["visual_manipulation", "rotat"])
+    with pytest.raises(LevelError, match="L9"):
+        build("rotate", 2, level="L9")
+    with pytest.raises(ConfigError, match=r"no option of task 'rotate'.*num_distractors"):
+        build("rotate", 2, num_distracters=1)
+    with pytest.raises(ConfigError, match="a name, or a mapping with 'task'"):
+        build([{"level": "L1"}])
+    with pytest.raises(ConfigError, match="1 seeds for 2"):
+        build("rotate", 2, seeds=[1])
+    with pytest.raises(ConfigError, match="at least one"):
+        build("rotate", 0)
+    with pytest.raises(ConfigError, match="autoreset mode 'Never'"):
+        build("rotate", 1, autoreset_mode="Never")
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(ConfigError, match="vectorization mode 'threads'.*sync, async"):
+        openvima.make_vec("rotate", 2, vectorization_mode="threads")
