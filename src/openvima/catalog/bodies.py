@@ -6,6 +6,7 @@ beside it, and the letter T is upright.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
     if not all(factor > 0 for factor in scale):
         raise AssetError(f"scale of {object_name} is {scale}; all three factors must be above 0.")
     if spec.kind == "kit":
-        return _kit(spec, scale)
+        return scaled_geometry(_kit(spec), scale)
     if object_name in _FIXED_SIZE:
         return scaled_geometry(_FIXED_SIZE[object_name](), scale)
     build, needed_lengths = _BOXES[object_name]
@@ -55,12 +56,11 @@ def has_fixed_size(object_name: str) -> bool:
     return object_spec(object_name).kind == "kit" or object_name in _FIXED_SIZE
 
 
-def _kit(spec: ObjectSpec, scale: Vector3) -> Geometry:
+@cache  # tasks stretch these few shapes by factors that are new in each episode
+def _kit(spec: ObjectSpec) -> Geometry:
     loops = outline(spec.name)
     height = spec.size_max[2] / boxes.HEIGHT_DIVISOR
-    return scaled_geometry(
-        Geometry(prism(loops, 0.0, height), (slab_hull(loops[0], 0.0, height),), 0.0), scale
-    )
+    return Geometry(prism(loops, 0.0, height), (slab_hull(loops[0], 0.0, height),), 0.0)
 
 
 def _frame() -> Geometry:
