@@ -22,7 +22,7 @@ def test_golden_prompts_could_be_ours(task: str, path: Path) -> None:
     ours = sample_episode(task, seed=0, compat=True).problem
     assert set(record["assets"]) == {name for name, _ in ours.prompt.images}
     words = re.split(r"\{\w+\}", task_spec(task).template)
-    pattern = r"(?:\{\w+\}|[\w-]+)".join(re.escape(word) for word in words)
+    pattern = r"(?:\{\w+\}|[\w -]+)".join(re.escape(word) for word in words)
     assert re.fullmatch(pattern, record["prompt"]) and re.fullmatch(pattern, ours.prompt.text)
 
 

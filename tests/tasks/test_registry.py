@@ -44,7 +44,7 @@ def test_a_task_describes_itself(task: str) -> None:
 def test_every_prompt_follows_the_template(task: str) -> None:
     spec = task_spec(task)
     pattern = re.escape(spec.template).replace(r"\{", "{").replace(r"\}", "}")
-    pattern = re.sub(r"\{(\w+)\}", r"(\\{\1\\}|[\\w-]+)", pattern)
+    pattern = re.sub(r"\{(\w+)\}", r"(\\{\1\\}|[\\w -]+)", pattern)
     for seed in range(5):
         text = sample_episode(task, level=spec.levels[0], seed=seed).problem.prompt.text
         assert re.fullmatch(pattern, text), text

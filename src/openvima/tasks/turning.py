@@ -33,8 +33,16 @@ def check_angles(angles_deg: Sequence[float]) -> None:
     """Refuse angles that are met, or nearly met, before anything is turned.
 
     Raises:
-        ConfigError: An angle is within 15 degrees of no turn at all, or there is none.
+        ConfigError: An angle is within 15 degrees of no turn at all or is no number, or there is none.
     """
+    try:
+        are_numbers = all(math.isfinite(angle) for angle in angles_deg)
+    except TypeError:
+        are_numbers = False
+    if not are_numbers:
+        raise ConfigError(
+            f"angles_deg is {angles_deg!r}; give a list of angles in degrees, such as [30, 60]."
+        )
     small = [angle for angle in angles_deg if abs(math.remainder(angle, 360)) <= TOLERANCE_DEG]
     if small or not angles_deg:
         shown = ", ".join(f"{angle:g}" for angle in small) or "nothing"
