@@ -7,13 +7,13 @@ Success:  object within 0.1 m of the base's origin, while no distractor is as ne
 Source:   VIMA paper, task list of the appendix, "Scene understanding".
 """
 
-from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt, SceneImage, Tolerance
+from openvima.scene import Placement, Problem, Prompt, SceneImage
+from openvima.tasks.into_base import APART_M, into_base, place_base_and_target
 from openvima.tasks.options import check_count, textures_by_difficulty
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Put the {dragged_texture} object in {scene} into the {base_texture} object."
-TOLERANCE = Tolerance(position_m=0.1)
 
 
 @register_task("scene_understanding", family="simple_manipulation", template=TEMPLATE, oracle_max_steps=3)
@@ -35,18 +35,15 @@ def sample(
     check_count("num_distractors", num_distractors, high=3)
     check_count("num_pictured_distractors", num_pictured_distractors, high=3)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
-    dragged_objects, base_objects = table.pool.dragged_objects, table.pool.base_objects
-    objects, textures = (*dragged_objects, *base_objects), (*dragged_textures, *base_textures)
-    apart_m = TOLERANCE.position_m  # nearer, and the episode would be decided at the start
+    textures = (*dragged_textures, *base_textures)
 
     base_texture = target_texture = ""
     while base_texture == target_texture:
         base_texture, target_texture = table.choose(base_textures), table.choose(dragged_textures)
-    base = table.place_one("base", lambda: (table.choose(base_objects), base_texture))
-    target = table.place_one(
-        "object to move", lambda: (table.choose(dragged_objects), target_texture), apart_m=apart_m
+    base, target = place_base_and_target(
+        table, dragged_textures=(target_texture,), base_textures=(base_texture,)
     )
-    other_shapes = [name for name in dragged_objects if name != target.object]
+    other_shapes = [name for name in table.pool.dragged_objects if name != target.object]
     other_base_textures = [texture for texture in textures if texture != base.texture]
 
     def draw_distractor() -> tuple[str, str]:
@@ -55,30 +52,28 @@ def sample(
         return base.object, table.choose(other_base_textures)
 
     distractors = table.place(
-        "distractor", draw_distractor, count=num_distractors, tries=num_distractors + 20, apart_m=apart_m
+        "distractor", draw_distractor, count=num_distractors, tries=num_distractors + 20, apart_m=APART_M
     )
-    picture = _picture(table, target, objects=objects, textures=textures, count=num_pictured_distractors)
-    return Problem(
-        scene=table.scene(),
-        prompt=Prompt.parse(
-            TEMPLATE, dragged_texture=target.texture, scene=picture, base_texture=base.texture
-        ),
-        goals=(AtPose(target.id, base.pose, TOLERANCE, relative_to=base.id),),
-        constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
+    prompt = Prompt.parse(
+        TEMPLATE,
+        dragged_texture=target.texture,
+        scene=_picture(table, target, textures, num_pictured_distractors),
+        base_texture=base.texture,
     )
+    return into_base(table, prompt, target=target, base=base, distractors=distractors)
 
 
 def _picture(
-    table: TableSampler,
-    target: Placement,
-    *,
-    objects: tuple[str, ...],
-    textures: tuple[str, ...],
-    count: int,
+    table: TableSampler, target: Placement, textures: tuple[str, ...], num_distractors: int
 ) -> SceneImage:
     """Show the object to move somewhere else, among anything that has not its texture."""
-    shown = table.blank()
-    shown.place_one("pictured object", lambda: (target.object, target.texture), size=target.size)
+    shown, objects = table.blank(), (*table.pool.dragged_objects, *table.pool.base_objects)
     others = [texture for texture in textures if texture != target.texture]
-    shown.place("pictured distractor", lambda: (shown.choose(objects), shown.choose(others)), count=count)
+    shown.place_one("pictured object", lambda: (target.object, target.texture), size=target.size)
+    shown.place(
+        "pictured distractor",
+        lambda: (shown.choose(objects), shown.choose(others)),
+        count=num_distractors,
+        tries=num_distractors + 10,
+    )
     return SceneImage.of(shown.placements)
