@@ -59,6 +59,18 @@ def test_the_cup_catches_what_is_a_little_beside_it(beside_m, is_caught) -> None
     assert z == pytest.approx(0.069 if is_caught else -0.001, abs=1e-3)
 
 
+def test_a_block_above_the_floor_is_caught_at_any_height_and_tilt() -> None:
+    rng = np.random.default_rng(0)
+    scene = table(("block", 0.5, 0.0, 0.0))
+    for _ in range(100):
+        tilt = Pose((0, 0, 0), (*rng.normal(0, 10.0 ** rng.uniform(-12, -1), size=2).tolist(), 0.0, 1.0))
+        pose = scene[5].pose.moved(dz=rng.uniform(0.001, 0.05)) @ tilt
+        bodies = Bodies(scene.with_poses({5: pose}), ASSETS)
+        x, y = rng.uniform(-0.025, 0.025, size=2).tolist()
+        index, z = body_under_needle(bodies, 0.5 + x, y)
+        assert index == 0 and z == pytest.approx(pose.z + 0.035, abs=0.02)
+
+
 def test_of_stacked_bodies_the_upper_one_is_picked_and_can_leave() -> None:
     scene = table(("block", 0.5, 0.0, 0.0), ("letter A", 0.5, 0.0, 0.0))
     scene = scene.with_poses({6: scene[6].pose.moved(dz=0.0705)})

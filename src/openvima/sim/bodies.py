@@ -9,7 +9,6 @@ import numpy as np
 from openvima.catalog.geometry import Assets, Vector3
 from openvima.scene import Pose, Scene
 from openvima.scene.pose import Quaternion, normalised
-from openvima.sim.end_effectors import NEEDLE_RADIUS_M
 from openvima.sim.model import NEEDLE_HALF_LENGTH_M, PARKED_M, TICK_S, body_shape, build_model
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
@@ -84,7 +83,7 @@ class Bodies:
 
     def place_needle(self, x: float, y: float, z: float) -> None:
         """Put the lower end of the needle somewhere, metres."""
-        self.data.mocap_pos[self._needle_mocap] = (x, y, z + NEEDLE_HALF_LENGTH_M + NEEDLE_RADIUS_M)
+        self.data.mocap_pos[self._needle_mocap] = (x, y, z + NEEDLE_HALF_LENGTH_M)
 
     def place_blade(self, pose: Pose) -> None:
         """Put the blade's centre somewhere, at rest."""
