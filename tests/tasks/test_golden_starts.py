@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from openvima.catalog import object_spec
 from openvima.scene import FIRST_OBJECT_ID
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
@@ -37,7 +38,9 @@ def test_golden_starts_have_our_ids_roles_and_heights(task: str, path: Path) -> 
         if placement.object not in recorded or placement.object in ("bowl", "frame"):
             continue  # those two were recorded by a centre of mass beside the link frame
         other = recorded[placement.object]
-        assert placement.pose.z == pytest.approx(other["pos"][2])
+        spec = object_spec(placement.object)
+        if spec.size_min == spec.size_max and not task.startswith("novel_adj"):  # heights drawn at random
+            assert placement.pose.z == pytest.approx(other["pos"][2])
         assert ("fixed" if placement.fixed else "rigid") == other["category"]
         if placement.object in ("line", "three-sided rectangle"):
             boxes = [shape["dims"] for shape in other["shapes"]]
