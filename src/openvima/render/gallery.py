@@ -1,0 +1,272 @@
+"""A web page that shows every object and texture of an asset pack: pictures, measures, and who uses it."""
+
+import html
+import io
+from collections.abc import Callable, Sequence
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from openvima.catalog import (
+    LEVELS,
+    NEUTRAL_TEXTURE,
+    OBJECT_SETS,
+    OBJECTS,
+    TEXTURE_SETS,
+    TEXTURES,
+    Assets,
+    ObjectSpec,
+    TextureSpec,
+    pool,
+    tasks_at,
+    texture_spec,
+)
+from openvima.errors import AssetError
+from openvima.files import write_whole
+from openvima.render.camera import VIEWS, View
+from openvima.render.portraits import Detail, draw_portrait
+from openvima.render.rasteriser import Rasteriser
+
+Report = Callable[[int, int, str], None]
+
+PICTURES = "pictures"
+_SWATCH_PX = 240
+_SAMPLE_OBJECT = "round"  # shows each texture on a large flat face and a curved wall
+_HEROES = ("wooden", "yellow", "cyan", "tiger", "blue and purple stripe", "orange", "brick", "pink")
+_PALETTES = (
+    ("red", "tiger", "yellow and blue stripe", "red and green polka dot", "blue swirl", "green paisley"),
+    ("green", "magma", "red and purple stripe", "blue and purple polka dot", "red swirl", "purple paisley"),
+    ("blue", "granite", "green and purple stripe", "polka dot", "purple swirl", "yellow paisley"),
+    ("purple", "rainbow", "dark red and blue stripe", "checkerboard", "dark green swirl", "red paisley"),
+    ("dark blue", "tiles", "red and yellow stripe", "yellow and purple polka dot", "plastic", "blue paisley"),
+)
+_KINDS = {
+    "kit": "flat prism",
+    "box": "box of the sampled size",
+    "compound": "put together from boxes",
+    "mesh": "modelled shape of one size",
+}
+_CATEGORIES = {
+    "plain": "Plain colours",
+    "special": "Materials and single patterns",
+    "stripe": "Stripes",
+    "polka_dot_2": "Polka dots in two colours",
+    "swirl": "Swirls",
+    "paisley": "Paisleys",
+    "neutral": "Neutral",
+}
+_ROLES_OUTSIDE_POOLS = {"line": "the line that sweeps must not touch or cross"}
+
+
+def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) -> tuple[Path, tuple[str, ...]]:
+    """Write index.html and its pictures; the page needs nothing else and nothing from the network.
+
+    Args:
+        out: Folder; what an earlier call wrote there is overwritten.
+        assets: The pack to show.
+        report: Is told how many of how many entries are drawn, and the last one's name.
+
+    Returns:
+        The page, and a sentence for each object and texture that the pack cannot show.
+    """
+    artist = _Artist(out, Rasteriser(assets))
+    textures = [*TEXTURES.values(), texture_spec(NEUTRAL_TEXTURE)]
+    total = len(OBJECTS) + len(textures)
+    objects, swatches = [], []
+    for index, spec in enumerate(OBJECTS.values()):
+        objects.append(_object_card(artist, spec, index))
+        if report:
+            report(len(objects), total, spec.name)
+    for spec in textures:
+        swatches.append(_texture_card(artist, spec))
+        if report:
+            report(len(objects) + len(swatches), total, spec.name)
+    page = write_whole(out / "index.html", _page(assets.name, objects, _by_category(textures, swatches)))
+    return page, tuple(dict.fromkeys(artist.problems))
+
+
+class _Artist:
+    """Draws pictures into the page's folder and returns their <img> elements."""
+
+    def __init__(self, out: Path, rasteriser: Rasteriser) -> None:
+        self.out = out
+        self.rasteriser = rasteriser
+        self.problems: list[str] = []
+
+    def portrait(self, object_name: str, texture_name: str, view: View, *, detail: Detail = 1) -> str:
+        return self._picture(
+            _slug(f"{object_name} in {texture_name} {view}"),
+            f"{texture_name} {object_name}" + (", from above" if view == "top" else ""),
+            lambda: draw_portrait(self.rasteriser, object_name, texture_name, view, detail=detail),
+        )
+
+    def swatch(self, texture_name: str) -> str:
+        return self._picture(
+            _slug(f"texture {texture_name}"),
+            f"texture {texture_name}",
+            lambda: _shrunk(self.rasteriser.assets.texture(texture_name)),
+        )
+
+    def _picture(self, name: str, title: str, draw: Callable[[], np.ndarray]) -> str:
+        try:
+            pixels = draw()
+        except AssetError as error:
+            self.problems.append(str(error))
+            return f'<span class="missing">{html.escape(title)} is missing</span>'
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "PNG")
+        write_whole(self.out / PICTURES / f"{name}.png", stream.getvalue())
+        height, width = pixels.shape[:2]
+        return (
+            f'<img src="{PICTURES}/{name}.png" width="{width}" height="{height}" '
+            f'alt="{html.escape(title)}" title="{html.escape(title)}" loading="lazy">'
+        )
+
+
+def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> str:
+    hero = _HEROES[index % len(_HEROES)]
+    views = "".join(artist.portrait(spec.name, hero, view, detail=2) for view in VIEWS)
+    palette = _PALETTES[index % len(_PALETTES)]
+    strip = "".join(artist.portrait(spec.name, name, "front") for name in palette)
+    facts = {
+        "size": _extent(artist, spec),
+        "mass": f"{1000 * spec.mass_kg:g} g",
+        "turned": _symmetry(spec.symmetry_rad),
+        "sets": _sets_with(spec.name, OBJECT_SETS),
+    }
+    rows = {
+        "to be moved": _levels_where(lambda pool: spec.name in pool.dragged_objects),
+        "as a base": _levels_where(lambda pool: spec.name in pool.base_objects),
+    }
+    note = _ROLES_OUTSIDE_POOLS.get(spec.name, "") or ("" if any(rows.values()) else "used by no task")
+    return (
+        f'<article class="card" id="{_slug(spec.name)}"><h3>{spec.name}</h3>'
+        f'<p class="kind">{_KINDS[spec.kind]}</p>'
+        f'<div class="views">{views}</div><div class="strip">{strip}</div>'
+        f"{_facts(facts)}{_level_table(rows, note)}</article>"
+    )
+
+
+def _texture_card(artist: _Artist, spec: TextureSpec) -> str:
+    facts = {}
+    try:
+        image = artist.rasteriser.assets.texture(spec.name)
+    except AssetError:
+        facts["image"] = "missing"
+    else:
+        height, width = image.shape[:2]
+        mean = image.reshape(-1, 3).mean(axis=0)
+        facts["mean" if width > 1 else "RGB"] = ", ".join(f"{channel:.0f}" for channel in mean)
+        if width > 1:
+            facts["image"] = f"{width} × {height} pixels"
+    facts["sets"] = _sets_with(spec.name, TEXTURE_SETS)
+    rows = {
+        "moved objects": _levels_where(lambda pool: spec.name in pool.dragged_textures),
+        "bases": _levels_where(lambda pool: spec.name in pool.base_textures),
+    }
+    if spec.name == NEUTRAL_TEXTURE:
+        note = "prompt images that show a shape only"
+    else:
+        note = "" if any(rows.values()) else "used by no task"
+    return (
+        f'<article class="card" id="{_slug("texture " + spec.name)}"><h3>{spec.name}</h3>'
+        f'<div class="views">{artist.swatch(spec.name)}'
+        f"{artist.portrait(_SAMPLE_OBJECT, spec.name, 'front')}</div>"
+        f"{_facts(facts)}{_level_table(rows, note)}</article>"
+    )
+
+
+def _extent(artist: _Artist, spec: ObjectSpec) -> str:
+    """Measures of what is drawn; for objects of several sizes the largest, and the range of the sides."""
+    try:
+        vertices = artist.rasteriser.assets.geometry(spec.name, spec.size_max).visual.vertices
+    except AssetError:
+        return "unknown"
+    lengths = np.ptp(vertices.reshape(-1, 3), axis=0)
+    text = " × ".join(f"{100 * length:.1f}" for length in lengths) + " cm"
+    if spec.kind in ("box", "compound") and spec.size_min != spec.size_max:
+        text += f", sides from {100 * spec.size_min[0]:.0f} to {100 * spec.size_max[0]:.0f}"
+    return text
+
+
+def _symmetry(symmetry_rad: float | None) -> str:
+    if symmetry_rad is None:
+        return "not stated"
+    if symmetry_rad == 0:
+        return "looks the same at any angle"
+    degrees = round(np.rad2deg(symmetry_rad))
+    return "no symmetry" if degrees == 360 else f"counts as the same every {degrees}°"
+
+
+def _sets_with(name: str, sets: dict[str, tuple[str, ...]]) -> str:
+    return ", ".join(title for title, members in sets.items() if name in members) or "none"
+
+
+def _levels_where(is_used: Callable[..., bool]) -> dict[str, tuple[str, ...]]:
+    """Levels with the tasks of which the pool passes, for those levels that have any."""
+    found = {level: tuple(t for t in tasks_at(level) if is_used(pool(t, level))) for level in LEVELS}
+    return {level: tasks for level, tasks in found.items() if tasks}
+
+
+def _facts(facts: dict[str, str]) -> str:
+    return "<dl>" + "".join(f"<dt>{k}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items()) + "</dl>"
+
+
+def _level_table(rows: dict[str, dict[str, tuple[str, ...]]], note: str) -> str:
+    """Which levels use an entry, a line a role; the tasks show when the pointer rests on a level."""
+    lines = []
+    for role, levels in rows.items():
+        if levels:
+            chips = "".join(
+                f'<span class="{"on" if level in levels else "off"}" '
+                f'title="{html.escape(", ".join(levels.get(level, ())) or "no task")}">{level}</span>'
+                for level in LEVELS
+            )
+            lines.append(f'<div class="levels"><b>{role}</b>{chips}</div>')
+    return "".join(lines) + (f'<p class="note">{note}</p>' if note else "")
+
+
+def _by_category(textures: Sequence[TextureSpec], cards: Sequence[str]) -> str:
+    sections = []
+    for category, title in _CATEGORIES.items():
+        members = [card for spec, card in zip(textures, cards, strict=True) if spec.category == category]
+        sections.append(f"<h3>{title} ({len(members)})</h3>" + _grid(members, "small"))
+    return "".join(sections)
+
+
+def _grid(cards: Sequence[str], size: str) -> str:
+    return f'<div class="grid {size}">{"".join(cards)}</div>'
+
+
+def _page(pack: str, objects: Sequence[str], textures: str) -> str:
+    style = resources.files("openvima.render").joinpath("gallery.css").read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>Objects and textures · {pack} pack · openvima</title>\n"
+        f'<link rel="icon" href="data:,">\n<style>\n{style}</style>\n</head>\n<body>\n'
+        f'<header><div><p class="eyebrow">openvima · {pack} pack</p>'
+        f"<h1>{len(objects)} objects, {len(TEXTURES)} textures</h1>"
+        "<p>Drawn by the simulator's own renderer, enlarged and with smoothed edges. Each object is seen by "
+        "the front camera and from above. Highlighted levels use it; point at one for its tasks.</p>"
+        '<nav><a href="#objects">Objects</a><a href="#textures">Textures</a></nav></div></header>\n<main>\n'
+        f'<section id="objects"><h2>Objects</h2>{_grid(objects, "large")}</section>\n'
+        f'<section id="textures"><h2>Textures</h2>{textures}</section>\n'
+        "</main>\n</body>\n</html>\n"
+    )
+
+
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    """A picture of a texture no larger than the page shows it; a plain colour becomes an area."""
+    height, width = image.shape[:2]
+    if width == 1:
+        return np.broadcast_to(image, (_SWATCH_PX, _SWATCH_PX, 3)).copy()
+    factor = min(1.0, _SWATCH_PX / min(height, width))
+    size = (round(width * factor), round(height * factor))
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
+
+
+def _slug(text: str) -> str:
+    return text.lower().replace(" ", "-")
