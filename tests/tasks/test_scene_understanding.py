@@ -1,0 +1,211 @@
+"""Scenes, pictures and outcomes of `scene_understanding` follow its specification."""
+
+import collections
+import re
+
+import numpy as np
+import pytest
+
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import TEXTURE_SETS, Assets, pool
+from openvima.errors import ConfigError
+from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem, SceneImage
+from openvima.tasks import TableSampler, advance, begin, sample_episode, task_spec
+
+TASK = "scene_understanding"
+NUM_EPISODES = 2000
+SENTENCE = r"Put the ([\w ]+) object in \{scene\} into the ([\w ]+) object\."
+
+
+def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
+    """Target, base and distractors."""
+    (goal,) = problem.goals
+    (constraint,) = problem.constraints
+    assert isinstance(goal, AtPose) and goal.relative_to is not None
+    assert isinstance(constraint, DistractorsApart) and not constraint.at_end
+    scene = problem.scene
+    return scene[goal.object_id], scene[goal.relative_to], [scene[i] for i in constraint.object_ids]
+
+
+def pictured(problem: Problem) -> tuple[Placement, ...]:
+    ((name, image),) = problem.prompt.images
+    assert name == "scene" and isinstance(image, SceneImage)
+    return image.scene.placements
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
+
+
+def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
+    drawn_from = task_spec(TASK).pool("train")
+    casts = [cast(problem) for problem in problems]
+    assert_uniform((target.texture for target, _, _ in casts), drawn_from.dragged_textures)
+    assert_uniform((base.texture for _, base, _ in casts), drawn_from.base_textures)
+    assert_uniform((base.object for _, base, _ in casts), drawn_from.base_objects)
+    # Narrow shapes fit beside a hollow base more often, so targets are uniform only roughly.
+    counts = collections.Counter(target.object for target, _, _ in casts)
+    assert set(counts) == set(drawn_from.dragged_objects)
+    assert all(0.6 < count * 14 / NUM_EPISODES < 1.5 for count in counts.values())
+
+
+@pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+def test_every_level_draws_from_its_pool(level: str) -> None:
+    drawn_from = pool(TASK, level)
+    for seed in range(150):
+        target, base, distractors = cast(sample_episode(TASK, level=level, seed=seed).problem)
+        assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
+        assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
+        for distractor in distractors:
+            assert distractor.texture in (*drawn_from.dragged_textures, *drawn_from.base_textures)
+
+
+def test_a_distractor_looks_like_the_base_or_has_the_texture_of_the_target(problems: list[Problem]) -> None:
+    kinds = []
+    for target, base, (distractor,) in map(cast, problems):
+        is_base = distractor.object == base.object
+        assert target.texture != base.texture
+        assert distractor.fixed is is_base and base.fixed and not target.fixed
+        if is_base:
+            assert distractor.texture != base.texture
+        else:
+            assert distractor.texture == target.texture and distractor.object != target.object
+        kinds.append(is_base)
+    assert 0.44 < np.mean(kinds) < 0.51  # bases are a little harder to place
+
+
+def test_a_base_as_distractor_may_have_any_other_texture(problems: list[Problem]) -> None:
+    seen = {d.texture for _, base, (d,) in map(cast, problems) if d.object == base.object}
+    assert seen == {*TEXTURE_SETS["C1"], *TEXTURE_SETS["C2"]}
+
+
+def test_the_picture_shows_the_target_among_things_of_other_textures(problems: list[Problem]) -> None:
+    num_same_shape = num_same_place = 0
+    for problem in problems:
+        target, _, _ = cast(problem)
+        first, second = pictured(problem)
+        shown, other = (first, second) if first.texture == target.texture else (second, first)
+        assert (shown.object, shown.size, shown.texture) == (target.object, target.size, target.texture)
+        assert other.texture != target.texture and {first.id, second.id} == {2, 3}
+        assert shown.pose.planar_distance(other.pose) > 0.05
+        num_same_shape += other.object == target.object
+        num_same_place += shown.pose == target.pose
+    assert 0.03 < num_same_shape / NUM_EPISODES < 0.085  # 1 in 18
+    assert num_same_place == 0
+
+
+def test_ids_in_the_picture_do_not_tell_the_target(problems: list[Problem]) -> None:
+    ids = (p.id for problem in problems for p in pictured(problem) if p.texture == cast(problem)[0].texture)
+    assert_uniform(ids, (2, 3))
+
+
+def test_the_prompt_names_both_textures(problems: list[Problem]) -> None:
+    assert task_spec(TASK).template == (
+        "Put the {dragged_texture} object in {scene} into the {base_texture} object."
+    )
+    for problem in problems:
+        target, base, _ = cast(problem)
+        match = re.fullmatch(SENTENCE, problem.prompt.text)
+        assert match and match.groups() == (target.texture, base.texture)
+
+
+def test_nothing_starts_within_the_tolerance_of_anything(problems: list[Problem]) -> None:
+    for problem in problems:
+        poses = [placement.pose for placement in problem.scene.placements]
+        assert all(a.planar_distance(b) >= 0.1 for i, a in enumerate(poses) for b in poses[:i])
+
+
+@pytest.mark.parametrize(
+    ("target_at", "distractor_at", "success", "failure"),
+    [
+        (0.099, None, True, False),
+        (0.101, None, False, False),
+        (None, 0.099, False, True),
+        (None, 0.101, False, False),
+        (0.05, 0.14, False, True),  # in the base, but 0.09 m from the distractor
+        (0.03, 0.14, True, False),
+    ],
+)
+def test_distances_decide(
+    target_at: float | None, distractor_at: float | None, success: bool, failure: bool
+) -> None:
+    problem = sample_episode(TASK, seed=1).problem
+    target, base, (distractor,) = cast(problem)
+    inward = 1.0 if base.pose.y < 0 else -1.0
+    moved = {}
+    for object_id, distance in ((target.id, target_at), (distractor.id, distractor_at)):
+        if distance is not None:
+            moved[object_id] = base.pose.moved(dy=inward * distance)
+    outcome = advance(problem, begin(problem), problem.scene.with_poses(moved))[1]
+    assert (outcome.success, outcome.failure) == (success, failure), outcome.reason
+
+
+def test_a_lost_target_is_a_failure_and_a_lost_distractor_is_none() -> None:
+    problem = sample_episode(TASK, seed=1).problem
+    target, _, (distractor,) = cast(problem)
+    for object_id, failure in ((target.id, True), (distractor.id, False)):
+        scene = problem.scene.with_poses({object_id: Pose.planar(0.76, 0.0)})
+        outcome = advance(problem, begin(problem), scene)[1]
+        assert outcome.failure is failure and (failure or outcome == Outcome())
+
+
+@pytest.mark.parametrize(("difficulty", "dragged", "base"), [("easy", "C1", "C2"), ("hard", "C2", "C1")])
+def test_hard_exchanges_the_textures(difficulty: str, dragged: str, base: str) -> None:
+    for seed in range(40):
+        target, container, _ = cast(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
+        assert target.texture in TEXTURE_SETS[dragged] and container.texture in TEXTURE_SETS[base]
+
+
+def test_medium_draws_two_different_textures_of_one_set() -> None:
+    sets = []
+    for seed in range(400):
+        target, base, _ = cast(sample_episode(TASK, seed=seed, difficulty="medium").problem)
+        assert target.texture != base.texture
+        sets.append(target.texture in TEXTURE_SETS["C1"])
+        assert (base.texture in TEXTURE_SETS["C1"]) is sets[-1]
+    assert_frequencies(sets, {True: 0.5, False: 0.5})
+
+
+@pytest.mark.parametrize(("num_distractors", "num_pictured"), [(0, 2), (2, 0), (3, 3)])
+def test_the_numbers_of_distractors_can_be_chosen(num_distractors: int, num_pictured: int) -> None:
+    for seed in range(20):
+        problem = sample_episode(
+            TASK, seed=seed, num_distractors=num_distractors, num_pictured_distractors=num_pictured
+        ).problem
+        assert len(cast(problem)[2]) == num_distractors
+        assert len(pictured(problem)) == 1 + num_pictured
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("num_distractors", 4, "num_distractors is 4; give an integer from 0 to 3"),
+        ("num_pictured_distractors", -1, "num_pictured_distractors is -1"),
+        ("difficulty", "hardest", "no difficulty 'hardest'. Did you mean 'hard'"),
+    ],
+)
+def test_bad_options_are_refused(option: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sample_episode(TASK, seed=0, **{option: value})
+
+
+def test_in_a_picture_hollow_bases_are_things_like_any_other(assets: Assets) -> None:
+    table = TableSampler(np.random.default_rng(0), pool(TASK, "train"), assets=assets)
+    shown = table.blank()
+    shown.add("cross", "red", size=(0.128, 0.128, 0.032), pose=Pose.planar(0.5, 0.0))
+    frame = shown.add("frame", "blue", size=(0.225, 0.225, 0.0), pose=Pose.planar(0.5, 0.2))
+    assert not frame.fixed and table.placements == []
+
+
+def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
+    for seed in range(20):
+        problem = sample_episode(TASK, seed=seed, compat=True).problem
+        target, base, (distractor,) = cast(problem)
+        assert (base.id, target.id, distractor.id) == (5, 6, 7)
+        assert target.pose.z == pytest.approx(target.size[2] / 2)
+        assert [p.texture == target.texture for p in pictured(problem)] == [True, False]
+
+
+def test_bad_luck_is_rare() -> None:
+    assert sum(sample_episode(TASK, level="L3", seed=seed).num_redraws for seed in range(500)) <= 5
