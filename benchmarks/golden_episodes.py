@@ -7,20 +7,23 @@ replayed from its recorded start, so that differences do not add up.
 import gzip
 import json
 import math
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from golden_scenes import link_pose, size_and_scale
+from golden_scenes import RecordingError, link_pose, size_and_scale
 from openvima.catalog import Assets, object_spec
+from openvima.errors import OpenVimaError
 from openvima.scene import Action, Placement, Pose, Scene, angle_difference
 from openvima.sim import World
 
-MOVED_M = 0.005  # a body counts as moved from this distance …
-MOVED_RAD = math.radians(3)  # … or turn on
+MOVED_M = 0.005  # a body counts as moved from this planar distance on
+TURNED_RAD = math.radians(3)  # one that was carried may also just have been turned
+FAR_M = 0.02  # bodies that end farther apart than this are listed one by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,30 +48,79 @@ class RecordedStep:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """How one free body of one step came to lie, here and there.
+class BodyDifference:
+    """How one free body of one step came to lie, in the recording ("there") and here.
 
     Args:
-        is_lifted: It was grasped here.
-        is_swept: The step was a sweep.
-        moved: Whether the benchmark moved it.
-        moved_here: Whether we did.
-        position_m: Planar distance of the two results.
-        yaw_rad: Angle between them.
+        label: Object id and name, for messages.
+        moved_there_m: Planar way in the recording.
+        moved_here_m: Planar way here.
+        apart_m: Planar distance of the two results.
+        apart_rad: Angle between them, up to the body's symmetry.
+        is_carried: The action carried it: it was lifted here or, if nothing was, the one that moved farthest
+            there.
     """
 
-    is_lifted: bool
-    is_swept: bool
-    moved: bool
-    moved_here: bool
-    position_m: float
-    yaw_rad: float
+    label: str
+    moved_there_m: float
+    moved_here_m: float
+    apart_m: float
+    apart_rad: float
+    is_carried: bool
+
+    @property
+    def moved_there(self) -> bool:
+        """Whether the benchmark moved it."""
+        return self.moved_there_m > MOVED_M
+
+    @property
+    def moved_here(self) -> bool:
+        """Whether we did."""
+        return self.moved_here_m > MOVED_M
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it moved and ended far from where it does in the recording."""
+        return (self.moved_there or self.moved_here) and self.apart_m > FAR_M
+
+
+@dataclass(frozen=True, slots=True)
+class StepDifference:
+    """How one step came out, in the recording and here.
+
+    Args:
+        step: What was replayed.
+        bodies: The free bodies.
+    """
+
+    step: RecordedStep
+    bodies: tuple[BodyDifference, ...]
+
+    @property
+    def same_moved(self) -> bool:
+        """Whether the same bodies moved."""
+        return all(body.moved_there == body.moved_here for body in self.bodies)
 
 
 def read_steps(path: Path) -> Iterator[RecordedStep]:
-    """Read all steps of a recording (`episodes.json.gz`), episode by episode."""
-    with gzip.open(path, "rt", encoding="utf-8") as file:
-        episodes = json.load(file)
+    """Read all steps of a recording (`episodes.json.gz`), episode by episode.
+
+    Raises:
+        RecordingError: The file is missing, damaged, empty or lacks something.
+    """
+    try:
+        with gzip.open(path, "rt", encoding="utf-8") as file:
+            episodes = json.load(file)
+        if not episodes:
+            raise RecordingError(f"{path} holds no episodes.")
+        yield from _steps(episodes)
+    except (OpenVimaError, OSError, EOFError, zlib.error, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} is no recording of episodes: {error}") from error
+    except KeyError as error:
+        raise RecordingError(f"{path} lacks the entry {error}.") from error
+
+
+def _steps(episodes: list[dict[str, Any]]) -> Iterator[RecordedStep]:
     for episode in episodes:
         bodies = {int(number): body for number, body in episode["objects"].items()}
         for number, step in enumerate(episode["steps"]):
@@ -103,54 +155,61 @@ def _link_pose(object_name: str, numbers: list[float]) -> Pose:
     return link_pose({"name": object_name, "pos": numbers[:3], "quat_xyzw": numbers[3:]})
 
 
-def replay(step: RecordedStep, assets: Assets) -> list[Difference]:
+def replay(step: RecordedStep, assets: Assets) -> StepDifference:
     """Replay one step and compare every free body with the recording."""
     world = World(step.before, assets, compat=True)
-    execution = world.execute(step.action)
-    differences = []
-    for start, end in zip(step.before.placements, world.scene.placements, strict=True):
-        if start.fixed:
-            continue
-        theirs = step.after[start.id]
-        symmetry = object_spec(start.object).symmetry_rad
-        differences.append(
-            Difference(
-                is_lifted=execution.grasped == start.id,
-                is_swept=step.before.end_effector == "spatula",
-                moved=_has_moved(start.pose, theirs),
-                moved_here=_has_moved(start.pose, end.pose),
-                position_m=end.pose.planar_distance(theirs),
-                yaw_rad=angle_difference(
-                    end.pose.yaw_rad, theirs.yaw_rad, 2 * math.pi if symmetry is None else symmetry
-                ),
-            )
-        )
-    return differences
+    grasped = world.execute(step.action).grasped
+    free = [placement for placement in step.before.placements if not placement.fixed]
+    carried = grasped
+    if step.before.end_effector == "suction" and grasped is None and free:
+        farthest = max(free, key=lambda body: body.pose.planar_distance(step.after[body.id]))
+        turn = angle_difference(farthest.pose.yaw_rad, step.after[farthest.id].yaw_rad)
+        is_moved = farthest.pose.planar_distance(step.after[farthest.id]) > MOVED_M or turn > TURNED_RAD
+        carried = farthest.id if is_moved else None
+    return StepDifference(step, tuple(_compared(body, world.scene, step, carried) for body in free))
 
 
-def _has_moved(before: Pose, after: Pose) -> bool:
-    turn = angle_difference(before.yaw_rad, after.yaw_rad)
-    return before.planar_distance(after) > MOVED_M or turn > MOVED_RAD
+def _compared(start: Placement, ours: Scene, step: RecordedStep, carried: int | None) -> BodyDifference:
+    here, there = ours[start.id].pose, step.after[start.id]
+    symmetry = object_spec(start.object).symmetry_rad
+    period_rad = 2 * math.pi if symmetry is None else symmetry
+    return BodyDifference(
+        label=f"{start.id} {start.object}",
+        moved_there_m=start.pose.planar_distance(there),
+        moved_here_m=start.pose.planar_distance(here),
+        apart_m=here.planar_distance(there),
+        apart_rad=angle_difference(here.yaw_rad, there.yaw_rad, period_rad),
+        is_carried=start.id == carried,
+    )
 
 
-def summary(differences: list[Difference]) -> dict[str, float | int | None]:
+def summary(steps: Iterable[StepDifference]) -> dict[str, float | int | None]:
     """Summarise how well results agree; medians are None where there is nothing to compare.
 
     Returns:
-        `same_moved`: share of free bodies that moved there and here, or stayed there and here;
-        `place_error_mm_median` and `yaw_error_deg_median`: of bodies that were lifted;
-        `sweep_error_mm_median`: of bodies that the benchmark's blade moved.
+        `same_moved`: share of steps in which the same bodies moved; `place_error_mm_median` and
+        `yaw_error_deg_median`: of bodies that were carried; `sweep_error_mm_median`: of bodies that the
+        benchmark's blade moved.
     """
-    lifted = [d for d in differences if d.is_lifted and d.moved]
-    swept = [d for d in differences if d.is_swept and d.moved]
+    steps = tuple(steps)
+    carried = [body for step in steps for body in step.bodies if body.is_carried]
+    swept = [
+        body
+        for step in steps
+        if step.step.before.end_effector == "spatula"
+        for body in step.bodies
+        if body.moved_there
+    ]
     return {
-        "same_moved": sum(d.moved == d.moved_here for d in differences) / len(differences),
-        "place_error_mm_median": _median([d.position_m * 1e3 for d in lifted]),
-        "yaw_error_deg_median": _median([math.degrees(d.yaw_rad) for d in lifted]),
-        "sweep_error_mm_median": _median([d.position_m * 1e3 for d in swept]),
-        "num_bodies": len(differences),
-        "num_lifted": len(lifted),
+        "same_moved": sum(step.same_moved for step in steps) / len(steps),
+        "place_error_mm_median": _median([body.apart_m * 1e3 for body in carried]),
+        "yaw_error_deg_median": _median([math.degrees(body.apart_rad) for body in carried]),
+        "sweep_error_mm_median": _median([body.apart_m * 1e3 for body in swept]),
+        "num_steps": len(steps),
+        "num_same_moved": sum(step.same_moved for step in steps),
+        "num_carried": len(carried),
         "num_swept": len(swept),
+        "num_far": sum(body.is_far for step in steps for body in step.bodies),
     }
 
 

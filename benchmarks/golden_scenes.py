@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from openvima.catalog import Assets, Vector3, object_spec
+from openvima.errors import OpenVimaError
 from openvima.render import VIEWS, empty_labels, stamp
 from openvima.scene import BACKGROUND_ID, ObjectImage, Placement, Pose, Scene
 
@@ -100,10 +101,10 @@ def read_scene(path: Path) -> GoldenScene:
     """
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        with np.load(path.with_suffix(".npz")) as arrays:
+        with path.with_suffix(".npz").open("rb") as file, np.load(file) as arrays:
             images = {name: arrays[name] for name in arrays.files}
         return _golden_scene(record, images)
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OpenVimaError, OSError, ValueError, zipfile.BadZipFile) as error:
         raise RecordingError(f"{path.with_suffix('')}.{{json,npz}}: {error}") from error
     except KeyError as error:
         raise RecordingError(f"{path.with_suffix('')}.{{json,npz}} lack the entry {error}.") from error
