@@ -1,6 +1,7 @@
 """Free places, sizes, crowding, redraws; what a sampled episode promises whatever the task."""
 
 import collections
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from openvima.render.labels import label_raster
 from openvima.scene import (
     FIRST_OBJECT_ID,
     AtPose,
+    DistractorsApart,
     Episode,
+    EveryStepCounts,
     ObjectImage,
     Outcome,
     Placement,
@@ -32,6 +35,12 @@ from openvima.tasks import (
 from openvima.tasks.table import CELL_M, is_in_hollow
 from strategies import seeds
 
+HEIGHTS_OF_THEIR_OWN = (  # at which the original benchmark spawns some objects
+    "follow_motion",
+    "pick_in_order_then_restore",
+    "rearrange",
+    "rearrange_then_restore",
+)
 EVERYWHERE = [(task, level) for task in list_tasks() for level in task_spec(task).levels]
 
 
@@ -46,6 +55,13 @@ def roles(episode: Episode) -> tuple[Placement, Placement]:
     scene = episode.problem.scene
     assert isinstance(goal, AtPose) and goal.relative_to is not None
     return scene[goal.object_id], scene[goal.relative_to]
+
+
+def standing_on_the_table(episode: Episode) -> list[Placement]:
+    """All objects but the one that starts in a base."""
+    scene = episode.problem.scene
+    starts_in_base = episode.task == "pick_in_order_then_restore"
+    return [p for p in scene.placements if p.fixed or not starts_in_base]
 
 
 @pytest.mark.parametrize(("task", "level"), EVERYWHERE)
@@ -64,7 +80,9 @@ def test_domains_and_levels_share_no_scene(task: str) -> None:
         for seed in range(20)
     ]
     scenes += [
-        sample_episode(task, level=task_spec(task).levels[1], seed=seed).problem.scene for seed in range(20)
+        sample_episode(task, level=level, seed=seed).problem.scene
+        for level in task_spec(task).levels[1:2]
+        for seed in range(20)
     ]
     assert len(set(scenes)) == len(scenes)
 
@@ -78,26 +96,30 @@ def test_every_start_is_open_inside_the_workspace_and_numbered_without_gaps(seed
     first = FIRST_OBJECT_ID[scene.end_effector]
     assert [p.id for p in scene.placements] == list(range(first, first + len(scene.placements)))
     assert all(in_workspace(p.pose) for p in scene.placements)
-    assert advance(problem, begin(problem), scene) == (begin(problem), Outcome())
+    waiting = replace(problem, constraints=tuple(c for c in problem.constraints if c != EveryStepCounts()))
+    assert advance(waiting, begin(problem), scene) == (begin(problem), Outcome())
     assert (episode.task, episode.level, episode.seed, episode.domain) == (task, level, seed, "user")
     assert episode.max_steps == episode.oracle_max_steps + 2
 
 
 @pytest.mark.parametrize(("task", "level"), EVERYWHERE)
 def test_objects_start_at_rest_or_hover_with_compat(task: str, level: str, assets: Assets) -> None:
-    for placement in sample_episode(task, level=level, seed=1).problem.scene.placements:
+    for placement in standing_on_the_table(sample_episode(task, level=level, seed=1)):
         rest_z_m = assets.geometry(placement.object, placement.size, placement.scale).rest_z_m
         assert placement.pose.z == rest_z_m
+    if task in HEIGHTS_OF_THEIR_OWN:
+        return
     for placement in sample_episode(task, level=level, seed=1, compat=True).problem.scene.placements:
-        assert placement.pose.z == placement.size[2] / 2
+        assert placement.pose.z == placement.size[2] * placement.scale[2] / 2
 
 
 @pytest.mark.parametrize("task", list_tasks())
 def test_no_two_objects_cover_the_same_cell(task: str, assets: Assets) -> None:
     for seed in range(30):
-        scene = sample_episode(task, seed=seed).problem.scene
-        movable = [p for p in scene.placements if task != "sweep_without_exceeding" or not p.fixed]
-        alone = sum((label_raster([p], assets) > 0).astype(int) for p in movable)
+        episode = sample_episode(task, seed=seed)
+        flat = {"line", "three-sided rectangle"}  # these two lie in one another
+        apart = [p for p in standing_on_the_table(episode) if p.object not in flat]
+        alone = sum((label_raster([p], assets) > 0).astype(int) for p in apart)
         assert np.max(alone) <= 1, seed
 
 
@@ -121,6 +143,7 @@ def test_goals_constraints_and_prompt_follow_the_ids() -> None:
         }
         assert shown == {"dragged_obj_1": target, "base_obj": base}
         (constraint,) = episode.problem.constraints
+        assert isinstance(constraint, DistractorsApart)
         assert set(constraint.object_ids) == {5, 6, 7} - {target.id, base.id}
 
 

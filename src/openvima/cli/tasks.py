@@ -1,9 +1,13 @@
 """`openvima tasks`: list the tasks."""
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from openvima.tasks.measured import oracle_record
 
 if TYPE_CHECKING:
     from openvima.tasks import TaskSpec
@@ -11,19 +15,29 @@ if TYPE_CHECKING:
 FULL_WIDTH = 110  # columns of the terminal that all columns of the table need
 
 
-def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
-    """List the tasks: what the robot is told, its tool, the levels, the steps.
+def main(
+    *,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    gallery: Path | None = None,
+    assets: str = "procedural",
+) -> int:
+    """List the tasks: what the robot is told, its tool, the levels, the steps, how often the oracle succeeds.
 
     Example: openvima tasks
 
     Args:
         as_json: Print JSON instead of a table.
+        gallery: Write a page with a picture of each task, and all of them on one sheet, into this folder.
+        assets: Asset pack of the gallery: procedural, original, or the folder of a checkout of the original
+            benchmark.
 
     Returns:
         Exit status.
     """
     from openvima.tasks import list_tasks, task_spec
 
+    if gallery is not None:
+        return _write_gallery(gallery, assets)
     specs = [task_spec(name) for name in list_tasks()]
     if as_json:
         print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
@@ -36,11 +50,11 @@ def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int
     if not console.is_terminal:  # a file or a pipe takes long lines
         console = Console(width=150)
     table = Table(title=f"{len(specs)} tasks", show_lines=True)
-    columns = ["task", "family", "prompt", "tool", "levels", "steps"]
+    columns = ["task", "family", "prompt", "tool", "levels", "steps", "oracle"]
     if console.width < FULL_WIDTH:  # else words of the prompts would break
         columns.remove("family")
     for name in columns:
-        table.add_column(name, no_wrap=name in ("task", "tool", "steps"), overflow="fold")
+        table.add_column(name, no_wrap=name in ("task", "tool", "steps", "oracle"), overflow="fold")
         if name == "levels" and console.width < FULL_WIDTH:
             table.columns[-1].max_width = len("train L1")  # in two lines, which prompts need anyway
     for spec in specs:
@@ -51,10 +65,12 @@ def main(*, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int
             "tool": spec.end_effector,
             "levels": " ".join(spec.levels),
             "steps": f"{spec.oracle_max_steps} + 2",
+            "oracle": _percent(oracle_record(spec.name)),
         }
         table.add_row(*(cells[name] for name in columns))
     console.print(table)
     console.print("steps: those that the oracle may take, and what a policy is given on top")
+    console.print("oracle: episodes that it solves in per cent, over all levels; --json has each level")
     return 0
 
 
@@ -68,4 +84,21 @@ def _record(spec: "TaskSpec") -> dict[str, object]:
         "levels": list(spec.levels),
         "oracle_max_steps": spec.oracle_max_steps,
         "max_steps": spec.max_steps,
+        "oracle": oracle_record(spec.name),
     }
+
+
+def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
+    episodes = sum(level["episodes"] for level in record.values())
+    solved = sum(level["successes"] for level in record.values())
+    return f"{100 * solved / episodes:.2f}" if episodes else "–"
+
+
+def _write_gallery(folder: Path, assets: str) -> int:
+    from openvima.cli.progress import progress_bar
+    from openvima.env import Setup
+    from openvima.evaluation.task_gallery import save_task_gallery
+
+    with progress_bar("tasks") as report:
+        print(save_task_gallery(folder, setup=Setup(assets), report=report))
+    return 0

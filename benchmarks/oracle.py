@@ -1,0 +1,69 @@
+"""How many evaluation episodes of each task and level the oracle solves.
+
+    python benchmarks/oracle.py [--episodes N] [--workers K] [--levels L1,L2,…] [--out DIR] [--record]
+
+Plays them with `openvima evaluate`'s machinery (an interrupted run goes on), prints every failure with its
+seed and reason, and with `--record` writes the counts to where `openvima tasks` shows them.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from openvima.catalog import LEVELS
+from openvima.evaluation import EvaluationConfig, Results, evaluate
+
+RECORD = Path(__file__).parents[1] / "src/openvima/tasks/measured_oracle.json"
+
+
+def counts(results: Results) -> dict[str, dict[str, dict[str, int]]]:
+    """Return task → level → episodes, successes and redraws."""
+    found: dict[str, dict[str, dict[str, int]]] = {}
+    for row in sorted(results.rows, key=lambda row: (row.task, LEVELS.index(row.level))):
+        entry = {"episodes": row.episodes, "successes": row.successes, "redraws": row.redraws}
+        found.setdefault(row.task, {})[row.level] = entry
+    return found
+
+
+def main() -> None:
+    """Play, print, and record if asked."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--tasks", default="all")
+    parser.add_argument("--levels", default=",".join(LEVELS))
+    parser.add_argument("--out", type=Path, default=Path("oracle"))
+    parser.add_argument("--record", action="store_true")
+    options = parser.parse_args()
+    config = EvaluationConfig(
+        policies=("oracle",),
+        tasks=tuple(options.tasks.split(",")),
+        levels=tuple(options.levels.split(",")),
+        episodes=options.episodes,
+        workers=options.workers,
+        out=options.out,
+        batch=50,
+        report=False,
+    )
+    results = Results.read(evaluate(config))
+    found = counts(results)
+    for task, levels in found.items():
+        cells = "   ".join(f"{level} {e['successes']}/{e['episodes']}" for level, e in levels.items())
+        redraws = sum(entry["redraws"] for entry in levels.values())
+        print(f"{task:<28}{cells}   redraws {redraws}")
+    for row in results.rows:
+        for outcome in row.outcomes:
+            if not outcome.success:
+                print(f"failed: {row.task} {row.level} seed {outcome.seed}: {outcome.reason}")
+    if options.record:
+        record = {
+            "command": "python benchmarks/oracle.py --record",
+            "versions": results.versions,
+            "tasks": found,
+        }
+        RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

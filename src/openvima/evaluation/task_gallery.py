@@ -1,0 +1,120 @@
+"""Pictures of all tasks: what each is told and how a solved episode looks."""
+
+import html
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from openvima.env import Setup, TabletopEnv
+from openvima.env.setup import DEFAULT_SETUP
+from openvima.evaluation.film import Artist
+from openvima.evaluation.picture import save_episode_picture
+from openvima.evaluation.players import OraclePlayer
+from openvima.evaluation.prompt_strip import INK, draw_prompt_strip, font
+from openvima.evaluation.rollout import play
+from openvima.files import write_whole
+from openvima.tasks import TaskSpec, list_tasks, task_spec
+
+SHEET_NAME = "contact_sheet.png"
+PAGE_NAME = "index.html"
+_COLUMNS, _GAP, _TITLE_HEIGHT = 3, 16, 30  # the last two in pixels
+_TRIES = 20  # seeds, until the oracle solves an episode
+
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>openvima: tasks</title>
+<style>
+:root {{ color-scheme: light dark; }}
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
+img {{ width: 100%; height: auto; border-radius: 8px; background: #fff; }}
+section {{ margin-block: 2.5rem; }} h2 {{ margin-bottom: 0; }} p {{ margin-top: .2rem; }}
+</style><h1>{count} tasks</h1>{sections}</html>
+"""
+
+
+def save_task_gallery(
+    folder: Path,
+    *,
+    tasks: Sequence[str] = (),
+    setup: Setup = DEFAULT_SETUP,
+    seed: int = 0,
+    report: Callable[[int, int, str], None] | None = None,
+) -> Path:
+    """Write a page with a solved episode of each task, its pictures, and all of them on one sheet.
+
+    Args:
+        folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
+        tasks: Names of tasks; by default all.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        seed: First seed to try for each task; the first episode that the oracle solves is shown.
+        report: Called with tasks done, tasks in all, and the task's name.
+
+    Returns:
+        The page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    specs = [task_spec(name) for name in tasks or list_tasks()]
+    panels = []
+    for number, spec in enumerate(specs):
+        env = setup.make(spec.name, spec.levels[0], domain="user")
+        solved = _first_solved(env, seed)
+        save_episode_picture(env, folder / f"{spec.name}.png", seed=solved)
+        panels.append(_panel(env, spec.name, solved))
+        if report is not None:
+            report(number + 1, len(specs), spec.name)
+    write_whole(folder / SHEET_NAME, _small_png(_sheet(panels)))
+    sections = "\n".join(_section(spec) for spec in specs)
+    return write_whole(folder / PAGE_NAME, _PAGE.format(count=len(specs), sections=sections))
+
+
+def _first_solved(env: TabletopEnv, seed: int) -> int:
+    for candidate in range(seed, seed + _TRIES):
+        (outcome,) = play([env], [candidate], OraclePlayer())
+        if outcome.success:
+            return candidate
+    return seed  # shown as it is: not solved
+
+
+def _panel(env: TabletopEnv, title: str, seed: int) -> Image.Image:
+    """Title, prompt and the table after the episode."""
+    play([env], [seed], OraclePlayer())
+    scene = Artist(env, enlarge=2).draw(env.scene, joints=None)
+    strip = draw_prompt_strip(env.prompt, width=scene.shape[1], image_height=44, font_size=16)
+    head = Image.new("RGB", (scene.shape[1], _TITLE_HEIGHT), (255, 255, 255))
+    place = (10, _TITLE_HEIGHT // 2)
+    ImageDraw.Draw(head).text(place, title, font=font(17, bold=True), fill=INK, anchor="lm")
+    return Image.fromarray(np.concatenate([np.asarray(head), strip, scene]))
+
+
+def _sheet(panels: Sequence[Image.Image]) -> Image.Image:
+    """Lay the panels in columns, each below the shortest one so far."""
+    width = panels[0].width
+    columns = min(_COLUMNS, len(panels))
+    ends = [_GAP] * columns
+    places = []
+    for panel in panels:
+        column = ends.index(min(ends))
+        places.append((_GAP + column * (width + _GAP), ends[column]))
+        ends[column] += panel.height + _GAP
+    sheet = Image.new("RGB", (_GAP + columns * (width + _GAP), max(ends)), (255, 255, 255))
+    for panel, place in zip(panels, places, strict=True):
+        sheet.paste(panel, place)
+    return sheet
+
+
+def _small_png(picture: Image.Image) -> bytes:
+    """A picture in 256 colours, a third of the size."""
+    stream = BytesIO()
+    picture.quantize(256, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+def _section(spec: TaskSpec) -> str:
+    facts = f"{spec.family.replace('_', ' ')} · {spec.end_effector} · {', '.join(spec.levels)}"
+    template = html.escape(spec.template)
+    return (
+        f'<section id="{spec.name}"><h2>{spec.name}</h2><p>{facts}<br><code>{template}</code><br>'
+        f'{html.escape(spec.summary)}</p><img src="{spec.name}.png" alt="{spec.name}: {template}"></section>'
+    )
