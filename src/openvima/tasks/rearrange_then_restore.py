@@ -33,8 +33,9 @@ def sample(
         conflict_rate: Share of single objects whose target is taken by the distractor.
         distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
             those of the level.
-        restore_distractor: Ask for the distractor at its original place as well. In the benchmark it has to
-            stay away from there, if that is the object's target.
+        restore_distractor: Ask for the distractor at its original place as well, after the objects were at
+            their targets; it then must stay in the workspace. In the benchmark a distractor that was in the
+            way must not come back.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
     """
     arrangement = sample_arrangement(

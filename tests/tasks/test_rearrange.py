@@ -1,0 +1,287 @@
+"""Scenes, pictures and outcomes of `rearrange` follow its specification."""
+
+import pytest
+
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import TEXTURE_SETS, Assets, pool
+from openvima.errors import ConfigError, OracleError
+from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem, SceneImage
+from openvima.tasks import Progress, advance, begin, oracle_action, sample_episode, stream, task_spec
+from openvima.tasks.table import is_in_the_way
+
+TASK = "rearrange"
+NUM_EPISODES = 2500
+FAR_AWAY = Pose.planar(0.9, 0.0)
+
+
+def moves(problem: Problem) -> list[tuple[Placement, Pose]]:
+    """Each object to move, where it stands, and its target."""
+    goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
+    assert len(goals) == len(problem.goals)
+    return [(problem.scene[goal.object_id], goal.target) for goal in goals]
+
+
+def distractor_of(problem: Problem) -> Placement | None:
+    (constraint,) = problem.constraints
+    assert isinstance(constraint, DistractorsApart) and constraint.at_end
+    ids = constraint.object_ids
+    return problem.scene[ids[0]] if ids else None
+
+
+def pictured(problem: Problem) -> tuple[Placement, ...]:
+    ((name, image),) = problem.prompt.images
+    assert name == "scene" and isinstance(image, SceneImage)
+    return image.scene.placements
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
+
+
+@pytest.fixture(scope="module")
+def conflict() -> Problem:
+    """One object, its target taken by the distractor."""
+    return sample_episode(TASK, seed=2, num_objects=1, conflict_rate=1).problem
+
+
+@pytest.fixture(scope="module")
+def clean() -> Problem:
+    """One object, its target free, a distractor elsewhere."""
+    return sample_episode(TASK, seed=2, num_objects=1, conflict_rate=0).problem
+
+
+def test_one_two_or_three_objects_have_to_be_moved(problems: list[Problem]) -> None:
+    assert_frequencies((len(p.goals) for p in problems), {1: 0.4, 2: 0.4, 3: 0.2})
+
+
+def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
+    problems: list[Problem],
+) -> None:
+    for problem in problems:
+        has_distractor = distractor_of(problem) is not None
+        assert has_distractor is (len(problem.goals) == 1)
+        assert len(problem.scene.placements) == len(problem.goals) + has_distractor
+    single = (bool(p.oracle_first) for p in problems if len(p.goals) == 1)
+    assert_frequencies(single, {True: 0.5, False: 0.5})
+    assert not any(p.oracle_first for p in problems if len(p.goals) > 1)
+
+
+def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
+    drawn_from = pool(TASK, "train")
+    movables = [placement for problem in problems for placement, _ in moves(problem)]
+    assert_uniform((placement.object for placement in movables), drawn_from.dragged_objects)
+    assert_uniform((placement.texture for placement in movables), drawn_from.dragged_textures)
+
+
+@pytest.mark.parametrize("level", ["train", "L2", "L3"])
+def test_a_distractor_has_another_shape_and_any_of_the_49_textures(level: str) -> None:
+    distractors = []
+    for seed in range(1000):
+        problem = sample_episode(TASK, level=level, seed=seed, num_objects=1).problem
+        ((target, _),), distractor = moves(problem), distractor_of(problem)
+        assert distractor is not None and distractor.object != target.object
+        assert target.object in pool(TASK, level).dragged_objects
+        assert target.texture in pool(TASK, level).dragged_textures
+        assert not distractor.fixed
+        distractors.append(distractor)
+    assert_uniform((d.texture for d in distractors), TEXTURE_SETS["T"])
+    assert {d.object for d in distractors} == set(pool(TASK, level).dragged_objects)
+
+
+def test_distractors_can_be_kept_to_the_textures_of_the_level() -> None:
+    for level, textures in (("train", "C1"), ("L2", "C2")):
+        for seed in range(60):
+            episode = sample_episode(TASK, level=level, seed=seed, num_objects=1, distractor_textures="pool")
+            assert {p.texture for p in episode.problem.scene.placements} <= set(TEXTURE_SETS[textures])
+
+
+def test_nothing_starts_in_the_way_of_a_target(problems: list[Problem]) -> None:
+    for problem in problems:
+        goals, taken = moves(problem), distractor_of(problem)
+        for own, target in goals:
+            at_target = own.at(target)
+            standing = [placement for placement, _ in goals]
+            if taken is not None and not problem.oracle_first:
+                standing.append(taken)
+            for placement in standing:
+                assert not is_in_the_way(placement, at_target)
+                assert placement.pose.planar_distance(target) >= 0.1
+            if taken is not None:
+                assert taken.pose.planar_distance(own.pose) >= 0.1
+
+
+def test_a_distractor_in_the_way_stands_exactly_on_the_target_at_its_own_height(
+    problems: list[Problem], assets: Assets
+) -> None:
+    for problem in problems:
+        distractor = distractor_of(problem)
+        if distractor is None or not problem.oracle_first:
+            continue
+        ((own, target),) = moves(problem)
+        assert distractor.pose.position[:2] == target.position[:2]
+        assert distractor.pose.quaternion == target.quaternion
+        assert distractor.pose.z == assets.geometry(distractor.object, distractor.size).rest_z_m
+        (parking,) = problem.oracle_first
+        assert parking.object_id == distractor.id
+        parked = distractor.at(parking.target)
+        assert not is_in_the_way(parked, own.at(target))
+        assert parked.pose.planar_distance(own.pose) >= 0.11
+
+
+def test_the_picture_shows_the_objects_at_their_targets_and_no_distractor(problems: list[Problem]) -> None:
+    for problem in problems:
+        shown = {(p.object, p.texture, p.size, p.pose) for p in pictured(problem)}
+        assert shown == {(p.object, p.texture, p.size, target) for p, target in moves(problem)}
+        assert sorted(p.id for p in pictured(problem)) == list(range(2, 2 + len(problem.goals)))
+
+
+def test_the_prompt_is_the_published_sentence(problems: list[Problem]) -> None:
+    assert {p.prompt.text for p in problems} == {"Rearrange to this {scene}."} == {task_spec(TASK).template}
+
+
+def judged(problem: Problem, *steps: dict[int, Pose]) -> tuple[Progress, Outcome]:
+    """How the problem stands after steps that move objects to these poses and leave the others."""
+    progress, outcome, scene = begin(problem), Outcome(), problem.scene
+    for step in steps:
+        assert not outcome.is_over, outcome.reason
+        scene = scene.with_poses(step)
+        progress, outcome = advance(problem, progress, scene)
+    return progress, outcome
+
+
+def ids(problem: Problem) -> tuple[int, int]:
+    """The single object to move and the distractor."""
+    distractor = distractor_of(problem)
+    assert distractor is not None
+    return moves(problem)[0][0].id, distractor.id
+
+
+@pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.099, True), (0.101, False)])
+@pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
+def test_an_object_has_to_be_near_its_target_at_any_heading(
+    clean: Problem, distance: float, yaw_rad: float, success: bool
+) -> None:
+    ((own, target),) = moves(clean)
+    outcome = judged(clean, {own.id: target.moved(dx=distance).rotated(yaw_rad)})[1]
+    assert (outcome.success, outcome.failure) == (success, False)
+
+
+def test_objects_may_be_moved_in_any_order_and_stay_done() -> None:
+    problem = sample_episode(TASK, seed=0, num_objects=3).problem
+    (a, at_a), (b, at_b), (c, at_c) = moves(problem)
+    progress, outcome = judged(problem, {c.id: at_c}, {a.id: at_a, c.id: FAR_AWAY})
+    assert progress.open_goals == (1,) and outcome == Outcome()
+    assert judged(problem, {c.id: at_c}, {a.id: at_a, c.id: FAR_AWAY}, {b.id: at_b})[1].success
+
+
+def test_a_parked_distractor_leaves_the_target_to_the_object(conflict: Problem) -> None:
+    ((own, target),), (_, distractor) = moves(conflict), ids(conflict)
+    inward = 1.0 if target.y < 0 else -1.0
+    for parked in (conflict.oracle_first[0].target, target.moved(dy=0.101 * inward), FAR_AWAY):
+        assert judged(conflict, {distractor: parked}, {own.id: target})[1].success
+
+
+def test_an_object_on_top_of_the_distractor_is_a_failure(conflict: Problem) -> None:
+    ((own, target),) = moves(conflict)
+    outcome = judged(conflict, {own.id: target})[1]
+    assert outcome.failure and "is within 0.1 m of the target of" in outcome.reason
+
+
+@pytest.mark.parametrize(("distance", "success"), [(0.099, False), (0.101, True)])
+def test_at_the_end_the_distractor_must_be_away_from_target_and_object(
+    conflict: Problem, distance: float, success: bool
+) -> None:
+    ((own, target),), (_, distractor) = moves(conflict), ids(conflict)
+    inward = 1.0 if target.y < 0 else -1.0
+    near_target = judged(conflict, {distractor: target.moved(dy=distance * inward)}, {own.id: target})[1]
+    askew = target.moved(dy=0.05 * inward)
+    beside_it = askew.moved(dy=distance * inward)
+    near_object = judged(conflict, {distractor: beside_it}, {own.id: askew})[1]
+    for outcome in (near_target, near_object):
+        assert (outcome.success, outcome.failure) == (success, not success)
+
+
+def test_a_distractor_may_be_anywhere_until_the_object_is_there(clean: Problem) -> None:
+    ((own, target),), (_, distractor) = moves(clean), ids(clean)
+    on_target = {distractor: target}
+    assert judged(clean, on_target)[1] == Outcome()
+    assert judged(clean, on_target, {distractor: FAR_AWAY}, {own.id: target})[1].success
+    assert judged(clean, on_target, {own.id: target})[1].failure
+
+
+def test_a_lost_object_is_a_failure(conflict: Problem) -> None:
+    own, _ = ids(conflict)
+    outcome = judged(conflict, {own: FAR_AWAY})[1]
+    assert outcome.failure and "left the workspace" in outcome.reason
+
+
+@pytest.mark.parametrize(
+    ("options", "num_steps"),
+    [
+        ({"num_objects": 1, "conflict_rate": 0}, 1),
+        ({"num_objects": 1, "conflict_rate": 1}, 2),
+        ({"num_objects": 2}, 2),
+        ({"num_objects": 3}, 3),
+    ],
+)
+def test_the_oracle_needs_a_step_an_object_and_one_to_clear_the_target(
+    options: dict[str, object], num_steps: int, assets: Assets
+) -> None:
+    problem = sample_episode(TASK, seed=5, **options).problem
+    rng, scene, progress, outcome = (
+        stream("user", TASK, "train", 5, "oracle"),
+        problem.scene,
+        begin(problem),
+        0,
+    )
+    picked = []
+    for _ in range(num_steps):
+        picked.append(oracle_action(problem, progress, scene, assets=assets, rng=rng).pick_id)
+        wanted = [g for g in (*problem.oracle_first, *problem.goals) if isinstance(g, AtPose)]
+        scene = scene.with_poses({g.object_id: g.target for g in wanted if g.object_id == picked[-1]})
+        progress, outcome = advance(problem, progress, scene)
+    assert outcome.success
+    assert picked == [g.object_id for g in (*problem.oracle_first, *problem.goals)]
+    with pytest.raises(OracleError, match="nothing left to do"):
+        oracle_action(problem, progress, scene, assets=assets, rng=rng)
+
+
+def test_difficulties_change_nothing() -> None:
+    for seed in range(30):
+        easy, medium, hard = (
+            sample_episode(TASK, seed=seed, difficulty=word).problem for word in ("easy", "medium", "hard")
+        )
+        assert easy == medium == hard
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("num_objects", 4, "num_objects is 4; give an integer from 1 to 3"),
+        ("num_objects", 0, "num_objects is 0"),
+        ("conflict_rate", 1.5, "conflict_rate is 1.5; give a number from 0 to 1"),
+        ("conflict_rate", float("nan"), "conflict_rate is nan"),
+        ("distractor_textures", "pol", "no choice of distractor_textures 'pol'. Did you mean 'pool'"),
+        ("difficulty", "extreme", "no difficulty 'extreme'"),
+    ],
+)
+def test_bad_options_are_refused(option: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sample_episode(TASK, seed=0, **{option: value})
+
+
+def test_with_compat_a_distractor_in_the_way_starts_at_the_height_of_the_object() -> None:
+    sunk = 0
+    for seed in range(150):
+        options = {"num_objects": 1, "conflict_rate": 1, "compat": True}
+        problem = sample_episode(TASK, seed=seed, **options).problem
+        ((own, target),), distractor = moves(problem), distractor_of(problem)
+        assert distractor is not None and (own.id, distractor.id) == (5, 6)
+        assert distractor.pose == target and target.z == pytest.approx(own.size[2] / 2)
+        sunk += distractor.object == "block" and own.object != "block"
+    assert sunk > 0
+
+
+def test_bad_luck_is_rare() -> None:
+    assert sum(sample_episode(TASK, level="L3", seed=seed).num_redraws for seed in range(500)) <= 8
