@@ -1,4 +1,4 @@
-"""Gathering: put all objects that share something with a base into it, and leave the others where they are."""
+"""Gathering: put all objects that share something with a base into it, and leave the others out."""
 
 from collections.abc import Sequence
 
@@ -54,7 +54,8 @@ def gathering_problem(
         distractor_objects: Shapes of distractors.
         counts: Number of dragged objects and of distractors.
         after_bowl: Whether the bowl's smaller tolerance holds whatever the base. The original keeps it from
-            the first bowl on for as long as an environment lives; so does None with `compat`, where bowls occur.
+            the first bowl on for as long as an environment lives. None: only with `compat`, where the pool
+            holds a bowl.
 
     Returns:
         The problem; not with `compat`, nothing in it is decided at the start.
@@ -62,7 +63,7 @@ def gathering_problem(
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
     tolerance = Tolerance(BOWL_TOLERANCE_M if after_bowl or base.object == "bowl" else TOLERANCE_M)
-    num_dragged, num_distractors = counts
+    num_dragged, _ = counts
     dragged: list[Placement] = []
 
     def draw() -> tuple[str, str]:

@@ -3,8 +3,8 @@
 Scene:    six bases of one shape, each of another texture, in two rows; an object lies in one of them.
 Prompt:   "Put {dragged_obj} into {base_obj_1} then {base_obj_2}. Finally restore it into its original
           container."
-Success:  object within 0.05 m of the origin of each pictured base in turn, then of the base that it came from;
-          it must not be in a pictured base before its turn.
+Success:  object within 0.05 m of the origin of each pictured base in turn, then of the base that it came
+          from; it must not be in a pictured base before its turn.
 Source:   VIMA paper, task list of the appendix, "Visual memory".
 """
 
@@ -63,15 +63,14 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
         shape = shapes[index]
         return table.add(shape, textures[index], size=base_sizes[shape], pose=centres[index], fixed=True)
 
-    def add_dragged() -> Placement:
-        hover_z = (2.0 if shapes[0] in _DEEP_BASES else 0.5) * size[2]
-        z = hover_z if table.compat else None
-        return table.add(name, texture, size=size, pose=centres[0], fixed=False, z=z, on_top=not table.compat)
-
     if table.compat:
-        dragged, source = add_dragged(), add_base(0)
+        z = (2.0 if shapes[0] in _DEEP_BASES else 0.5) * size[2]
+        dragged = table.add(name, texture, size=size, pose=centres[0], fixed=False, z=z)
+        source = add_base(0)
     else:
-        source, dragged = add_base(0), add_dragged()
+        source = add_base(0)
+        start = table.centred_in(source, name, size) if source.object == "bowl" else centres[0]
+        dragged = table.add(name, texture, size=size, pose=start, fixed=False, on_top=True)
     targets = [add_base(index) for index in range(1, len(centres))][:num_targets]
     shown = {f"base_obj_{n}": ObjectImage(target) for n, target in enumerate(targets, 1)}
     return Problem(

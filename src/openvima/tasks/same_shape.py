@@ -60,7 +60,7 @@ def _by_profile(pool: Pool, base_object: str) -> tuple[list[str], list[str]]:
     different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]
     if not alike or not different:
         raise ConfigError(
-            f"the pool's dragged objects are {', '.join(pool.dragged_objects)}; some must have the profile of "
-            f"the base {base_object!r} ({profile}) and some another one."
+            f"the pool's dragged objects are {', '.join(pool.dragged_objects)}; some must have the profile "
+            f"of the base {base_object!r} ({profile}) and some another one."
         )
     return alike, different

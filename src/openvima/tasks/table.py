@@ -18,6 +18,7 @@ from openvima.scene import (
     Pose,
     Scene,
 )
+from openvima.tasks.circles import middle_of_smallest_circle
 
 T = TypeVar("T")
 Reject = Callable[[Placement], bool]
@@ -210,6 +211,21 @@ class TableSampler:
             new = new.at(new.pose.moved(dz=height_m)) if height_m else new
         return self._put(new if z is None else new.at(Pose((pose.x, pose.y, z), pose.quaternion)))
 
+    def centred_in(self, base: Placement, object_name: str, size: Vector3) -> Pose:
+        """Return where to put an object, unturned, so that it lies evenly in a round base.
+
+        The smallest circles around what is drawn of the two have the same middle, so all points at which the
+        object may touch the slope are equally high.
+
+        Args:
+            base: The base, unturned.
+            object_name: Display name in the catalogue.
+            size: Nominal size in metres.
+        """
+        base_x, base_y = _middle_m(self._assets, base.object, base.size)
+        x, y = _middle_m(self._assets, object_name, size)
+        return Pose.planar(base.pose.x + base_x - x, base.pose.y + base_y - y)
+
     def blank(self) -> "TableSampler":
         """Return an empty table for a scene of the prompt, with the same generator and assets.
 
@@ -354,3 +370,10 @@ def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
     """Largest planar distance of anything drawn of an object from its link frame, in metres."""
     vertices = assets.geometry(object_name, size).visual.vertices
     return float(np.hypot(vertices[..., 0], vertices[..., 1]).max())
+
+
+@functools.lru_cache(maxsize=256)
+def _middle_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
+    """Middle of the smallest circle around all that is drawn of an object, in its link frame, in metres."""
+    vertices = assets.geometry(object_name, size).visual.vertices
+    return middle_of_smallest_circle(vertices.reshape(-1, 3)[:, :2])
