@@ -1,0 +1,155 @@
+"""Scenes, prompts and outcomes of `novel_noun` follow its specification."""
+
+import re
+
+import pytest
+
+from base_cases import assert_judged_at_its_limits, cast
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import TEXTURE_SETS, pool
+from openvima.errors import ConfigError
+from openvima.scene import ObjectImage, Problem
+from openvima.tasks import sample_episode
+
+TASK = "novel_noun"
+NUM_EPISODES = 2000
+NOUNS = ("dax", "blicket", "wug", "zup")
+FORMS = {
+    "target first": r"This is a (?P<target>\w+) \{dragged_obj_1\}\. This is a (?P<base>\w+) \{base_obj\}\. "
+    r"Put a (?P=target) into a (?P=base)\.",
+    "base first": r"This is a (?P<base>\w+) \{base_obj\}\. This is a (?P<target>\w+) \{dragged_obj_1\}\. "
+    r"Put a (?P=target) into a (?P=base)\.",
+}
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
+
+
+def matched(problem: Problem) -> tuple[str, re.Match[str]]:
+    """Which form the prompt has, and its words."""
+    (found,) = [(n, match) for n, form in FORMS.items() if (match := re.fullmatch(form, problem.prompt.text))]
+    return found
+
+
+def test_two_different_nouns_are_introduced_in_either_order(problems: list[Problem]) -> None:
+    forms, matches = zip(*map(matched, problems), strict=True)
+    assert_uniform(forms, FORMS)
+    pairs = [(a, b) for a in NOUNS for b in NOUNS if a != b]
+    assert_uniform([(match["target"], match["base"]) for match in matches], pairs)
+
+
+def test_the_pictures_are_gray_and_of_target_and_base(problems: list[Problem]) -> None:
+    for problem in problems[:200]:
+        target, base, _ = cast(problem)
+        images = dict(problem.prompt.images)
+        assert set(images) == {"dragged_obj_1", "base_obj"}
+        for image, shown in ((images["dragged_obj_1"], target), (images["base_obj"], base)):
+            assert isinstance(image, ObjectImage)
+            assert (image.placement.object, image.placement.size) == (shown.object, shown.size)
+            assert image.placement.texture == "gray" and shown.texture != "gray"
+
+
+def test_textures_and_bases_are_uniform(problems: list[Problem]) -> None:
+    drawn_from = pool(TASK, "train")
+    casts = [cast(problem) for problem in problems]
+    assert_uniform([target.texture for target, _, _ in casts], drawn_from.dragged_textures)
+    assert_uniform([base.texture for _, base, _ in casts], drawn_from.base_textures)
+    assert_uniform([base.object for _, base, _ in casts], drawn_from.base_objects)
+    textures = (*drawn_from.dragged_textures, *drawn_from.base_textures)
+    assert_uniform([distractors[0].texture for _, _, distractors in casts], textures)
+
+
+def test_a_distractor_has_a_third_shape_and_is_fixed_if_a_base(problems: list[Problem]) -> None:
+    base_shapes = pool(TASK, "train").base_objects
+    num_bases = 0
+    for problem in problems:
+        target, base, (distractor,) = cast(problem)
+        assert distractor.object not in (target.object, base.object)
+        assert base.fixed and not target.fixed
+        assert distractor.fixed is (distractor.object in base_shapes)
+        num_bases += distractor.fixed
+    assert 0.13 < num_bases / NUM_EPISODES < 0.21  # 3 of 16 shapes, some of them harder to place
+
+
+@pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+def test_every_level_draws_from_its_pool(level: str) -> None:
+    drawn_from = pool(TASK, level)
+    for seed in range(150):
+        target, base, (distractor,) = cast(sample_episode(TASK, level=level, seed=seed).problem)
+        assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
+        assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
+        assert distractor.object in (*drawn_from.dragged_objects, *drawn_from.base_objects)
+        assert distractor.texture in (*drawn_from.dragged_textures, *drawn_from.base_textures)
+
+
+@pytest.mark.parametrize("level", ["train", "L3"])
+def test_outcomes_change_at_the_limits(level: str) -> None:
+    for seed in range(25):
+        assert_judged_at_its_limits(sample_episode(TASK, level=level, seed=seed).problem)
+
+
+def test_hardly_any_draw_is_thrown_away() -> None:
+    redraws = [sample_episode(TASK, seed=seed, num_distractors=3).num_redraws for seed in range(100)]
+    assert sum(redraws) <= 2
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "options"),
+    [
+        ("easy", {("C1", "C2"): 1.0}),
+        ("medium", {("C1", "C1"): 0.5, ("C2", "C2"): 0.5}),
+        ("hard", {("C2", "C1"): 1.0}),
+    ],
+)
+def test_the_difficulty_says_who_gets_which_textures(
+    difficulty: str, options: dict[tuple[str, str], float]
+) -> None:
+    drawn = []
+    for seed in range(100):
+        target, base, _ = cast(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
+        drawn.append(tuple("C1" if p.texture in TEXTURE_SETS["C1"] else "C2" for p in (target, base)))
+    if len(options) == 1:
+        assert set(drawn) == set(options)
+    else:
+        assert_frequencies(drawn, options)
+
+
+def test_words_and_number_of_distractors_can_be_chosen() -> None:
+    for num_distractors in (0, 2, 3):
+        problem = sample_episode(
+            TASK, seed=1, nouns=["tove", "rath"], num_distractors=num_distractors
+        ).problem
+        assert len(cast(problem)[2]) == num_distractors
+        _, match = matched(problem)
+        assert {match["target"], match["base"]} == {"tove", "rath"}
+
+
+@pytest.mark.parametrize(
+    ("nouns", "message"),
+    [
+        (["dax"], "nouns holds 'dax'; give at least 2 different words"),
+        ("dax", "nouns holds 'dax'; give at least 2"),
+        ([], "nouns holds nothing"),
+        (["dax", "dax"], "nouns holds 'dax', 'dax'; give at least 2 different"),
+        (["dax", "two words", "{x}", 3], r"nouns holds 'two words', '\{x\}', 3; give"),
+    ],
+)
+def test_unfit_words_are_refused(nouns: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        sample_episode(TASK, seed=0, nouns=nouns)
+
+
+def test_other_unfit_options_are_refused() -> None:
+    with pytest.raises(ConfigError, match="num_distractors is 4; give an integer from 0 to 3"):
+        sample_episode(TASK, seed=0, num_distractors=4)
+    with pytest.raises(ConfigError, match="no difficulty 'eas'"):
+        sample_episode(TASK, seed=0, difficulty="eas")
+
+
+def test_compat_starts_hover_and_have_ids_in_order_of_roles() -> None:
+    for seed in range(30):
+        target, base, (distractor,) = cast(sample_episode(TASK, seed=seed, compat=True).problem)
+        assert (base.id, target.id, distractor.id) == (5, 6, 7)
+        assert target.pose.z == target.size[2] / 2
