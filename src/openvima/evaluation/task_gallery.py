@@ -81,7 +81,7 @@ def _panel(env: TabletopEnv, title: str, seed: int) -> Image.Image:
     """Title, prompt and the table after the episode."""
     play([env], [seed], OraclePlayer())
     scene = Artist(env, enlarge=2).draw(env.scene, joints=None)
-    strip = draw_prompt_strip(env.prompt, width=scene.shape[1], image_height=44, font_size=16)
+    strip = draw_prompt_strip(env.prompt, width=scene.shape[1], image_height=56, font_size=16)
     head = Image.new("RGB", (scene.shape[1], _TITLE_HEIGHT), (255, 255, 255))
     place = (10, _TITLE_HEIGHT // 2)
     ImageDraw.Draw(head).text(place, title, font=font(17, bold=True), fill=INK, anchor="lm")

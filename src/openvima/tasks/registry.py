@@ -2,16 +2,23 @@
 
 import functools
 import importlib
+import importlib.metadata
+import importlib.util
 import inspect
+import os
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
-from openvima.errors import LevelError, UnknownTaskError, unknown_name
+from openvima.errors import ConfigError, LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
 
+TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
+ENTRY_POINTS = "openvima.tasks"
 EXTRA_STEPS = 2  # that a policy is given beyond the oracle's
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
 
@@ -154,9 +161,30 @@ def list_tasks() -> tuple[str, ...]:
 
 @functools.cache
 def _load_task_files() -> None:
-    """Import every module of this package, so that a task is found by its file being there."""
+    """Import all modules of this package, so that a task is found by its file being there, and users' own."""
     import openvima.tasks as package
 
     for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
         if not module.name.endswith(".kernels"):  # compiled code, loaded when an episode is sampled
             importlib.import_module(module.name)
+    for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        entry_point.load()
+    for path in filter(None, os.environ.get(TASK_FILES_VARIABLE, "").split(os.pathsep)):
+        _import_file(Path(path))
+
+
+def _import_file(path: Path) -> None:
+    """Import a task file that lies anywhere.
+
+    Raises:
+        ConfigError: There is no such Python file.
+    """
+    spec = importlib.util.spec_from_file_location(f"openvima_task_{path.stem}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise ConfigError(
+            f"{TASK_FILES_VARIABLE} names {str(path)!r}, which is no Python file; "
+            f"give paths with {os.pathsep!r} in between."
+        )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
