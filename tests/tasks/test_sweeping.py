@@ -7,7 +7,8 @@ import pytest
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone, ZoneKeptClear
 from openvima.tasks import sample_episode
 from openvima.tasks.footprints import Rectangle
-from openvima.tasks.sweeping import SHORTFALL_M, STANDOFF_M, Sweep, plan_sweep
+from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Sweep
+from openvima.tasks.sweeping import plan_sweep
 
 ZONE = Zone(0.5, 0.0, 0.1, 0.27)
 FAR = (0.6, 0.3)

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from openvima.scene import Pose
+from openvima.scene import Pose, Zone
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,11 @@ class Rectangle:
         """Footprint of a box that lies flat, its link frame in the middle."""
         return Rectangle(pose.x, pose.y, pose.yaw_rad, size_x / 2, size_y / 2)
 
+    @staticmethod
+    def of_zone(zone: Zone) -> "Rectangle":
+        """The rectangle of a zone."""
+        return Rectangle(zone.x, zone.y, 0.0, zone.size_x / 2, zone.size_y / 2)
+
     def comes_near(self, other: "Rectangle", margin_m: float = 0.0) -> bool:
         """Whether the two rectangles overlap, or no axis of either shows a gap of `margin_m` between them.
 
@@ -36,6 +41,15 @@ class Rectangle:
         for yaw in (self.yaw_rad, self.yaw_rad + math.pi / 2, other.yaw_rad, other.yaw_rad + math.pi / 2):
             distance = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
             if distance >= self.half_width(yaw) + other.half_width(yaw) + margin_m:
+                return False
+        return True
+
+    def meets_box_around(self, other: "Rectangle", margin_m: float = 0.0) -> bool:
+        """Whether this one comes near the smallest box along its own axes around the other one."""
+        dx, dy = other.x - self.x, other.y - self.y
+        for yaw, half in ((self.yaw_rad, self.half_x), (self.yaw_rad + math.pi / 2, self.half_y)):
+            distance = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
+            if distance >= half + other.half_width(yaw) + margin_m:
                 return False
         return True
 

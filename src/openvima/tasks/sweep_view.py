@@ -1,0 +1,105 @@
+"""What a planner of sweeps sees of a scene: blocks, lines, and which pushes keep clear of them."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from openvima.scene import InZone, NeverTouches, Pose, Problem, Scene, Zone
+from openvima.tasks.footprints import Rectangle
+from openvima.tasks.pushes import Point, Push
+
+_BLADE_GAP_M = 0.001  # left free around the blade where it comes down
+_END_STEP_M = 0.015
+_COLUMN_STEP_M = 0.05  # two blocks pushed one after the other along the same way have room
+_END_EDGE_M = 0.03  # ends keep this far from the zone's edge
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Blocks and lines of a scene, as far as sweeps care.
+
+    Args:
+        goals: The open goals, those with the block nearest to its zone first.
+        footprints: Ids of all blocks, and where they lie.
+        met_ids: Blocks of goals that are met.
+        lines: What no block of a goal may touch.
+    """
+
+    goals: tuple[InZone, ...]
+    footprints: dict[int, Rectangle]
+    met_ids: frozenset[int]
+    lines: tuple[Zone, ...]
+
+    @staticmethod
+    def of(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
+        """Look at a scene with these open goals."""
+
+        def distance(goal: InZone) -> float:
+            return scene[goal.object_id].pose.planar_distance(Pose.planar(goal.zone.x, goal.zone.y))
+
+        blocks = [placement for placement in scene.placements if not placement.fixed]
+        return View(
+            goals=tuple(sorted(goals, key=distance)),
+            footprints={b.id: Rectangle.of_box(b.pose, b.size[0], b.size[1]) for b in blocks},
+            met_ids=frozenset(g.object_id for g in problem.goals) - {g.object_id for g in goals},
+            lines=tuple(c.zone for c in problem.constraints if isinstance(c, NeverTouches)),
+        )
+
+    def place(self, goal: InZone) -> Point:
+        """Where the centre of a goal's block is."""
+        footprint = self.footprints[goal.object_id]
+        return footprint.x, footprint.y
+
+    def after(self, goal: InZone, push: Push) -> "View":
+        """Return what one will see once the goal's block was pushed."""
+        block = replace(self.footprints[goal.object_id], x=push.end[0], y=push.end[1], yaw_rad=push.yaw_rad)
+        return replace(self, footprints=self.footprints | {goal.object_id: block})
+
+    def only(self, goal: InZone) -> "View":
+        """Return the same with no other goal open."""
+        return replace(self, goals=(goal,))
+
+    def others(self, goal: InZone) -> Iterator[tuple[int, Rectangle]]:
+        """Ids and footprints of all blocks but the goal's."""
+        return ((i, block) for i, block in self.footprints.items() if i != goal.object_id)
+
+    def is_clear(
+        self, goal: InZone, push: Push, *, yielding: Collection[int] = (), overlap_m: float = 0.0
+    ) -> bool:
+        """Whether a push of the goal's block moves no other one and touches no line.
+
+        Args:
+            goal: Whose block.
+            push: From where to where.
+            yielding: Ids of blocks whose footprints the way may overlap, by up to `overlap_m`.
+            overlap_m: In metres.
+        """
+        if touches_line(push, self.lines):
+            return False
+        way, blade = push.way(), push.blade()
+        return not any(
+            way.comes_near(block, -overlap_m if object_id in yielding else 0.0)
+            or blade.meets_box_around(block, _BLADE_GAP_M)
+            for object_id, block in self.others(goal)
+        )
+
+
+def touches_line(push: Push, lines: Sequence[Zone]) -> bool:
+    """Whether a block that is pushed may touch one of the lines."""
+    track = push.track()
+    return any(track.comes_near(Rectangle.of_zone(line)) for line in lines)
+
+
+def ends(zone: Zone, start: Point) -> Iterator[Point]:
+    """Points in a zone to push a block to: the middle, then ever farther beside it, then deeper and nearer.
+
+    Args:
+        zone: The zone.
+        start: Where the block is; of two points to the left and to the right, its own side comes first.
+    """
+    side = 1 if start[1] >= zone.y else -1
+    num_steps = int((zone.size_y / 2 - _END_EDGE_M) / _END_STEP_M + 1e-9)
+    shifts = (0.0, *(sign * _END_STEP_M * step for step in range(1, num_steps + 1) for sign in (side, -side)))
+    columns = (
+        (0.0, -_COLUMN_STEP_M, _COLUMN_STEP_M) if zone.size_x / 2 > _COLUMN_STEP_M + _END_EDGE_M else (0.0,)
+    )
+    return ((zone.x + column, zone.y + shift) for column in columns for shift in shifts)
