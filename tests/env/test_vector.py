@@ -319,5 +319,5 @@ def test_what_cannot_be_built_is_refused_at_once(kind: str) -> None:
 
 
 def test_an_unknown_kind_is_refused() -> None:
-    with pytest.raises(ConfigError, match="vectorization mode 'threads'.*sync, async"):
+    with pytest.raises(ConfigError, match=r"vectorization mode 'threads'.*sync, async"):
         openvima.make_vec("rotate", 2, vectorization_mode="threads")

@@ -16,6 +16,7 @@ from typing import Any  # actions, observations and infos are nested dictionarie
 
 import gymnasium
 import numpy as np
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 
@@ -124,7 +125,7 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
         """End all workers if the block fails, except if it was only called at the wrong time."""
         try:
             yield
-        except gymnasium.error.Error:
+        except (AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError):
             raise
         except (EOFError, ConnectionError):
             message = self._obituary()

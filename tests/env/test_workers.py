@@ -1,0 +1,199 @@
+"""Workers: what an error, a kill or Ctrl-C does to them, and what they leave behind."""
+
+import functools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import openvima
+from faulty_environments import FailsToStart, Faulty
+from openvima.env import stack_actions
+from openvima.env.workers import AsyncTabletopEnvs
+from openvima.errors import SamplingError, WorkerError
+
+IDLE = stack_actions([None, None])
+SCRIPT = """
+import openvima
+from openvima.env import stack_actions
+
+def main():
+    print("starting", flush=True)
+    envs = openvima.make_vec("rotate", 2, vectorization_mode="async")
+    envs.reset(seed=0)
+    print(*[process.pid for process in envs.processes], flush=True)
+    while True:
+        envs.step(stack_actions([None, None]))
+
+"""
+GUARD = 'if __name__ == "__main__":\n    '
+
+
+def build(recipe: Callable[[], gymnasium.Env] = Faulty) -> AsyncTabletopEnvs:
+    return AsyncTabletopEnvs([recipe, recipe], AutoresetMode.NEXT_STEP)
+
+
+def start(folder: Path, script: str) -> subprocess.Popen:
+    """Run a script as the leader of a group of processes, as a terminal does."""
+    file = folder / "script.py"
+    file.write_text(script, encoding="utf-8")
+    return subprocess.Popen(
+        [sys.executable, str(file)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process exists and is no zombie, which a container without an init process keeps."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")")[1].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+def wait_until_gone(pids: list[int]) -> None:
+    deadline = time.monotonic() + 20
+    while any(map(is_running, pids)):
+        assert time.monotonic() < deadline, f"{[pid for pid in pids if is_running(pid)]} still run"
+        time.sleep(0.02)
+
+
+def test_an_error_in_a_worker_reaches_the_caller_and_ends_all() -> None:
+    envs = build()
+    envs.reset(seed=[1, 2])
+    with pytest.raises(SamplingError, match="no place for the target") as caught:
+        envs.reset(seed=[1, 13])
+    assert "raised in sub-environment 1; all workers were ended" in caught.value.__notes__[0]
+    assert "faulty_environments.py" in caught.value.__notes__[0]  # its traceback
+    assert not any(process.is_alive() for process in envs.processes)
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+        envs.step(IDLE)
+    envs.close()
+
+
+def test_an_error_that_cannot_be_sent_ends_all_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("openvima.env.workers._PATIENCE_S", 0.5)
+    envs = build()
+    with pytest.raises(WorkerError, match="cannot be sent"):
+        envs.reset(seed=[14, 1])
+    assert not any(process.is_alive() for process in envs.processes)
+
+
+@pytest.mark.parametrize("is_stepping", [False, True])
+def test_a_killed_worker_is_reported_and_ends_all(is_stepping: bool) -> None:
+    envs = build(functools.partial(Faulty, step_s=0.3))
+    envs.reset(seed=0)
+    if is_stepping:
+        envs.step_async(IDLE)
+    victim = envs.processes[1]
+    os.kill(victim.pid, signal.SIGKILL)
+    victim.join()
+    with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) ended by itself"):
+        envs.step_wait() if is_stepping else envs.step(IDLE)
+    assert not any(process.is_alive() for process in envs.processes)
+    envs.close()
+
+
+def test_closing_after_a_kill_is_quiet() -> None:
+    envs = build()
+    envs.processes[0].kill()
+    envs.processes[0].join()
+    envs.close()
+    assert [process.exitcode for process in envs.processes] == [-9, 0]
+
+
+def test_a_worker_that_does_not_start_is_reported() -> None:
+    with pytest.raises(WorkerError, match=r"0 \(exit code 3\).*__main__"):
+        build(FailsToStart())
+
+
+def test_closing_lets_idle_workers_finish_and_stops_busy_ones() -> None:
+    idle, busy = build(), build(functools.partial(Faulty, step_s=60))
+    for envs in (idle, busy):
+        envs.reset(seed=0)
+    busy.step_async(IDLE)
+    for envs in (idle, busy):
+        envs.close()
+        envs.close()
+    assert [process.exitcode for process in idle.processes] == [0, 0]
+    assert [process.exitcode for process in busy.processes] == [-signal.SIGTERM] * 2
+
+
+def test_a_call_at_the_wrong_time_is_refused_and_changes_nothing() -> None:
+    envs = build()
+    envs.reset(seed=0)
+    envs.step_async(IDLE)
+    with pytest.raises(gymnasium.error.AlreadyPendingCallError):
+        envs.step_async(IDLE)
+    assert envs.step_wait()[4]["num_steps"].tolist() == [1, 1]
+    envs.close()
+
+
+def test_closed_environments_leave_no_file_handles() -> None:
+    def num_handles() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    counts = []
+    for _ in range(2):
+        envs = openvima.make_vec("rotate", 2, vectorization_mode="async")
+        envs.reset(seed=0)
+        envs.close()
+        del envs
+        counts.append(num_handles())
+    assert counts[0] == counts[1]  # the first starts the process that looks after shared resources
+
+
+def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
+    process = start(tmp_path, SCRIPT + GUARD + "main()")
+    assert process.stdout.readline() == "starting\n"
+    workers = [int(pid) for pid in process.stdout.readline().split()]
+    assert len(workers) == 2
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGINT
+    assert errors.count("Traceback") == 1
+    assert errors.endswith("KeyboardInterrupt\n")
+    wait_until_gone(workers)
+
+
+def test_ctrl_c_while_workers_start_is_quiet_too(tmp_path: Path) -> None:
+    process = start(tmp_path, SCRIPT + GUARD + "main()")
+    process.stdout.readline()
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(children.read_text(encoding="utf-8").split()) < 3:  # two workers, and who looks after them
+        time.sleep(0.005)
+    pids = [int(pid) for pid in children.read_text(encoding="utf-8").split()]
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert errors.count("Traceback") == 1
+    assert errors.endswith("KeyboardInterrupt\n")
+    wait_until_gone(pids)
+
+
+def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
+    process = start(tmp_path, SCRIPT + GUARD + "main()")
+    process.stdout.readline()
+    workers = [int(pid) for pid in process.stdout.readline().split()]
+    process.kill()
+    _, errors = process.communicate(timeout=60)
+    assert "Traceback" not in errors
+    wait_until_gone(workers)
+
+
+def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+    process = start(tmp_path, SCRIPT + "main()")
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "WorkerError: the worker of sub-environment" in errors
+    assert 'under `if __name__ == "__main__":`' in errors
