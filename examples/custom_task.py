@@ -1,6 +1,6 @@
 """A task of your own in one file: put an object between two others.
 
-Run it with `python examples/custom_task.py` to watch the oracle solve it. For the command line, name the file:
+Run it with `python examples/custom_task.py`: the oracle solves it. On the command line, name the file:
 
     OPENVIMA_TASK_FILES=examples/custom_task.py openvima demo put_between --out put_between.mp4
 """
