@@ -1,6 +1,7 @@
 """The reader of the original asset pack; what is in the pack is compared in tests named golden."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from openvima.catalog import OBJECTS, TEXTURES, Assets, CollisionBox, CollisionHull
 from openvima.catalog.boxes import block, container, line, square, three_sided_rectangle
 from openvima.catalog.obj_file import parse_obj
-from openvima.catalog.original import OriginalAssets, image_file
+from openvima.catalog.original import _FIXED_MESHES, OriginalAssets, image_file
 from openvima.catalog.textures import texture_spec
 from openvima.errors import AssetError, UnknownObjectError, UnknownTextureError
 
@@ -265,3 +266,19 @@ def test_the_top_of_a_box_shows_the_lower_right_sixteenth_of_its_texture() -> No
     expected = np.stack([0.75 + (x + 1) / 8, 0.25 - (y + 1) / 8], axis=-1)
     np.testing.assert_allclose(cube.uvs[top], expected)
     assert cube.uvs[~top].max() <= 0.75
+
+
+@needs_pack
+def test_golden_body_descriptions_name_the_meshes_and_scales_of_the_code() -> None:
+    described = {
+        "bowl": "bowl/bowl",
+        "pallet": "pallet/pallet",
+        "frame": "zone/zone",
+        "disk": "hanoi/disk-mod",
+    }
+    for name, file in described.items():
+        text = (ASSETS_FOLDER / f"{file}.urdf").read_text()
+        mesh, scale = re.findall(r'mesh filename="([^"]+)" scale="([^"]+)"', text)[0]
+        path, metres, _ = _FIXED_MESHES[name]
+        assert path == f"{Path(file).parent}/{mesh}"
+        assert metres == tuple(float(number) for number in scale.split())

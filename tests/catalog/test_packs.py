@@ -102,6 +102,29 @@ def test_a_truncated_cache_file_is_replaced():
     assert len(np.load(path)) == 100
 
 
+@pytest.mark.parametrize("place", [-1, -20, 200])
+def test_a_cache_file_with_a_changed_byte_is_replaced(place, caplog):
+    path = cache_dir() / "group" / "key.npy"
+    cached_array("group", "key", lambda: np.arange(100))
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+    assert np.array_equal(cached_array("group", "key", lambda: np.arange(100)), np.arange(100))
+    assert "its checksum is wrong" in caplog.text
+    caplog.clear()
+    cached_array("group", "key", lambda: np.arange(100))
+    assert caplog.text == ""
+
+
+def test_a_damaged_picture_of_the_procedural_pack_is_drawn_again():
+    drawn = ProceduralAssets().texture("tiles")
+    (file,) = cache_dir().rglob("tiles.npy")
+    content = bytearray(file.read_bytes())
+    content[1000] ^= 255
+    file.write_bytes(content)
+    assert np.array_equal(ProceduralAssets().texture("tiles"), drawn)
+
+
 def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("a file where the folder should be")

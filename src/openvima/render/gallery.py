@@ -137,8 +137,8 @@ def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> str:
         "sets": _sets_with(spec.name, OBJECT_SETS),
     }
     rows = {
-        "to be moved": _levels_where(lambda pool: spec.name in pool.dragged_objects),
-        "as a base": _levels_where(lambda pool: spec.name in pool.base_objects),
+        "moved": _levels_where(lambda pool: spec.name in pool.dragged_objects),
+        "base": _levels_where(lambda pool: spec.name in pool.base_objects),
     }
     note = _ROLES_OUTSIDE_POOLS.get(spec.name, "") or ("" if any(rows.values()) else "used by no task")
     return (
@@ -163,8 +163,8 @@ def _texture_card(artist: _Artist, spec: TextureSpec) -> str:
             facts["image"] = f"{width} × {height} pixels"
     facts["sets"] = _sets_with(spec.name, TEXTURE_SETS)
     rows = {
-        "moved objects": _levels_where(lambda pool: spec.name in pool.dragged_textures),
-        "bases": _levels_where(lambda pool: spec.name in pool.base_textures),
+        "moved": _levels_where(lambda pool: spec.name in pool.dragged_textures),
+        "base": _levels_where(lambda pool: spec.name in pool.base_textures),
     }
     if spec.name == NEUTRAL_TEXTURE:
         note = "prompt images that show a shape only"
