@@ -4,9 +4,11 @@ import collections
 
 import pytest
 
-from openvima.catalog import TEXTURE_SETS
-from openvima.scene import AtPose, DistractorsApart, Placement, Problem
-from openvima.tasks import sample_episode, task_spec
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import TEXTURE_SETS, pool
+from openvima.errors import ConfigError
+from openvima.scene import AtPose, DistractorsApart, Placement, Pose, Problem
+from openvima.tasks import advance, begin, sample_episode, task_spec
 
 NUM_EPISODES = 2000
 
@@ -27,15 +29,6 @@ def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
 @pytest.fixture(scope="module")
 def problems() -> list[Problem]:
     return [sample_episode("visual_manipulation", seed=seed).problem for seed in range(NUM_EPISODES)]
-
-
-def assert_uniform(names: list[str], options: tuple[str, ...]) -> None:
-    counts = collections.Counter(names)
-    assert set(counts) == set(options)
-    expected = len(names) / len(options)
-    statistic = sum((count - expected) ** 2 / expected for count in counts.values())
-    degrees = len(options) - 1
-    assert statistic < degrees + 3.5 * (2 * degrees) ** 0.5 + 4, statistic  # beyond p = 0.001
 
 
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
@@ -102,13 +95,12 @@ def test_hard_exchanges_the_textures(difficulty: str, dragged: str, base: str) -
 
 
 def test_medium_draws_both_roles_from_one_of_the_sets() -> None:
-    sets = collections.Counter()
-    for seed in range(60):
+    sets = []
+    for seed in range(200):
         target, base, _ = cast(sample_episode("visual_manipulation", seed=seed, difficulty="medium").problem)
-        both_first = target.texture in TEXTURE_SETS["C1"]
-        assert (base.texture in TEXTURE_SETS["C1"]) is both_first
-        sets[both_first] += 1
-    assert min(sets.values()) > 15
+        sets.append(target.texture in TEXTURE_SETS["C1"])
+        assert (base.texture in TEXTURE_SETS["C1"]) is sets[-1]
+    assert_frequencies(sets, {True: 0.5, False: 0.5})
 
 
 @pytest.mark.parametrize("num_distractors", [0, 2, 3])
@@ -117,3 +109,59 @@ def test_the_number_of_distractors_can_be_chosen(num_distractors: int) -> None:
         problem = sample_episode("visual_manipulation", seed=seed, num_distractors=num_distractors).problem
         assert len(cast(problem)[2]) == num_distractors
         assert len(problem.scene.placements) == 2 + num_distractors
+
+
+@pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+def test_every_level_draws_from_its_pool(level: str) -> None:
+    drawn_from = pool("visual_manipulation", level)
+    for seed in range(100):
+        target, base, _ = cast(sample_episode("visual_manipulation", level=level, seed=seed).problem)
+        assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
+        assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
+
+
+@pytest.mark.parametrize(
+    ("target_at", "distractor_at", "success", "failure"),
+    [
+        (0.099, None, True, False),
+        (0.101, None, False, False),
+        (None, 0.099, False, True),
+        (None, 0.101, False, False),
+        (0.05, 0.14, False, True),  # in the base, but 0.09 m from the distractor
+    ],
+)
+def test_distances_decide(
+    target_at: float | None, distractor_at: float | None, success: bool, failure: bool
+) -> None:
+    problem = sample_episode("visual_manipulation", seed=1).problem
+    target, base, (distractor,) = cast(problem)
+    inward = 1.0 if base.pose.y < 0 else -1.0
+    moved = {
+        object_id: base.pose.moved(dy=inward * distance)
+        for object_id, distance in ((target.id, target_at), (distractor.id, distractor_at))
+        if distance is not None
+    }
+    outcome = advance(problem, begin(problem), problem.scene.with_poses(moved))[1]
+    assert (outcome.success, outcome.failure) == (success, failure), outcome.reason
+
+
+def test_a_lost_target_is_a_failure() -> None:
+    problem = sample_episode("visual_manipulation", seed=1).problem
+    lost = problem.scene.with_poses({cast(problem)[0].id: Pose.planar(0.76, 0.0)})
+    assert advance(problem, begin(problem), lost)[1].failure
+
+
+@pytest.mark.parametrize(
+    "options", [{"num_distractors": 4}, {"num_distractors": -1}, {"difficulty": "Easy!"}]
+)
+def test_bad_options_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        sample_episode("visual_manipulation", seed=0, **options)
+
+
+def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
+    for seed in range(20):
+        problem = sample_episode("visual_manipulation", seed=seed, compat=True).problem
+        target, base, (distractor,) = cast(problem)
+        assert (base.id, target.id, distractor.id) == (5, 6, 7)
+        assert target.pose.z == pytest.approx(target.size[2] / 2)
