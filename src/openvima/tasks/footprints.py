@@ -37,21 +37,17 @@ class Rectangle:
 
         At the corners the gap may thus be a little wider than the margin and still count as near.
         """
-        dx, dy = other.x - self.x, other.y - self.y
-        for yaw in (self.yaw_rad, self.yaw_rad + math.pi / 2, other.yaw_rad, other.yaw_rad + math.pi / 2):
-            distance = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
-            if distance >= self.half_width(yaw) + other.half_width(yaw) + margin_m:
-                return False
-        return True
+        return self.meets_box_around(other, margin_m) and other.meets_box_around(self, margin_m)
 
     def meets_box_around(self, other: "Rectangle", margin_m: float = 0.0) -> bool:
         """Whether this one comes near the smallest box along its own axes around the other one."""
         dx, dy = other.x - self.x, other.y - self.y
-        for yaw, half in ((self.yaw_rad, self.half_x), (self.yaw_rad + math.pi / 2, self.half_y)):
-            distance = abs(dx * math.cos(yaw) + dy * math.sin(yaw))
-            if distance >= half + other.half_width(yaw) + margin_m:
-                return False
-        return True
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        turn = other.yaw_rad - self.yaw_rad
+        turn_cos, turn_sin = abs(math.cos(turn)), abs(math.sin(turn))
+        reach_x = self.half_x + other.half_x * turn_cos + other.half_y * turn_sin + margin_m
+        reach_y = self.half_y + other.half_x * turn_sin + other.half_y * turn_cos + margin_m
+        return abs(dx * cos + dy * sin) < reach_x and abs(dy * cos - dx * sin) < reach_y
 
     def half_width(self, direction_rad: float) -> float:
         """Half of the rectangle's extent along a direction, in metres."""

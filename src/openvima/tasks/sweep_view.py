@@ -1,6 +1,6 @@
 """What a planner of sweeps sees of a scene: blocks, lines, and which pushes keep clear of them."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from openvima.scene import InZone, NeverTouches, Pose, Problem, Scene, Zone
@@ -22,12 +22,15 @@ class View:
         footprints: Ids of all blocks, and where they lie.
         met_ids: Blocks of goals that are met.
         lines: What no block of a goal may touch.
+        overlap_m: How far a way may overlap blocks that were swept already, in metres. They stay counted, and
+            the blade stops too far before a line to push them onto it.
     """
 
     goals: tuple[InZone, ...]
     footprints: dict[int, Rectangle]
     met_ids: frozenset[int]
     lines: tuple[Zone, ...]
+    overlap_m: float = 0.0
 
     @staticmethod
     def of(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
@@ -62,22 +65,13 @@ class View:
         """Ids and footprints of all blocks but the goal's."""
         return ((i, block) for i, block in self.footprints.items() if i != goal.object_id)
 
-    def is_clear(
-        self, goal: InZone, push: Push, *, yielding: Collection[int] = (), overlap_m: float = 0.0
-    ) -> bool:
-        """Whether a push of the goal's block moves no other one and touches no line.
-
-        Args:
-            goal: Whose block.
-            push: From where to where.
-            yielding: Ids of blocks whose footprints the way may overlap, by up to `overlap_m`.
-            overlap_m: In metres.
-        """
+    def is_clear(self, goal: InZone, push: Push) -> bool:
+        """Whether a push of the goal's block moves no other one, beyond `overlap_m`, and touches no line."""
         if touches_line(push, self.lines):
             return False
         way, blade = push.way(), push.blade()
         return not any(
-            way.comes_near(block, -overlap_m if object_id in yielding else 0.0)
+            way.comes_near(block, -self.overlap_m if object_id in self.met_ids else 0.0)
             or blade.meets_box_around(block, _BLADE_GAP_M)
             for object_id, block in self.others(goal)
         )

@@ -1,14 +1,15 @@
 """Planning of sweeps: which block to push, from where and how far, so that nothing else is moved.
 
 The plan is pure geometry: a sweep is clear if its way comes near no other block and the block's track near
-no line. Of the first sweeps of 500 episodes of `sweep_without_exceeding`, 95 % take the nearest block straight
-to the middle of the zone; the others go elsewhere in it, move a block aside or part a tight group. A line at
-the zone's mouth is passed in one sweep where there is room, else with one stop beside the line.
+no line. Of the first sweeps of 500 episodes of `sweep_without_exceeding`, 95 % take the nearest block
+straight to the middle of the zone; the others go elsewhere in it, move a block aside or part a tight group.
+A line at the zone's mouth is passed in one sweep where there is room, else with one stop beside the line.
 """
 
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, InZone, Problem, Scene, Zone
 from openvima.tasks.detours import waypoints
@@ -17,7 +18,7 @@ from openvima.tasks.published_sweeps import published_sweep
 from openvima.tasks.pushes import BLOCK_REACH_M, Point, Push, Sweep
 from openvima.tasks.sweep_view import View, ends
 
-_NUDGE_M, _SHOVE_M = 0.012, 0.03  # how far a way may overlap a block in the zone that counts already
+_NUDGE_M, _SHOVE_M = 0.012, 0.03  # how far a way may overlap a block that counts already
 _ASIDE_LENGTHS_M = (0.06, 0.1)
 _ASIDE_ANGLES_RAD = tuple(2 * math.pi * step / 24 for step in range(24))
 _PARKING_EDGE_M = 0.03  # a parked block keeps this far from the zone and the edge of the workspace
@@ -35,44 +36,46 @@ def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compa
     if compat:
         return published_sweep(goals[0], scene, problem)
     view = View.of(goals, scene, problem)
+    nudging, shoving = replace(view, overlap_m=_NUDGE_M), replace(view, overlap_m=_SHOVE_M)
     sweeps = itertools.chain(
         _direct_sweeps(view),
-        _direct_sweeps(view, overlap_m=_NUDGE_M),
+        _direct_sweeps(nudging),
         _detours(view),
         _aside_sweeps(view),
-        _direct_sweeps(view, overlap_m=_SHOVE_M),
-        _detours(view, overlap_m=_SHOVE_M),
+        _direct_sweeps(shoving),
+        _detours(shoving),
         _parting_sweeps(view),
         _last_resort(view),
     )
     return next(sweeps)
 
 
-def _direct_sweeps(view: View, *, overlap_m: float = 0.0) -> Iterator[Sweep]:
-    """Clear sweeps that bring one block into the zone: to its middle, else beside it, the near side first.
-
-    The way may overlap blocks that were swept already, by up to `overlap_m`: they stay counted, and the blade
-    stops too far before a line to push them onto it.
-    """
-    routes = [
-        [Push.between(view.place(goal), end) for end in ends(goal.zone, view.place(goal))]
-        for goal in view.goals
-    ]
-    for pushes in itertools.zip_longest(*routes):
+def _direct_sweeps(view: View) -> Iterator[Sweep]:
+    """Clear sweeps that bring one block into the zone: to its middle, else beside it, the near side first."""
+    if view.overlap_m and not view.met_ids:
+        return  # nothing can be overlapped
+    for pushes in itertools.zip_longest(*(_pushes_into_zone(view, goal) for goal in view.goals)):
         for goal, push in zip(view.goals, pushes, strict=True):
-            if push and view.is_clear(goal, push, yielding=view.met_ids, overlap_m=overlap_m):
+            if push and view.is_clear(goal, push):
                 yield push.sweep(goal)
 
 
-def _detours(view: View, *, overlap_m: float = 0.0) -> Iterator[Sweep]:
+def _pushes_into_zone(view: View, goal: InZone) -> Iterator[Push]:
+    place = view.place(goal)
+    return (Push.between(place, end) for end in ends(goal.zone, place))
+
+
+def _detours(view: View) -> Iterator[Sweep]:
     """Clear sweeps to a stop beside the line from where the same block can go straight on, shortest first."""
-    stops = []
-    for goal in view.goals:
-        for waypoint in waypoints(goal.zone, view.lines):
-            push = Push.between(view.place(goal), waypoint.point)
-            stops.append((push.length_m + waypoint.rest_m, len(stops), goal, push))
-    for _, _, goal, push in sorted(stops, key=lambda stop: stop[:2]):
-        if view.is_clear(goal, push) and _can_finish(view.after(goal, push).only(goal), overlap_m=overlap_m):
+    stops = [
+        (math.dist(view.place(goal), waypoint.point) + waypoint.rest_m, rank, waypoint.point)
+        for rank, goal in enumerate(view.goals)
+        for waypoint in waypoints(goal.zone, view.lines)
+    ]
+    for _, rank, stop in sorted(stops):
+        goal = view.goals[rank]
+        push = Push.between(view.place(goal), stop)
+        if view.is_clear(goal, push) and _can_finish(view.after(goal, push).only(goal)):
             yield push.sweep(goal)
 
 
@@ -83,8 +86,8 @@ def _aside_sweeps(view: View) -> Iterator[Sweep]:
             yield push.sweep(goal)
 
 
-def _can_finish(view: View, *, overlap_m: float = 0.0) -> bool:
-    return any(True for _ in _direct_sweeps(view, overlap_m=overlap_m))
+def _can_finish(view: View) -> bool:
+    return any(True for _ in _direct_sweeps(view))
 
 
 def _parting_sweeps(view: View) -> Iterator[Sweep]:
