@@ -2,6 +2,7 @@
 
 import functools
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -167,18 +168,36 @@ def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
     wait_until_gone(workers)
 
 
-def test_ctrl_c_while_workers_start_is_quiet_too(tmp_path: Path) -> None:
+def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + GUARD + "main()")
     process.stdout.readline()
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while len(children.read_text(encoding="utf-8").split()) < 3:  # two workers, and who looks after them
+    while not select.select([process.stdout], [], [], 0.005)[0]:  # until all have started
+        for pid in children.read_text(encoding="utf-8").split():
+            os.kill(int(pid), signal.SIGINT)
+    workers = [int(pid) for pid in process.stdout.readline().split()]
+    assert len(workers) == 2
+    for pid in workers:
+        os.kill(pid, signal.SIGINT)
+    time.sleep(0.2)
+    assert all(map(is_running, workers))
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert errors.count("Traceback") == 1
+    wait_until_gone(workers)
+
+
+def test_ctrl_c_while_workers_start_ends_them(tmp_path: Path) -> None:
+    process = start(tmp_path, SCRIPT + GUARD + "main()")
+    process.stdout.readline()
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(pids := children.read_text(encoding="utf-8").split()) < 3:  # a third one counts resources
         time.sleep(0.005)
-    pids = [int(pid) for pid in children.read_text(encoding="utf-8").split()]
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert errors.count("Traceback") == 1
     assert errors.endswith("KeyboardInterrupt\n")
-    wait_until_gone(pids)
+    wait_until_gone([int(pid) for pid in pids])
 
 
 def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
