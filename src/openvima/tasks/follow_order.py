@@ -124,7 +124,7 @@ def _stacked(table: TableSampler, blocks: list[Placement], stacks: Stacks) -> Fr
         for level, index in enumerate(stack):
             block = blocks[index]
             z = (2 * level + 1) * block.size[2] / 2 if table.compat else None
-            lying = shown.add(block.object, block.texture, size=block.size, pose=place, z=z, on_top=True)
+            lying = shown.add(block.object, block.texture, size=block.size, pose=place, z=z, on_top=level > 0)
             poses[index] = lying.pose
     return [block.at(poses[index]) for index, block in enumerate(blocks)]
 

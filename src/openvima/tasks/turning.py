@@ -29,26 +29,28 @@ def turn_goal(placement: Placement, angle_deg: float, *, position_m: float) -> A
     return AtPose(placement.id, turned(placement.pose, angle_deg), tolerance, relative_to=placement.id)
 
 
-def check_angles(angles_deg: Sequence[float]) -> None:
-    """Refuse angles that are met, or nearly met, before anything is turned.
+def check_angles(angles_deg: object) -> None:
+    """Refuse angles that are no numbers, and those that are met, or nearly met, before anything is turned.
 
     Raises:
-        ConfigError: An angle is within 15 degrees of no turn at all or is no number, or there is none.
+        ConfigError: An angle is within 15 degrees of no turn at all, or what was given is no list of numbers.
     """
-    try:
-        are_numbers = all(math.isfinite(angle) for angle in angles_deg)
-    except TypeError:
-        are_numbers = False
-    if not are_numbers:
+    if not isinstance(angles_deg, Sequence) or isinstance(angles_deg, str):
         raise ConfigError(
-            f"angles_deg is {angles_deg!r}; give a list of angles in degrees, such as [30, 60]."
+            f"angles_deg is {angles_deg!r}; give a list of degrees, such as {list(ANGLES_DEG)}."
         )
-    small = [angle for angle in angles_deg if abs(math.remainder(angle, 360)) <= TOLERANCE_DEG]
-    if small or not angles_deg:
-        shown = ", ".join(f"{angle:g}" for angle in small) or "nothing"
+    wrong = [str(angle) for angle in angles_deg if not _is_large(angle)]
+    if wrong or not angles_deg:
+        shown = ", ".join(wrong) or "nothing"
         raise ConfigError(
             f"angles_deg holds {shown}; each angle must turn by more than {TOLERANCE_DEG} degrees."
         )
+
+
+def _is_large(angle: object) -> bool:
+    if not isinstance(angle, int | float) or not math.isfinite(angle):
+        return False
+    return abs(math.remainder(angle, 360)) > TOLERANCE_DEG
 
 
 def check_turnable(pool: Pool) -> None:

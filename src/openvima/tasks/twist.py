@@ -93,6 +93,7 @@ def sample(
         prompt=Prompt.parse(template(num_examples), twist_obj_texture=texture, **examples),
         goals=tuple(turn_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
+        oracle_max_steps=num_objects + 2,
     )
 
 

@@ -1,0 +1,222 @@
+"""Scenes, frames and outcomes of `follow_motion` follow its specification."""
+
+import itertools
+import math
+
+import pytest
+
+from frequencies import assert_uniform
+from openvima.catalog import object_spec, pool
+from openvima.errors import ConfigError
+from openvima.scene import AtPose, ObjectImage, Outcome, Placement, Pose, Problem, SceneImage
+from openvima.tasks import advance, begin, sample_episode, task_spec
+
+TASK = "follow_motion"
+NUM_EPISODES = 2000
+POINTS = [
+    Pose.planar(0.5 + 0.19 * math.cos(a), 0.19 * math.sin(a)) for a in (n * 0.4 * math.pi for n in range(5))
+]
+ELSEWHERE = Pose.planar(0.3, 0.4)
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
+
+
+def cast(problem: Problem) -> tuple[Placement, Placement]:
+    """The object to move and the distractor."""
+    (moved_id,) = {goal.object_id for goal in problem.goals}
+    (distractor,) = (p for p in problem.scene.placements if p.id != moved_id)
+    return problem.scene[moved_id], distractor
+
+
+def frames(problem: Problem) -> list[tuple[Placement, Placement]]:
+    """For each frame the object to move and the distractor that is shown instead of the real one."""
+    moved, _ = cast(problem)
+    shown = []
+    for _, fill in problem.prompt.images[1:]:
+        assert isinstance(fill, SceneImage)
+        one, other = fill.scene.placements
+        follows = (one.object, one.texture) == (moved.object, moved.texture)
+        shown.append((one, other) if follows else (other, one))
+    return shown
+
+
+def targets(problem: Problem) -> list[Pose]:
+    return [goal.target for goal in problem.goals if isinstance(goal, AtPose)]
+
+
+def point_of(pose: Pose) -> int:
+    (index,) = (n for n, point in enumerate(POINTS) if pose.planar_distance(point) < 1e-9)
+    return index
+
+
+def played(problem: Problem, *moves: dict[int, Pose]) -> list[Outcome]:
+    """Outcome after each step."""
+    progress, scene, outcomes = begin(problem), problem.scene, []
+    for move in moves:
+        scene = scene.with_poses(move)
+        progress, outcome = advance(problem, progress, scene)
+        outcomes.append(outcome)
+    return outcomes
+
+
+def test_walks_are_uniform(problems: list[Problem]) -> None:
+    walks = []
+    for problem in problems:
+        points = [point_of(pose) for pose in (cast(problem)[0].pose, *targets(problem))]
+        walks.append((points[0], *((after - before) % 5 for before, after in itertools.pairwise(points))))
+    assert_uniform(walks, [(start, a, b) for start in range(5) for a in (1, 4) for b in (1, 4)])
+
+
+def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
+    drawn_from = pool(TASK, "L4")
+    assert len(drawn_from.dragged_objects) == 19 and len(drawn_from.dragged_textures) == 49
+    for role in (0, 1):
+        assert_uniform((cast(problem)[role].object for problem in problems), drawn_from.dragged_objects)
+        assert_uniform((cast(problem)[role].texture for problem in problems), drawn_from.dragged_textures)
+    assert_uniform((frames(problem)[0][1].object for problem in problems), drawn_from.dragged_objects)
+
+
+def test_the_distractors_of_table_and_frames_are_drawn_apart(problems: list[Problem]) -> None:
+    num_alike = num_same_shape = num_same_texture = 0
+    for problem in problems:
+        moved, distractor = cast(problem)
+        shown = frames(problem)[0][1]
+        for other in (distractor, shown):
+            assert (other.object, other.texture) != (moved.object, moved.texture)
+            num_same_shape += other.object == moved.object
+            num_same_texture += other.texture == moved.texture
+        num_alike += distractor.object == shown.object
+    assert 0.03 < num_alike / NUM_EPISODES < 0.08  # 1 in 19
+    assert 0.035 < num_same_shape / NUM_EPISODES / 2 < 0.07  # nearly 1 in 19
+    assert 0.01 < num_same_texture / NUM_EPISODES / 2 < 0.03  # nearly 1 in 49
+
+
+def test_everything_lies_straight_on_the_table(problems: list[Problem]) -> None:
+    for problem in problems[:300]:
+        moved, distractor = cast(problem)
+        assert not moved.fixed and not distractor.fixed
+        assert (distractor.pose.x, distractor.pose.y) == (0.5, 0.0)
+        for placement in (moved, distractor, *(p for frame in frames(problem) for p in frame)):
+            assert placement.pose.quaternion == (0.0, 0.0, 0.0, 1.0)
+            rest_z_m = 0.034 if placement.object == "block" else 0.0  # a box's frame is in its middle
+            assert placement.pose.z == pytest.approx(rest_z_m, abs=2e-3)
+
+
+def test_the_frames_show_the_start_and_the_target_of_each_move(problems: list[Problem]) -> None:
+    for problem in problems[:300]:
+        moved, _ = cast(problem)
+        (_, picture), *_ = problem.prompt.images
+        assert isinstance(picture, ObjectImage) and picture.placement == moved
+        shown = frames(problem)
+        assert [frame[0].pose for frame in shown] == [moved.pose, *targets(problem)]
+        assert {(frame[0].id, frame[0].size) for frame in shown} == {(shown[0][0].id, moved.size)}
+        assert {frame[1] for frame in shown} == {shown[0][1]}
+        assert (shown[0][1].pose.x, shown[0][1].pose.y) == (0.5, 0.0)
+        assert {placement.id for placement in shown[0]} == {2, 3}
+
+
+def test_ids_say_nothing_about_the_role(problems: list[Problem]) -> None:
+    assert_uniform((cast(problem)[0].id for problem in problems), (5, 6))
+    assert_uniform((frames(problem)[0][0].id for problem in problems), (2, 3))
+
+
+def test_no_draw_is_thrown_away() -> None:
+    assert not any(sample_episode(TASK, seed=seed).num_redraws for seed in range(200))
+
+
+@pytest.mark.parametrize(("difficulty", "num_frames"), [("easy", 3), ("medium", 4), ("hard", 5)])
+def test_difficulty_adds_frames(difficulty: str, num_frames: int) -> None:
+    for seed in range(10):
+        episode = sample_episode(TASK, seed=seed, difficulty=difficulty)
+        slots = " ".join(f"{{frame_{n}}}" for n in range(num_frames))
+        assert episode.problem.prompt.text == f"Follow this motion for {{dragged_obj}}: {slots}."
+        assert len(episode.problem.goals) == num_frames - 1 == episode.oracle_max_steps
+
+
+def test_the_list_of_tasks_shows_the_easy_prompt() -> None:
+    assert task_spec(TASK).template == "Follow this motion for {dragged_obj}: {frame_0} {frame_1} {frame_2}."
+
+
+def test_an_explicit_number_of_frames_wins() -> None:
+    assert len(sample_episode(TASK, seed=0, difficulty="hard", num_frames=2).problem.goals) == 1
+    assert len(sample_episode(TASK, seed=0, num_frames=10).problem.goals) == 9
+
+
+@pytest.mark.parametrize("num_frames", [1, 11, 3.0, True])
+def test_a_wrong_number_of_frames_is_refused(num_frames: object) -> None:
+    with pytest.raises(ConfigError, match=f"num_frames is {num_frames!r}; give an integer from 2 to 10"):
+        sample_episode(TASK, seed=0, num_frames=num_frames)
+
+
+def test_a_wrong_difficulty_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no difficulty 'extreme'"):
+        sample_episode(TASK, seed=0, difficulty="extreme", num_frames=3)
+
+
+@pytest.mark.parametrize(("distance", "is_near"), [(0.0, True), (0.099, True), (0.101, False)])
+def test_each_step_must_bring_the_object_near_the_next_place(
+    problems: list[Problem], distance: float, is_near: bool
+) -> None:
+    for problem in problems[:5]:
+        moved, _ = cast(problem)
+        first, last = ({moved.id: place.moved(dy=distance)} for place in targets(problem))
+        outcomes = played(problem, first, last)
+        assert outcomes[0].failure is not is_near
+        assert outcomes[1].success is is_near
+        assert played(problem, {moved.id: targets(problem)[0]}, last)[1].failure is not is_near
+
+
+def test_heading_and_height_do_not_count(problems: list[Problem]) -> None:
+    moved, _ = cast(problems[0])
+    moves = [{moved.id: place.moved(dz=0.2).rotated(2.0)} for place in targets(problems[0])]
+    assert played(problems[0], *moves)[-1].success
+
+
+def test_a_step_that_does_not_count_ends_the_episode(problems: list[Problem]) -> None:
+    for problem in problems[:20]:
+        moved, distractor = cast(problem)
+        first, last = targets(problem)
+        assert played(problem, {})[0].failure
+        assert played(problem, {distractor.id: first})[0].failure
+        assert played(problem, {moved.id: ELSEWHERE})[0].failure
+        assert played(problem, {moved.id: first}, {distractor.id: last})[1].failure
+        assert played(problem, {moved.id: first}, {})[1].failure
+
+
+def test_no_place_may_be_skipped(problems: list[Problem]) -> None:
+    ahead = [p for p in problems[:50] if targets(p)[1].planar_distance(cast(p)[0].pose) > 0.1]
+    assert len(ahead) > 10
+    for problem in ahead:
+        assert played(problem, {cast(problem)[0].id: targets(problem)[1]})[0].failure
+
+
+def test_the_way_back_has_to_be_walked_too(problems: list[Problem]) -> None:
+    back = next(p for p in problems if targets(p)[1].planar_distance(cast(p)[0].pose) < 1e-9)
+    moved, _ = cast(back)
+    assert played(back, {})[0].failure  # it is where it ends, but has not been away
+    assert [o.success for o in played(back, {moved.id: targets(back)[0]}, {moved.id: moved.pose})] == [
+        False,
+        True,
+    ]
+
+
+def test_the_distractor_may_go_anywhere(problems: list[Problem]) -> None:
+    moved, distractor = cast(problems[0])
+    first, last = targets(problems[0])
+    moves = ({moved.id: first, distractor.id: first}, {moved.id: last, distractor.id: Pose.planar(0.9, 0.0)})
+    assert played(problems[0], *moves)[-1].success
+
+
+def test_with_compat_objects_hover_a_nominal_height_above_the_table() -> None:
+    for seed in range(50):
+        problem = sample_episode(TASK, seed=seed, compat=True).problem
+        moved, distractor = problem.scene.placements
+        assert cast(problem) == (moved, distractor)
+        spec = object_spec(moved.object)
+        assert spec.size_min[2] <= moved.pose.z <= spec.size_max[2]
+        for placement in (moved, distractor, *(p for frame in frames(problem) for p in frame)):
+            assert placement.pose.z == placement.size[2]
+        assert [tuple(p.id for p in frame) for frame in frames(problem)] == [(2, 3)] * 3

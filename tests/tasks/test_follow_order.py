@@ -1,0 +1,298 @@
+"""Scenes, frames and outcomes of `follow_order` follow its specification."""
+
+import collections
+from typing import Any
+
+import numpy as np
+import pytest
+
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import Assets, pool
+from openvima.env import TabletopEnv
+from openvima.errors import ConfigError
+from openvima.scene import AtPose, Outcome, Placement, Pose, Problem, SceneImage
+from openvima.tasks import advance, begin, sample_episode, task_spec
+from openvima.tasks.follow_order import all_stackings
+
+TASK = "follow_order"
+NUM_EPISODES = 2000
+ROW_OF_THREE, ROW_OF_FOUR = (-0.25, 0.0, 0.25), (-0.3, -0.1, 0.1, 0.3)
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
+
+
+def cast(problem: Problem) -> tuple[list[Placement], list[Placement]]:
+    """The blocks along the row, and the distractors."""
+    shown = {(p.object, p.texture) for p in frames(problem)[0]}
+    blocks = [p for p in problem.scene.placements if (p.object, p.texture) in shown]
+    others = [p for p in problem.scene.placements if (p.object, p.texture) not in shown]
+    return sorted(blocks, key=lambda block: block.pose.y), others
+
+
+def frames(problem: Problem) -> list[tuple[Placement, ...]]:
+    fills = [fill for _, fill in problem.prompt.images]
+    return [fill.scene.placements for fill in fills if isinstance(fill, SceneImage)]
+
+
+def moves(problem: Problem) -> list[dict[int, Pose]]:
+    """What each step has to do."""
+    return [{goal.object_id: goal.target} for goal in problem.goals if isinstance(goal, AtPose)]
+
+
+def played(problem: Problem, *moves: dict[int, Pose]) -> list[Outcome]:
+    """Outcome after each step."""
+    progress, scene, outcomes = begin(problem), problem.scene, []
+    for move in moves:
+        scene = scene.with_poses(move)
+        progress, outcome = advance(problem, progress, scene)
+        outcomes.append(outcome)
+    return outcomes
+
+
+def stacks(frame: tuple[Placement, ...], row: tuple[float, ...]) -> list[list[str]]:
+    """Textures at each place of the row, bottom to top."""
+    found = []
+    for y in row:
+        here = [p for p in frame if (p.pose.x, p.pose.y) == pytest.approx((0.5, y))]
+        found.append([p.texture for p in sorted(here, key=lambda p: p.pose.z)])
+    assert sum(map(len, found)) == len(frame)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("num_blocks", "num_moves", "num_ways"), [(3, 2, 24), (4, 3, 864), (4, 4, 6840), (2, 1, 2)]
+)
+def test_all_ways_to_stack_are_known(num_blocks: int, num_moves: int, num_ways: int) -> None:
+    ways = all_stackings(num_blocks, num_moves)
+    assert len(set(ways)) == len(ways) == num_ways
+    for way in ways:
+        assert way[0] == tuple((block,) for block in range(num_blocks))
+        assert all(sorted(sum(step, ())) == list(range(num_blocks)) for step in way)
+
+
+def test_ways_to_stack_are_uniform(problems: list[Problem]) -> None:
+    drawn = []
+    for problem in problems:
+        blocks, _ = cast(problem)
+        number = {block.texture: n for n, block in enumerate(blocks)}
+        shown = [stacks(frame, ROW_OF_THREE) for frame in frames(problem)]
+        drawn.append(tuple(tuple(tuple(number[t] for t in stack) for stack in frame) for frame in shown))
+    assert_uniform(drawn, all_stackings(3, 2))
+
+
+def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
+    drawn_from = pool(TASK, "train")
+    casts = [cast(problem) for problem in problems]
+    assert_uniform((blocks[0].object for blocks, _ in casts), drawn_from.dragged_objects)
+    for place in range(3):
+        assert_uniform((blocks[place].texture for blocks, _ in casts), drawn_from.dragged_textures)
+    assert_uniform((distractor.texture for _, (distractor,) in casts), drawn_from.dragged_textures)
+    assert_uniform((distractor.object for _, (distractor,) in casts), drawn_from.dragged_objects)
+    same_texture = [d.texture in {b.texture for b in blocks} for blocks, (d,) in casts]
+    assert_frequencies(same_texture, {True: 3 / 19, False: 16 / 19})
+
+
+def test_blocks_share_the_shape_and_no_other_object_has_it(problems: list[Problem]) -> None:
+    for problem in problems:
+        blocks, (distractor,) = cast(problem)
+        assert len({block.texture for block in blocks}) == 3
+        assert len({(block.object, block.size) for block in blocks}) == 1
+        assert distractor.object != blocks[0].object
+        assert not any(placement.fixed for placement in problem.scene.placements)
+
+
+@pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+def test_every_level_draws_from_its_pool(level: str) -> None:
+    drawn_from, shapes, textures = pool(TASK, level), set(), set()
+    for seed in range(150):
+        for placement in sample_episode(TASK, level=level, seed=seed).problem.scene.placements:
+            shapes.add(placement.object)
+            textures.add(placement.texture)
+    assert shapes == set(drawn_from.dragged_objects)
+    assert textures == set(drawn_from.dragged_textures)
+
+
+def test_blocks_lie_in_a_row_away_from_the_distractor(problems: list[Problem], assets: Assets) -> None:
+    for problem in problems:
+        blocks, (distractor,) = cast(problem)
+        for block, y in zip(blocks, ROW_OF_THREE, strict=True):
+            assert (block.pose.x, block.pose.y) == pytest.approx((0.5, y))
+            assert block.pose.quaternion == (0.0, 0.0, 0.0, 1.0)
+            assert block.pose.z == assets.geometry(block.object, block.size).rest_z_m
+            assert block.pose.planar_distance(distractor.pose) > 0.08
+    headings = [cast(problem)[1][0].pose.yaw_rad // (np.pi / 4) for problem in problems]
+    assert_uniform(headings, range(-4, 4))
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "hard"])
+def test_frames_show_blocks_resting_on_those_below(difficulty: str, assets: Assets) -> None:
+    for seed in range(80):
+        problem = sample_episode(
+            TASK, level="L3" if seed % 2 else "train", seed=seed, difficulty=difficulty
+        ).problem
+        blocks, _ = cast(problem)
+        geometry = assets.geometry(blocks[0].object, blocks[0].size)
+        height_m = float(np.ptp(geometry.visual.vertices[..., 2]))
+        for frame in frames(problem):
+            heights = collections.defaultdict(list)
+            for placement in frame:
+                heights[placement.pose.y].append(placement.pose.z)
+            for stack in heights.values():
+                resting = [geometry.rest_z_m + level * height_m for level in range(len(stack))]
+                assert sorted(stack) == pytest.approx(resting, abs=4e-3)
+
+
+def test_the_first_frame_is_the_start_and_the_others_are_what_the_goals_ask_for(
+    problems: list[Problem],
+) -> None:
+    for problem in problems[:300]:
+        blocks, _ = cast(problem)
+        id_of = {block.texture: block.id for block in blocks}
+        poses = {block.id: block.pose for block in blocks}
+        for frame, move in zip(frames(problem), [{}, *moves(problem)], strict=True):
+            poses |= move
+            assert {id_of[p.texture]: p.pose for p in frame} == poses
+
+
+def test_a_block_keeps_its_id_over_all_frames(problems: list[Problem]) -> None:
+    for problem in problems[:300]:
+        looks = [[(p.id, p.texture) for p in frame] for frame in frames(problem)]
+        assert looks == [looks[0]] * 3 and [object_id for object_id, _ in looks[0]] == [2, 3, 4]
+
+
+def test_ids_say_nothing_about_the_place(problems: list[Problem]) -> None:
+    assert_uniform((cast(problem)[0][0].id for problem in problems), (5, 6, 7, 8))
+    first = [min(frames(problem)[0], key=lambda p: p.pose.y).id for problem in problems]
+    assert_uniform(first, (2, 3, 4))
+
+
+def test_no_draw_is_thrown_away() -> None:
+    assert not any(sample_episode(TASK, level="L3", seed=seed).num_redraws for seed in range(200))
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "row", "num_frames"),
+    [("easy", ROW_OF_THREE, 3), ("medium", ROW_OF_FOUR, 4), ("hard", ROW_OF_FOUR, 5)],
+)
+def test_difficulty_adds_blocks_and_frames(difficulty: str, row: tuple[float, ...], num_frames: int) -> None:
+    for seed in range(10):
+        episode = sample_episode(TASK, seed=seed, difficulty=difficulty)
+        slots = " ".join(f"{{frame_{n}}}" for n in range(num_frames))
+        assert episode.problem.prompt.text == f"Stack objects in this order {slots}."
+        blocks, distractors = cast(episode.problem)
+        assert [block.pose.y for block in blocks] == pytest.approx(row) and len(distractors) == 1
+        assert len(episode.problem.goals) == num_frames - 1
+        assert episode.oracle_max_steps == num_frames + 1
+
+
+def test_the_list_of_tasks_shows_the_easy_prompt() -> None:
+    assert task_spec(TASK).template == "Stack objects in this order {frame_0} {frame_1} {frame_2}."
+
+
+def test_all_numbers_can_be_chosen() -> None:
+    problem = sample_episode(TASK, seed=3, num_blocks=2, num_frames=5, num_distractors=3).problem
+    blocks, distractors = cast(problem)
+    assert (len(blocks), len(frames(problem)), len(distractors)) == (2, 5, 3)
+    assert len(cast(sample_episode(TASK, seed=3, num_distractors=0).problem)[1]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [("num_blocks", 5, "2 to 4"), ("num_frames", 6, "2 to 5"), ("num_distractors", -1, "0 to 3")],
+)
+def test_numbers_out_of_range_are_refused(name: str, value: int, allowed: str) -> None:
+    option: dict[str, Any] = {name: value}  # Any: pyright cannot tell options from the other arguments
+    with pytest.raises(ConfigError, match=f"{name} is {value}; give an integer from {allowed}"):
+        sample_episode(TASK, seed=0, **option)
+
+
+@pytest.mark.parametrize(("distance", "is_near"), [(0.0, True), (0.099, True), (0.101, False)])
+def test_each_step_must_bring_its_block_near_the_place_shown(
+    problems: list[Problem], distance: float, is_near: bool
+) -> None:
+    for problem in problems[:20]:
+        first, last = moves(problem)
+        far = [{block: pose.moved(dx=-distance) for block, pose in move.items()} for move in (first, last)]
+        outcomes = played(problem, *far)
+        assert outcomes[0].failure is not is_near and outcomes[1].success is is_near
+        assert played(problem, first, far[1])[1].failure is not is_near
+
+
+def test_a_block_that_fell_beside_its_stack_counts(problems: list[Problem]) -> None:
+    for problem in problems[:20]:
+        fallen = [
+            {block: Pose.planar(p.x, p.y + 0.09, 1.0) for block, p in m.items()} for m in moves(problem)
+        ]
+        assert played(problem, *fallen)[-1].success
+
+
+def test_other_objects_and_other_orders_are_failures(problems: list[Problem]) -> None:
+    for problem in problems[:100]:
+        blocks, (distractor,) = cast(problem)
+        first, last = moves(problem)
+        (awaited, target), *_ = first.items()
+        assert played(problem, {})[0].failure
+        assert played(problem, {distractor.id: target})[0].failure
+        for block in blocks:
+            assert block.id == awaited or played(problem, {block.id: target})[0].failure
+        if last != first and (awaited not in last or last[awaited].planar_distance(target) > 0.1):
+            assert played(problem, last)[0].failure
+        assert played(problem, first, {})[1].failure
+
+
+def test_a_move_that_is_undone_has_to_be_made(problems: list[Problem]) -> None:
+    def undoes(problem: Problem) -> bool:
+        first, last = (list(frame) for frame in (frames(problem)[0], frames(problem)[-1]))
+        return [p.pose for p in first] == [p.pose for p in last]
+
+    problem = next(p for p in problems if undoes(p))
+    assert played(problem, {})[0].failure
+    assert [outcome.success for outcome in played(problem, *moves(problem))] == [False, True]
+
+
+def test_blocks_that_are_still_to_be_moved_must_stay(problems: list[Problem]) -> None:
+    problem = next(p for p in problems if len({goal.object_id for goal in p.goals}) == 2)
+    first, last = moves(problem)
+    (waiting,) = last
+    (done,) = first
+    away = Pose.planar(0.76, 0.0)
+    outcome = played(problem, {**first, waiting: away})[0]
+    assert outcome.failure and outcome.reason.endswith("left the workspace")
+    assert played(problem, first, {**last, done: away})[-1].success
+    others = [p.id for p in problem.scene.placements if p.id not in (waiting, done)]
+    assert played(problem, {**first, **dict.fromkeys(others, away)}, last)[-1].success
+
+
+def test_stacks_of_every_shape_hold() -> None:
+    env = TabletopEnv(TASK, level="L3", difficulty="hard")
+    shapes = set()
+    for seed in range(25):
+        env.reset(seed=seed)
+        while not env.outcome.is_over:
+            env.step(env.oracle_decision().action)
+        assert env.outcome.success, (seed, env.outcome)
+        last = {p.texture: p.pose for p in frames(env.episode.problem)[-1]}
+        blocks, _ = cast(env.episode.problem)
+        for block in blocks:
+            found, shown = env.scene[block.id].pose, last[block.texture]
+            assert found.planar_distance(shown) < 1e-3
+            assert found.z == pytest.approx(shown.z, abs=7e-3)  # bodies touch 2 mm before they meet
+        shapes.add(blocks[0].object)
+    assert shapes == set(pool(TASK, "L3").dragged_objects)
+
+
+def test_with_compat_blocks_are_numbered_by_place_and_stacked_by_nominal_height() -> None:
+    for seed in range(50):
+        problem = sample_episode(TASK, seed=seed, difficulty="hard", compat=True).problem
+        blocks, _ = cast(problem)
+        half_m = blocks[0].size[2] / 2
+        assert [block.id for block in blocks] == [5, 6, 7, 8]
+        assert {block.pose.z for block in blocks} == {half_m}
+        for frame in frames(problem):
+            places = [(p.pose.y, p.pose.z) for p in frame]
+            assert [p.id for p in frame] == [2, 3, 4, 5] and places == sorted(places)
+            levels = [sum(y == other and z > below for other, below in places) for y, z in places]
+            assert [z for _, z in places] == pytest.approx([(2 * level + 1) * half_m for level in levels])
