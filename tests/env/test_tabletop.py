@@ -122,6 +122,23 @@ def test_names_and_levels_are_checked_when_it_is_made() -> None:
         TabletopEnv("rotate", level="L9")
     with pytest.raises(ConfigError, match="rgb_array"):
         TabletopEnv("rotate", render_mode="human")
+    with pytest.raises(ConfigError, match=r"seed domain 'evil'. Did you mean 'eval'"):
+        TabletopEnv("rotate", domain="evil")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_distracters": 1}, r"Did you mean 'num_distractors'\? Allowed: angles_deg, num_distractors"),
+        ({"num_distractors": 7}, r"num_distractors is 7; give an integer from 0 to 6"),
+        ({"difficulty": "hrad"}, r"Did you mean 'hard'"),
+        ({"angles_deg": (5,)}, r"angles_deg holds 5"),
+    ],
+)
+def test_options_of_the_task_are_checked_when_it_is_made(options: dict, message: str) -> None:
+    for make in (openvima.make, lambda task, **given: gymnasium.make(f"openvima/{task}-v0", **given)):
+        with pytest.raises(ConfigError, match=message):
+            make("rotate", **options)
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:
@@ -147,15 +164,30 @@ def wrong(**changes: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (wrong(pose0_position=np.float32([0.8, 0.1])), r"pose0_position is \(0.8, 0.1\)"),
-        (wrong(pose0_position=np.float32([np.nan, 0.1])), "finite"),
-        (wrong(pose1_rotation=np.float32([0, 0, 1])), r"shape \(3,\)"),
-        (wrong(pose1_position=np.array([1, 0])), "dtype int64"),
-        ({"pose0_position": np.float32([0.5, 0])}, "missing"),
-        (wrong(extra=1), "unknown keys extra"),
+        (wrong(pose0_position=np.float32([0.8, 0.1])), r"pose0_position is \(0.8, 0.1\); x must lie in 0.25"),
+        (wrong(pose1_position=np.float32([0.5, -0.6])), r"pose1_position is .* y in -0.5 … 0.5 m"),
+        (wrong(pose0_rotation=np.float32([0, 0, 0, 1.5])), r"pose0_rotation is .*must lie in -1 … 1"),
+        (wrong(pose0_position=np.float32([np.nan, 0.1])), r"pose0_position is \(nan, .*finite"),
+        (wrong(pose1_rotation=np.float32([0, 0, np.inf, 1])), r"pose1_rotation is .*finite"),
+        (wrong(pose1_position=np.array([1e300, 0])), r"pose1_position is .*finite"),
+        (wrong(pose1_rotation=np.float32([0, 0, 1])), r"pose1_rotation has shape \(3,\); it must be \(4,\)"),
+        (wrong(pose0_position=np.float32([[0.5, 0]])), r"pose0_position has shape \(1, 2\)"),
+        (wrong(pose0_position=np.float32(0.5)), r"pose0_position has shape \(\)"),
+        (wrong(pose1_position=np.array([1, 0])), "pose1_position has dtype int64; it must be floating-point"),
+        (wrong(pose1_position=np.array(["a", "b"])), "pose1_position has dtype <U1"),
+        (wrong(pose1_position=np.complex64([0.5, 0])), "pose1_position has dtype complex64"),
+        (wrong(pose0_rotation=None), "pose0_rotation has dtype object"),
+        (wrong(pose0_rotation=[[0.0], [0.0, 1.0]]), "pose0_rotation is a list that NumPy cannot convert"),
+        ({"pose0_position": np.float32([0.5, 0])}, "pose0_rotation, pose1_position, pose1_rotation missing"),
+        ({}, "missing"),
+        (wrong(extra=1), "unknown keys extra; allowed are pose0_position"),
+        (wrong(**{"pose0_position": np.float32([9, 9]), "extra": 1}), "extra.*pose0_position is"),
+        (np.zeros(12, np.float32), "a mapping with keys .* not ndarray"),
+        (None, "not NoneType"),
+        (3, "not int"),
     ],
 )
-def test_an_action_that_does_not_fit_changes_nothing(action: dict, message: str) -> None:
+def test_an_action_that_does_not_fit_changes_nothing(action: object, message: str) -> None:
     untouched, env = TabletopEnv("rotate"), TabletopEnv("rotate")
     untouched.reset(seed=4)
     env.reset(seed=4)
@@ -165,6 +197,26 @@ def test_an_action_that_does_not_fit_changes_nothing(action: dict, message: str)
     assert env.scene == before
     expected = untouched.step(untouched.oracle_decision().action)
     assert frozen(env.step(env.oracle_decision().action)) == frozen(expected)
+
+
+def test_a_zero_quaternion_is_no_turn_and_a_long_one_is_normalised(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=4)
+    action = rotate.oracle_decision().action.to_arrays()
+    results = []
+    for turn in ([0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0.5]):
+        rotate.reset(seed=4)
+        results.append(frozen(rotate.step({**action, "pose0_rotation": np.float32(turn)})))
+    assert results[0] == results[1] == results[2]
+
+
+def test_lists_and_other_precisions_are_taken(rotate: TabletopEnv) -> None:
+    rotate.reset(seed=4)
+    action = rotate.oracle_decision().action.to_arrays()
+    results = []
+    for convert in (np.float32, np.float64, lambda values: values.tolist()):
+        rotate.reset(seed=4)
+        results.append(frozen(rotate.step({key: convert(values) for key, values in action.items()})))
+    assert results[0] == results[1] == results[2]
 
 
 def test_episodes_are_numbered_by_the_seed(rotate: TabletopEnv) -> None:
