@@ -1,0 +1,228 @@
+"""Scenes, prompts and outcomes of `manipulate_old_neighbor` follow its specification."""
+
+import functools
+import math
+import re
+
+import pytest
+
+from base_cases import beside, judged
+from frequencies import assert_frequencies, assert_uniform
+from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets
+from openvima.errors import ConfigError
+from openvima.render.labels import label_raster
+from openvima.scene import AtPose, DistractorsApart, InOrder, ObjectImage, Outcome, Placement, Pose, Problem
+from openvima.tasks import advance, begin, sample_episode, task_spec
+
+TASK = "manipulate_old_neighbor"
+STEPS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # row, column
+TEXTURES = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1"), "L3": ("T_first", "T_second")}
+FAR_AWAY = Pose.planar(0.9, 0.0)
+
+Cast = tuple[Placement, Placement, Placement, list[Placement]]
+Cell = tuple[int, int]
+
+
+def cast(problem: Problem) -> Cast:
+    """Dragged object, old neighbour, base, distractors."""
+    goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
+    order, apart = problem.constraints
+    assert order == InOrder((1,)) and isinstance(apart, DistractorsApart)  # tested in this order
+    dragged, neighbour = (problem.scene[goal.object_id] for goal in goals)
+    (base_id,) = {goal.relative_to for goal in goals}
+    assert base_id is not None
+    return dragged, neighbour, problem.scene[base_id], [problem.scene[i] for i in apart.object_ids]
+
+
+@functools.cache
+def problems(level: str = "train", difficulty: str = "easy", *, num: int = 2000) -> list[Problem]:
+    return [
+        sample_episode(TASK, level=level, seed=seed, difficulty=difficulty).problem for seed in range(num)
+    ]
+
+
+def direction_of(problem: Problem) -> str:
+    match = re.fullmatch(
+        r"First put \{dragged_obj\} into \{base_obj\} then put the object that was previously at its "
+        r"(north|south|west|east) into the same \{base_obj\}\.",
+        problem.prompt.text,
+    )
+    assert match, problem.prompt.text
+    return match.group(1)
+
+
+def cell_of(placement: Placement, num_columns: int = 2) -> Cell:
+    row = (placement.pose.x - 0.25) / 0.125 - 1
+    column = (placement.pose.y + 0.5) * (num_columns + 2) - 1
+    assert math.isclose(row, round(row), abs_tol=1e-9) and math.isclose(column, round(column), abs_tol=1e-9)
+    return round(row), round(column)
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "num_columns", "num_empty", "num_distractors"),
+    [("easy", 2, 1, 3), ("medium", 3, 3, 4), ("hard", 4, 4, 6)],
+)
+def test_objects_stand_on_a_grid_with_the_base_at_its_right(
+    difficulty: str, num_columns: int, num_empty: int, num_distractors: int
+) -> None:
+    for problem in problems(difficulty=difficulty, num=50):
+        dragged, neighbour, base, distractors = cast(problem)
+        assert len(distractors) == num_distractors == 3 * num_columns - num_empty - 2
+        cells = [cell_of(p, num_columns) for p in (dragged, neighbour, *distractors)]
+        assert len(set(cells)) == len(cells)
+        assert all(row in range(3) and column in range(num_columns) for row, column in cells)
+        assert (base.pose.x, base.pose.y) == (0.5, pytest.approx(0.5 - 1 / (num_columns + 2)))
+        assert base.fixed and not any(p.fixed for p in (dragged, neighbour, *distractors))
+        assert all(p.pose.quaternion == (0, 0, 0, 1) for p in problem.scene.placements)
+
+
+def test_the_neighbour_stands_in_the_named_direction() -> None:
+    for difficulty, num_columns in (("easy", 2), ("hard", 4)):
+        for problem in problems(difficulty=difficulty, num=50):
+            dragged, neighbour, *_ = cast(problem)
+            (row, column), (down, right) = cell_of(dragged, num_columns), STEPS[direction_of(problem)]
+            assert cell_of(neighbour, num_columns) == (row + down, column + right)
+
+
+def test_cells_directions_and_gaps_are_drawn_evenly() -> None:
+    cells = [(row, column) for row in range(3) for column in range(2)]
+    assert_uniform([cell_of(cast(problem)[0]) for problem in problems()], cells)
+    shares: dict[tuple[Cell, str], float] = {}
+    for row, column in cells:
+        names = [name for name, (down, right) in STEPS.items() if (row + down, column + right) in cells]
+        shares |= {((row, column), name): 1 / 6 / len(names) for name in names}
+    drawn = [(cell_of(cast(problem)[0]), direction_of(problem)) for problem in problems()]
+    assert_frequencies(drawn, shares)
+    gaps = []
+    for problem in problems():
+        dragged, neighbour, _, distractors = cast(problem)
+        others = sorted(set(cells) - {cell_of(dragged), cell_of(neighbour)})
+        (gap,) = set(others) - {cell_of(p) for p in distractors}
+        gaps.append(others.index(gap))
+    assert_uniform(gaps, range(4))
+
+
+@pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 200), ("L2", 300), ("L3", 500)])
+def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
+    casts = [cast(problem) for problem in problems(level, num=num)]
+    dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])
+    shapes = OBJECT_SETS["D_novel" if level == "L3" else "D_train"]
+    for index in (0, 1):  # no two of a table are alike, but the tables are independent
+        assert_uniform([c[index].object for c in casts], shapes)
+        assert_uniform([c[index].texture for c in casts], dragged_textures)
+    assert_uniform([c[2].object for c in casts], OBJECT_SETS["B_novel" if level == "L3" else "B_train"])
+    assert_uniform([c[2].texture for c in casts], base_textures)
+
+
+def test_no_two_objects_are_alike_but_shapes_and_textures_recur() -> None:
+    recurring = {"shape": 0, "texture": 0}
+    for problem in problems():
+        dragged, neighbour, _, distractors = cast(problem)
+        movable = [dragged, neighbour, *distractors]
+        assert len({(p.object, p.texture) for p in movable}) == len(movable)
+        recurring["shape"] += len({p.object for p in movable}) < len(movable)
+        recurring["texture"] += len({p.texture for p in movable}) < len(movable)
+    # Five looks, drawn independently: 1 − (13 · 12 · 11 · 10) / 14⁴ and 1 − (18 · 17 · 16 · 15) / 19⁴.
+    assert recurring["shape"] / 2000 == pytest.approx(0.54, abs=0.06)
+    assert recurring["texture"] / 2000 == pytest.approx(0.43, abs=0.06)
+
+
+def test_the_prompt_shows_object_and_base_but_not_the_neighbour() -> None:
+    problem = problems()[0]
+    dragged, _, base, _ = cast(problem)
+    shown = {name: fill.placement for name, fill in problem.prompt.images if isinstance(fill, ObjectImage)}
+    assert shown == {"dragged_obj": dragged, "base_obj": base}
+    assert list(shown) == ["dragged_obj", "base_obj"]
+    assert task_spec(TASK).template == problem.prompt.text.replace(direction_of(problem), "{direction}")
+
+
+@pytest.mark.parametrize("level", ["train", "L3"])
+def test_nothing_overlaps_and_nothing_is_decided_at_the_start(level: str, assets: Assets) -> None:
+    for problem in problems(level, num=100):
+        assert judged(problem, {}) == Outcome()
+        covered = sum((label_raster([p], assets) > 0).astype(int) for p in problem.scene.placements)
+        assert covered.max() == 1
+
+
+def test_object_then_neighbour_is_a_success() -> None:
+    for problem in problems()[:30]:
+        dragged, neighbour, base, _ = cast(problem)
+        for distance, is_met in ((0.0, True), (0.099, True), (0.101, False)):
+            place = beside(problem, base.pose, distance, moved_id=dragged.id) if distance else base.pose
+            scene = problem.scene.with_poses({dragged.id: place.rotated(1.0)})
+            progress, outcome = advance(problem, begin(problem), scene)
+            assert outcome == Outcome()
+            assert progress.open_goals == ((1,) if is_met else (0, 1))
+        progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
+        for distance, is_met in ((0.099, True), (0.101, False)):
+            place = beside(problem, base.pose, distance, moved_id=neighbour.id)
+            end = problem.scene.with_poses({dragged.id: base.pose, neighbour.id: place})
+            assert advance(problem, progress, end)[1].success is is_met
+
+
+def test_the_neighbour_must_not_come_first() -> None:
+    problem = problems()[0]
+    dragged, neighbour, base, distractors = cast(problem)
+    outcome = judged(problem, {neighbour.id: base.pose})
+    assert outcome.failure and "came before" in outcome.reason
+    assert judged(problem, {neighbour.id: base.pose, dragged.id: base.pose}).success  # both at once
+    both_wrong = judged(problem, {neighbour.id: base.pose, distractors[0].id: base.pose})
+    assert "came before" in both_wrong.reason  # the order is looked at first
+    missed = beside(problem, base.pose, 0.101, moved_id=neighbour.id)
+    assert judged(problem, {neighbour.id: missed}) == Outcome()  # only a step wasted
+
+
+def test_the_object_may_be_taken_out_again() -> None:
+    problem = problems()[0]
+    dragged, neighbour, base, _ = cast(problem)
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
+    end = problem.scene.with_poses({dragged.id: FAR_AWAY, neighbour.id: base.pose})
+    assert advance(problem, progress, end)[1].success
+
+
+def test_a_wrong_object_in_the_base_is_a_failure() -> None:
+    problem = problems()[0]
+    dragged, _, base, distractors = cast(problem)
+    progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
+    for distractor in distractors:
+        near, far = (beside(problem, base.pose, d, moved_id=distractor.id) for d in (0.099, 0.101))
+        assert judged(problem, {distractor.id: near}).failure
+        assert judged(problem, {distractor.id: far}) == Outcome()
+        second = problem.scene.with_poses({dragged.id: base.pose, distractor.id: near})
+        assert advance(problem, progress, second)[1].failure
+        assert judged(problem, {distractor.id: FAR_AWAY}) == Outcome()
+
+
+def test_an_object_pushed_against_a_distractor_is_a_failure() -> None:
+    problem = problems()[0]
+    dragged, neighbour, _, distractors = cast(problem)
+    for moved in (dragged, neighbour):
+        near, far = (beside(problem, distractors[0].pose, d, moved_id=moved.id) for d in (0.099, 0.101))
+        assert judged(problem, {moved.id: near}).failure
+        assert judged(problem, {moved.id: far}) == Outcome()
+
+
+def test_both_objects_have_to_stay_on_the_table() -> None:
+    problem = problems()[0]
+    dragged, neighbour, base, _ = cast(problem)
+    for lost in ({dragged.id: FAR_AWAY}, {neighbour.id: FAR_AWAY, dragged.id: base.pose}):
+        outcome = judged(problem, lost)
+        assert outcome.failure and "left the workspace" in outcome.reason
+
+
+def test_compat_places_row_by_row_and_the_base_last() -> None:
+    for seed in range(20):
+        problem = sample_episode(TASK, seed=seed, compat=True).problem
+        *movable, base = problem.scene.placements
+        assert [cell_of(p) for p in movable] == sorted(cell_of(p) for p in movable)
+        assert base.id == cast(problem)[2].id == 5 + len(movable)
+        assert all(p.pose.z == p.size[2] / 2 for p in problem.scene.placements)
+
+
+def test_an_unknown_difficulty_is_refused() -> None:
+    with pytest.raises(ConfigError, match="difficulty 'harder'"):
+        sample_episode(TASK, seed=0, difficulty="harder")
+
+
+def test_every_draw_succeeds() -> None:
+    assert all(sample_episode(TASK, seed=s, difficulty="hard").num_redraws == 0 for s in range(50))

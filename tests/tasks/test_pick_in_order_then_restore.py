@@ -1,0 +1,254 @@
+"""Scenes, prompts and outcomes of `pick_in_order_then_restore` follow its specification."""
+
+import functools
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from base_cases import judged
+from frequencies import assert_uniform
+from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, object_spec, pool
+from openvima.errors import ConfigError
+from openvima.scene import (
+    Action,
+    AtPose,
+    InOrder,
+    ObjectImage,
+    Outcome,
+    Placement,
+    Pose,
+    Problem,
+)
+from openvima.sim import World
+from openvima.tasks import Progress, TableSampler, advance, begin, sample_episode, task_spec
+
+TASK = "pick_in_order_then_restore"
+CELLS = [(x, y) for x in (0.375, 0.625) for y in (-0.25, 0.0, 0.25)]
+TEXTURES = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1"), "L3": ("T_first", "T_second")}
+BARE_TABLE = Action.planar((0.26, -0.49), (0.26, -0.49))
+
+Cast = tuple[Placement, Placement, list[Placement], list[Placement]]
+
+
+def cast(problem: Problem) -> Cast:
+    """Object, the base that it starts in, the bases to visit in order, the other bases."""
+    goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
+    (object_id,) = {goal.object_id for goal in goals}
+    bases = [problem.scene[goal.relative_to] for goal in goals if goal.relative_to is not None]
+    assert [goal.target for goal in goals] == [base.pose for base in bases]
+    *targets, source = bases
+    shown = {object_id, *(base.id for base in bases)}
+    return (
+        problem.scene[object_id],
+        source,
+        targets,
+        [p for p in problem.scene.placements if p.id not in shown],
+    )
+
+
+@functools.cache
+def problems(level: str = "train", difficulty: str = "easy", *, num: int = 2000) -> list[Problem]:
+    return [
+        sample_episode(TASK, level=level, seed=seed, difficulty=difficulty).problem for seed in range(num)
+    ]
+
+
+def cell_of(base: Placement) -> tuple[float, float]:
+    return round(base.pose.x, 9), round(base.pose.y, 9)
+
+
+def after(problem: Problem, *places: Pose) -> tuple[Progress, Outcome]:
+    """How the problem stands after steps that bring the object to these places."""
+    progress, outcome = begin(problem), Outcome()
+    for place in places:
+        assert not outcome.is_over, outcome
+        progress, outcome = advance(problem, progress, problem.scene.with_poses({cast(problem)[0].id: place}))
+    return progress, outcome
+
+
+@pytest.mark.parametrize(("difficulty", "num_targets"), [("easy", 2), ("medium", 2), ("hard", 3)])
+def test_six_bases_stand_in_two_rows(difficulty: str, num_targets: int) -> None:
+    for problem in problems(difficulty=difficulty, num=50):
+        dragged, source, targets, others = cast(problem)
+        bases = [source, *targets, *others]
+        assert (len(targets), len(others)) == (num_targets, 5 - num_targets)
+        assert sorted(cell_of(base) for base in bases) == CELLS
+        assert all(base.fixed and base.pose.quaternion == (0, 0, 0, 1) for base in bases)
+        assert not dragged.fixed
+        assert len({(base.object, base.size) for base in bases}) == 1
+        assert len({base.texture for base in bases}) == 6
+        assert problem.stages == (1,) * (num_targets + 1)
+        assert problem.constraints == (InOrder(tuple(range(1, num_targets))),)
+        assert problem.oracle_max_steps == num_targets + 2
+
+
+def test_source_and_targets_are_drawn_evenly() -> None:
+    drawn = []
+    for problem in problems():
+        _, source, targets, _ = cast(problem)
+        drawn.append(tuple(cell_of(base) for base in (source, *targets)))
+    assert_uniform(drawn, itertools.permutations(CELLS, 3))
+
+
+@pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 300)])
+def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
+    casts = [cast(problem) for problem in problems(level, num=num)]
+    dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])
+    assert_uniform([c[0].object for c in casts], OBJECT_SETS["D_novel" if level == "L3" else "D_train"])
+    assert_uniform([c[0].texture for c in casts], dragged_textures)
+    shapes = [c[1].object for c in casts]
+    if level == "L3":
+        assert set(shapes) == {"pallet"}
+    else:
+        assert_uniform(shapes, OBJECT_SETS["B_train"])
+    assert_uniform([c[1].texture for c in casts], base_textures)
+    assert_uniform([c[2][0].texture for c in casts], base_textures)
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "sentence"),
+    [
+        (
+            "easy",
+            "Put {dragged_obj} into {base_obj_1} then {base_obj_2}. "
+            "Finally restore it into its original container.",
+        ),
+        (
+            "hard",
+            "Put {dragged_obj} into {base_obj_1} then {base_obj_2} then {base_obj_3}. "
+            "Finally restore it into its original container.",
+        ),
+    ],
+)
+def test_the_prompt_shows_object_and_targets_but_not_the_source(difficulty: str, sentence: str) -> None:
+    for problem in problems(difficulty=difficulty, num=50):
+        dragged, _, targets, _ = cast(problem)
+        assert problem.prompt.text == sentence
+        shown = {
+            name: fill.placement for name, fill in problem.prompt.images if isinstance(fill, ObjectImage)
+        }
+        assert shown == {"dragged_obj": dragged} | {f"base_obj_{n}": t for n, t in enumerate(targets, 1)}
+    assert task_spec(TASK).template == problems()[0].prompt.text
+
+
+def test_bases_of_different_shapes_keep_their_own_sizes() -> None:
+    for seed in range(30):
+        _, source, targets, others = cast(sample_episode(TASK, seed=seed, same_bases=False).problem)
+        bases = [source, *targets, *others]
+        assert len({base.texture for base in bases}) == 6
+        for base in bases:
+            spec = object_spec(base.object)
+            assert all(
+                low <= s <= high for low, s, high in zip(spec.size_min, base.size, spec.size_max, strict=True)
+            )
+    shapes = [cast(sample_episode(TASK, seed=s, same_bases=False).problem)[3][0].object for s in range(300)]
+    assert_uniform(shapes, OBJECT_SETS["B_train"])
+
+
+def laid(assets: Assets, base: str, dragged: str) -> Problem:
+    """A problem with this base and this object alone in the pool."""
+    train = pool(TASK, "train")
+    narrow = type(train)((dragged,), (base,), train.dragged_textures, train.base_textures)
+    return task_spec(TASK).sample(TableSampler(np.random.default_rng(0), narrow, assets=assets))
+
+
+@pytest.mark.parametrize("base", ["bowl", "frame", "square", "container", "pallet"])
+def test_the_object_lies_in_its_base_and_stays_there(base: str, assets: Assets) -> None:
+    for name in (*OBJECT_SETS["D_train"], *OBJECT_SETS["D_novel"]):
+        problem = laid(assets, base, name)
+        dragged, source, _, _ = cast(problem)
+        before = dragged.pose
+        assert before.planar_distance(source.pose) < (0.015 if base == "bowl" else 1e-9)
+        world = World(problem.scene, assets)
+        world.execute(BARE_TABLE)
+        now = world.scene[dragged.id].pose
+        assert now.planar_distance(before) < 0.001 and abs(now.z - before.z) < 0.004, name
+        turned = abs(sum(a * b for a, b in zip(now.quaternion, before.quaternion, strict=True)))
+        assert 2 * math.acos(min(1.0, turned)) < math.radians(2), name
+
+
+def test_there_and_back_in_order_is_a_success() -> None:
+    for problem in problems(difficulty="hard", num=30):
+        _, source, (one, two, three), _ = cast(problem)
+        assert judged(problem, {}) == Outcome()
+        progress, outcome = after(problem, one.pose, two.pose, three.pose)
+        assert progress.open_goals == (3,) and outcome == Outcome()
+        assert after(problem, one.pose, two.pose, three.pose, source.pose)[1].success
+
+
+@pytest.mark.parametrize("goal_index", [0, 1, 2])
+def test_each_place_counts_within_5_cm(goal_index: int) -> None:
+    for problem in problems()[:20]:
+        _, source, (one, two), _ = cast(problem)
+        places = [one.pose, two.pose, source.pose]
+        for distance, is_met in ((0.049, True), (0.051, False)):
+            near = places[goal_index].moved(distance * 0.6, distance * 0.8).rotated(2.0)
+            progress, _ = after(problem, *places[:goal_index], near)
+            assert len(progress.open_goals) == 3 - goal_index - is_met
+
+
+def test_a_later_target_must_not_be_visited_before_its_turn() -> None:
+    problem = problems(difficulty="hard", num=30)[0]
+    _, _, (one, two, three), _ = cast(problem)
+    for places in ((two,), (three,), (one, three)):
+        *before, last = [place.pose for place in places]
+        outcome = after(problem, *before, last.moved(dy=0.049))[1]
+        assert outcome.failure and "is where it belongs later" in outcome.reason
+        assert not after(problem, *before, last.moved(dy=0.051))[1].is_over
+
+
+def test_other_places_only_cost_a_step() -> None:
+    for problem in problems()[:20]:
+        _, source, (one, two), (other, *_) = cast(problem)
+        home, beside_all = source.pose, Pose.planar(0.5, 0.125)
+        way = (
+            other.pose,
+            home,
+            beside_all,
+            one.pose,
+            home,
+            one.pose,
+            other.pose,
+            two.pose,
+            one.pose,
+            two.pose,
+        )
+        assert after(problem, *way)[1] == Outcome()
+        assert after(problem, *way, home)[1].success
+
+
+def test_the_last_place_is_the_base_it_came_from() -> None:
+    problem = problems()[0]
+    _, _, (one, two), others = cast(problem)
+    for other in others:
+        assert after(problem, one.pose, two.pose, other.pose)[1] == Outcome()
+
+
+def test_the_object_must_stay_on_the_table() -> None:
+    problem = problems()[0]
+    _, _, (one, _), _ = cast(problem)
+    outcome = after(problem, one.pose, Pose.planar(0.76, 0.0))[1]
+    assert outcome.failure and "left the workspace" in outcome.reason
+
+
+def test_compat_hovers_the_object_over_its_base_and_places_it_first() -> None:
+    for level in ("train", "L3"):
+        for seed in range(30):
+            problem = sample_episode(TASK, level=level, seed=seed, compat=True).problem
+            dragged, source, targets, others = cast(problem)
+            assert [p.id for p in (dragged, source, *targets, *others)] == list(range(5, 12))
+            factor = 2 if source.object in ("bowl", "pallet") else 0.5
+            assert dragged.pose.z == factor * dragged.size[2]
+            assert (dragged.pose.x, dragged.pose.y) == (source.pose.x, source.pose.y)
+            assert all(base.pose.z == base.size[2] / 2 for base in (source, *targets, *others))
+
+
+def test_an_unknown_difficulty_is_refused() -> None:
+    with pytest.raises(ConfigError, match="difficulty 'normal'"):
+        sample_episode(TASK, seed=0, difficulty="normal")
+
+
+def test_every_draw_succeeds() -> None:
+    assert all(sample_episode(TASK, seed=s, difficulty="hard").num_redraws == 0 for s in range(50))
