@@ -7,6 +7,7 @@ import pytest
 
 from openvima.scene import Action, Scene
 from openvima.sim import World
+from openvima.sim.blade import SWEEP_M_S, Blade
 from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
 from openvima.sim.settling import WATCH_TICKS
 from openvima.sim.stage import Stage
@@ -157,3 +158,40 @@ def test_a_block_caught_between_blade_and_wall_is_not_flung_away(x, y, yaw_rad) 
     world = World(scene, ASSETS)
     world.execute(Action.planar((0.4359, -0.1139), (0.2553, -0.1942)))
     assert world.scene[4].pose.planar_distance(scene[4].pose) < 0.4
+
+
+def test_a_block_that_rides_along_ends_where_physics_alone_pushes_it(monkeypatch) -> None:
+    scene = table(("small block", 0.68, 0.005, 0.3), ("small block", 0.5, 0.1, 0.8), end_effector="spatula")
+    action = Action.planar((0.7, 0.0), (0.35, 0.0))
+    riding = World(scene, ASSETS)
+    num_ticks = riding.execute(action).num_ticks
+    monkeypatch.setattr(Blade, "_riders", lambda _: None)
+    pushed = World(scene, ASSETS)
+    assert pushed.execute(action).num_ticks > 1.5 * num_ticks
+    for ours, theirs in zip(riding.scene.placements, pushed.scene.placements, strict=True):
+        assert ours.pose.planar_distance(theirs.pose) < 5e-3
+        assert ours.pose.z == pytest.approx(theirs.pose.z, abs=1e-4)
+
+
+def test_riding_bodies_are_watched_on_their_way() -> None:
+    world = blocks((0.68, 0.0, 0.0))
+    seen = []
+    action = Action.planar((0.7, 0.0), (0.35, 0.0))
+    world.execute(action, watch=lambda scene: seen.append(scene[4].pose.x))
+    steps = -np.diff(seen[:-1])
+    assert steps.max() <= WATCH_TICKS * SWEEP_M_S / 240 + 2e-3
+    assert len(seen) > 20
+
+
+def test_compat_moves_the_blade_in_a_bow() -> None:
+    # The straight way passes 35 mm beside the block's nearer side; the arm's bow leads 33 mm towards it, and
+    # half the blade's width more.
+    scene = table(("small block", 0.65, 0.1, 0.0), end_effector="spatula")
+    action = Action.planar((0.6, 0.3), (0.6, -0.15))
+    ways = []
+    for compat in (False, True):
+        world = World(scene, ASSETS, compat=compat)
+        world.execute(action)
+        ways.append(world.scene[4].pose.planar_distance(scene[4].pose))
+    assert ways[0] == 0
+    assert ways[1] > 0.02

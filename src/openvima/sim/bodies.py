@@ -3,6 +3,8 @@
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's names come from a compiled module without type stubs.)
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -162,6 +164,11 @@ class Bodies:
         if apart_from is not None:
             change[self._joint[apart_from]] = 0.0
         return float(change[:, :3].max(initial=0.0)), 2 * float(change[:, 3:].max(initial=0.0))
+
+    def shift(self, indices: Iterable[int], way: Vector3) -> None:
+        """Move free bodies by metres along the world's axes; they keep their velocities."""
+        for index in indices:
+            self._positions[self._joint[index], :3] += way
 
     def lowest_z(self, index: int, quaternion: Quaternion) -> float:
         """Height of a body's lowest touching point above its link frame, in metres, in a given attitude."""

@@ -1,8 +1,8 @@
 """The two primitives: pick and place with the suction cup, sweep with the spatula.
 
 Events, not time: while nothing can be touched, nothing is stepped. A lifted body moves rigidly with the arm;
-physics runs when it is let go onto something else than bare floor, while the blade pushes, and until all is
-at rest.
+physics runs when it is let go onto something else than bare floor, when the blade meets bodies, and until
+all is at rest.
 """
 
 import math
@@ -11,17 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.scene import Action, Pose
-from openvima.scene.pose import rotate
 from openvima.sim import end_effectors as tools
-from openvima.sim import settling, ur5
-from openvima.sim.arm_path import SWEEP_SPEED, reachable_joints
+from openvima.sim import ur5
+from openvima.sim.arm_path import reachable_joints
+from openvima.sim.blade import Blade
 from openvima.sim.bodies import Bodies
-from openvima.sim.model import FLOOR_Z_M, TICK_S
+from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.stage import RESTING_GAP_M, Stage
 from openvima.sim.touch import body_gap, gap, way_to_touch
 
-SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
-TOP_SPEED = 0.5  # m/s, of bodies that slip out between the blade and something fixed
 _DOWN = (0.0, 0.0, -1.0)
 _ABOVE_ALL_M = 1.0  # height from which tools and held bodies are lowered, above every stack
 
@@ -178,7 +176,7 @@ def _way_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
     return min(to_floor, to_others), False
 
 
-def sweep(stage: Stage, action: Action, *, shortfall_m: float = tools.BLADE_SHORTFALL_M) -> None:
+def sweep(stage: Stage, action: Action, *, compat: bool = False) -> None:
     """Push with the blade from just before pose0 towards pose1, in a straight line and at constant speed.
 
     Rotations of the action do not matter. If the two points are the same there is no direction: nothing
@@ -187,12 +185,13 @@ def sweep(stage: Stage, action: Action, *, shortfall_m: float = tools.BLADE_SHOR
     Args:
         stage: Bodies and arm; afterwards all is at rest.
         action: From where to where.
-        shortfall_m: How far before pose1 the blade stops.
+        compat: Move the blade as the benchmark's arm does, in bows, and stop it 3 mm earlier.
     """
     (x0, y0), (x1, y1) = action.pose0_position, action.pose1_position
     distance = math.hypot(x1 - x0, y1 - y0)
     if distance == 0:
         return
+    shortfall_m = tools.BLADE_SHORTFALL_M + (tools.COMPAT_SHORTFALL_M if compat else 0.0)
     vx, vy = (x1 - x0) / distance, (y1 - y0) / distance
     start = _within_reach(x0 - tools.BLADE_RUN_UP_M * vx, y0 - tools.BLADE_RUN_UP_M * vy)
     end = _within_reach(x1 - shortfall_m * vx, y1 - shortfall_m * vy)
@@ -200,7 +199,7 @@ def sweep(stage: Stage, action: Action, *, shortfall_m: float = tools.BLADE_SHOR
     # VIMA-Bench does.
     nudge = distance + tools.BLADE_RUN_UP_M - shortfall_m
     legs = [end] if nudge >= 0 else [_within_reach(start[0] - nudge * vx, start[1] - nudge * vy), end]
-    blade = _Blade(stage, math.atan2(vy, vx))
+    blade = Blade(stage, math.atan2(vy, vx), in_bows=compat)
     blade.lower(*start)
     for x, y in legs:
         blade.push(x, y)
@@ -212,128 +211,3 @@ def _within_reach(x: float, y: float) -> tuple[float, float]:
     farthest = ur5.farthest_tip_distance(tools.SWEEP_TIP_Z_M) - 1e-6
     shrink = min(1.0, farthest / math.hypot(x, y))
     return x * shrink, y * shrink
-
-
-class _Blade:
-    """The spatula's blade during one sweep: where it is, and how it moves."""
-
-    def __init__(self, stage: Stage, yaw_rad: float) -> None:
-        self._stage = stage
-        self._bodies = stage.bodies
-        self._yaw_rad = yaw_rad
-        self._x = self._y = 0.0
-        self._tip_z = tools.SWEEP_HOVER_TIP_Z_M
-        self._pushed = tuple(geom for index in stage.bodies.rigid for geom in stage.bodies.geoms(index))
-
-    def lower(self, x: float, y: float) -> None:
-        """Bring the blade down at a point, onto whatever is there."""
-        self._x, self._y = x, y
-        path, scene = self._stage.path, self._stage.start
-        path.move(self._joints(), scene=lambda _: scene)
-        down = reachable_joints(x, y, tools.SWEEP_TIP_Z_M, self._yaw_rad)
-        path.move(down, scene=lambda _: scene)
-        self._tip_z = tools.SWEEP_TIP_Z_M
-        in_the_way = [index for index in self._bodies.rigid if self._make_room(index)]
-        if in_the_way:
-            self._wait()
-
-    def push(self, x: float, y: float) -> None:
-        """Move the lowered blade to a point in a straight line."""
-        while (left := math.hypot(x - self._x, y - self._y)) > 1e-9:
-            direction = ((x - self._x) / left, (y - self._y) / left, 0.0)
-            if self._is_calm():
-                left = self._slide(direction, left)
-            ticks = min(settling.WATCH_TICKS, max(1, math.ceil(left / (SWEEP_M_S * TICK_S) - 1e-9)))
-            way = min(left, ticks * SWEEP_M_S * TICK_S)
-            if way > 0:
-                self._press(direction, way, way / (ticks * TICK_S))
-        self._x, self._y = x, y
-        self._stage.path.waypoints.append(self._joints())
-
-    def lift(self) -> None:
-        """Take the blade away and wait until all is at rest."""
-        stage = self._stage
-        self._bodies.park_blade()
-        if stage.num_ticks:
-            stage.settle(top_speed=TOP_SPEED)
-        after = stage.scene() if stage.path.is_filmed else stage.start
-        self._tip_z = tools.SWEEP_HOVER_TIP_Z_M
-        stage.path.move(self._joints(), scene=lambda _: after)
-
-    def _make_room(self, index: int) -> bool:
-        """Shift a body that stands where the blade comes down to its nearest side; whether it did.
-
-        Squeezing a body between blade and floor in the physics would fling it away; in VIMA-Bench, it is
-        nudged.
-        """
-        pose = self._bodies.pose(index)
-        blade = self._pose()
-        corners = blade.inverse().transform(pose.transform(self._bodies.shapes[index].points[:, :3]))
-        half = np.array(tools.BLADE_HALF_SIZE_M)
-        low, high = corners.min(axis=0) - half, corners.max(axis=0) + half  # body grown by the blade
-        if (low >= 0).any() or (high <= 0).any():
-            return False
-        shifts = [(-low[0], 0.0), (-high[0], 0.0), (0.0, -low[1]), (0.0, -high[1])]
-        along, across = min(shifts, key=lambda shift: abs(shift[0]) + abs(shift[1]))
-        dx, dy, _ = rotate(blade.quaternion, (along, across, 0.0))
-        self._bodies.place(index, pose.moved(dx, dy))
-        return True
-
-    def _wait(self) -> None:
-        """Run physics with the blade at rest until all others are, too."""
-        for _ in range(settling.SETTLE_LIMIT_TICKS // settling.STRIDE_TICKS):
-            self._run(settling.STRIDE_TICKS, (0.0, 0.0, 0.0))
-            if self._is_calm():
-                return
-
-    def _slide(self, direction: tuple[float, float, float], length: float) -> float:
-        """Move on, without physics, to just before the first body; return the way that is left."""
-        self._bodies.stop()
-        self._bodies.place_blade(self._pose())
-        self._bodies.refresh()
-        free = way_to_touch(
-            self._bodies, (self._bodies.blade_geom,), self._pushed, direction=direction, length_m=length
-        )
-        way = length if free is None else free
-        self._film(direction, way)
-        self._x += direction[0] * way
-        self._y += direction[1] * way
-        return length - way
-
-    def _press(self, direction: tuple[float, float, float], length: float, speed: float) -> None:
-        """Move on by a length under physics, at constant speed whatever stands in the way."""
-        left = max(1, round(length / (speed * TICK_S)))
-        step = length / left
-        velocity = (direction[0] * speed, direction[1] * speed, 0.0)
-        while left:
-            ticks = min(settling.STRIDE_TICKS, left)
-            self._run(ticks, velocity)
-            left -= ticks
-            self._x += direction[0] * step * ticks
-            self._y += direction[1] * step * ticks
-
-    def _run(self, num_ticks: int, velocity: tuple[float, float, float]) -> None:
-        self._bodies.tick_with_blade(self._pose(), velocity, num_ticks=num_ticks, top_speed=TOP_SPEED)
-        self._stage.count_ticks(num_ticks)
-        self._stage.path.stay(num_ticks, scene=self._stage.scene, joints=self._joints)
-
-    def _film(self, direction: tuple[float, float, float], length: float) -> None:
-        """Record the frames of a stretch in which nothing is touched."""
-        stage = self._stage
-        if not stage.path.is_filmed or length <= 0:
-            return
-        x, y = self._x + direction[0] * length, self._y + direction[1] * length
-        scene = stage.scene()
-        joints = reachable_joints(x, y, self._tip_z, self._yaw_rad)
-        stage.path.move(joints, scene=lambda _: scene, speed=SWEEP_SPEED)
-        stage.path.waypoints.pop()
-
-    def _is_calm(self) -> bool:
-        speed, turning = self._bodies.speeds()
-        return speed < settling.SETTLED_SPEED and turning < settling.SETTLED_TURNING
-
-    def _joints(self) -> np.ndarray:
-        return reachable_joints(self._x, self._y, self._tip_z, self._yaw_rad)
-
-    def _pose(self) -> Pose:
-        return Pose.planar(self._x, self._y, self._yaw_rad, z=tools.blade_centre_z(self._tip_z))

@@ -56,6 +56,12 @@ class Stage:
             self._unwatched_ticks = 0
             self._watch(self.scene(held))
 
+    def look(self) -> None:
+        """Let the onlooker look now: bodies move without physics."""
+        if self._watch is not None:
+            self._unwatched_ticks = 0
+            self._watch(self.scene())
+
     def settle(self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None) -> None:
         """Run physics until all is at rest; the arm's next move happens meanwhile."""
 

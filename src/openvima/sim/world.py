@@ -7,7 +7,7 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets
 from openvima.scene import Action, Scene
-from openvima.sim import end_effectors, primitives, ur5
+from openvima.sim import primitives, ur5
 from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
 from openvima.sim.stage import Stage, is_at_rest
@@ -43,7 +43,8 @@ class World:
         scene: The objects at their start. Those that hover or overlap come to rest during the first
             primitive.
         assets: Gives the shapes.
-        compat: Reproduce the benchmark's inexact stop of the blade: it ends 3 mm earlier.
+        compat: Move the blade as the benchmark's arm does: it descends, pushes and rises in bows, straight in
+            joint space, and ends 3 mm earlier.
 
     Raises:
         UnknownObjectError: The scene holds an object that the catalogue does not know.
@@ -107,8 +108,5 @@ class World:
     def _perform(self, stage: Stage, action: Action) -> int | None:
         if self._scene.end_effector == "suction":
             return primitives.pick_place(stage, action)
-        shortfall_m = end_effectors.BLADE_SHORTFALL_M
-        if self._compat:
-            shortfall_m += end_effectors.COMPAT_SHORTFALL_M
-        primitives.sweep(stage, action, shortfall_m=shortfall_m)
+        primitives.sweep(stage, action, compat=self._compat)
         return None
