@@ -1,12 +1,12 @@
 """What one push of a small block covers, and the sweep that makes it.
 
-While a block is pushed, blade and block cover a rectangle, the way; the block alone covers its track. Of 240
-simulated pushes of 0.05 to 0.3 m, no point of a block strayed more than 24 mm to the side, and none of the
-blocks came to rest more than 8 mm beyond its end.
+Of 480 simulated pushes of 0.05 to 0.3 m, the blade's middle up to 15 mm beside the block's, no point of a
+block strayed more than 24 mm to the side, and no block came to rest more than 9 mm beyond its end.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 from openvima.scene import InZone
 from openvima.tasks.footprints import Rectangle
@@ -15,12 +15,15 @@ Point = tuple[float, float]
 
 STANDOFF_M = 0.006  # how far behind a block's centre a sweep starts: the blade then clears any of its corners
 SHORTFALL_M = 0.0325  # how far short of a sweep's end the centre of the pushed block comes to rest
-BLOCK_REACH_M = 0.0212  # from a block's centre to its corner
-OVERRUN_M = 0.008  # how far a block may slide on
+BLOCK_HALF_M, BLOCK_REACH_M = 0.015, 0.0212  # from a block's centre to its face and to its corner
+OVERRUN_M = 0.009  # how far a block may slide on
+
+_ASIDE_M = 0.015  # how far beside a block's centre the middle of the blade may be
 
 _BLADE_AT_M = 0.02  # where the blade comes down, behind the start of a sweep
 _BLADE_HALF_THICKNESS_M = 0.0025
 _BLADE_HALF_WIDTH_M = 0.025
+_BLADE_GAP_M = 0.002  # kept free on either side of the blade
 _DRIFT_M = 0.005  # what a block moves to the side while it turns
 
 
@@ -47,6 +50,7 @@ class Push:
         start, end: Where from and where to, x and y in metres.
         ux, uy: Unit vector of the push.
         length_m: Its length.
+        aside_m: How far to the left of the line the middle of the blade is.
     """
 
     start: Point
@@ -54,6 +58,7 @@ class Push:
     ux: float
     uy: float
     length_m: float
+    aside_m: float = 0.0
 
     @staticmethod
     def between(start: Point, end: Point) -> "Push":
@@ -68,29 +73,38 @@ class Push:
         """Direction of the push."""
         return math.atan2(self.uy, self.ux)
 
+    def variants(self) -> Iterator["Push"]:
+        """The same push with the blade in the middle of the block, to the left of it and to the right."""
+        return (replace(self, aside_m=aside_m) for aside_m in (0.0, _ASIDE_M, -_ASIDE_M))
+
     def sweep(self, goal: InZone) -> Sweep:
         """Return the sweep that pushes the goal's block like this."""
-        start = (self.start[0] - STANDOFF_M * self.ux, self.start[1] - STANDOFF_M * self.uy)
-        return Sweep(goal, start, (self.end[0] + SHORTFALL_M * self.ux, self.end[1] + SHORTFALL_M * self.uy))
+        return Sweep(goal, self._point(-STANDOFF_M), self._point(self.length_m + SHORTFALL_M))
 
-    def way(self) -> Rectangle:
-        """Everything that blade and block cover."""
+    def blade_at_start(self) -> Rectangle:
+        """Where the blade comes down."""
+        x, y = self._point(-STANDOFF_M - _BLADE_AT_M)
+        return Rectangle(x, y, self.yaw_rad, _BLADE_HALF_THICKNESS_M, _BLADE_HALF_WIDTH_M + _BLADE_GAP_M)
+
+    def blade_way(self) -> Rectangle:
+        """Everything that the blade covers."""
         behind = STANDOFF_M + _BLADE_AT_M + _BLADE_HALF_THICKNESS_M
-        return self._strip(behind, BLOCK_REACH_M + OVERRUN_M, half_width=_BLADE_HALF_WIDTH_M + _DRIFT_M)
+        half_width = _BLADE_HALF_WIDTH_M + _BLADE_GAP_M
+        return self._strip(behind, -BLOCK_HALF_M, half_width=half_width, aside_m=self.aside_m)
 
-    def track(self) -> Rectangle:
+    def block_way(self) -> Rectangle:
         """Everything that the block covers."""
         return self._strip(BLOCK_REACH_M, BLOCK_REACH_M + OVERRUN_M, half_width=BLOCK_REACH_M + _DRIFT_M)
 
-    def blade(self) -> Rectangle:
-        """Where the blade comes down."""
-        behind = STANDOFF_M + _BLADE_AT_M
-        x, y = self.start[0] - behind * self.ux, self.start[1] - behind * self.uy
-        return Rectangle(x, y, self.yaw_rad, _BLADE_HALF_THICKNESS_M, _BLADE_HALF_WIDTH_M)
+    def _point(self, along_m: float) -> Point:
+        """Point on the line of the blade's middle, so far after the block's start."""
+        x, y = self.start
+        return x + along_m * self.ux - self.aside_m * self.uy, y + along_m * self.uy + self.aside_m * self.ux
 
-    def _strip(self, behind: float, ahead: float, *, half_width: float) -> Rectangle:
+    def _strip(self, behind: float, ahead: float, *, half_width: float, aside_m: float = 0.0) -> Rectangle:
         """Rectangle from `behind` the start to `ahead` of the end."""
         half_length = (self.length_m + ahead + behind) / 2
         middle = half_length - behind
-        x, y = self.start[0] + middle * self.ux, self.start[1] + middle * self.uy
+        x = self.start[0] + middle * self.ux - aside_m * self.uy
+        y = self.start[1] + middle * self.uy + aside_m * self.ux
         return Rectangle(x, y, self.yaw_rad, half_length, half_width)

@@ -7,7 +7,6 @@ from openvima.scene import InZone, NeverTouches, Pose, Problem, Scene, Zone
 from openvima.tasks.footprints import Rectangle
 from openvima.tasks.pushes import Point, Push
 
-_BLADE_GAP_M = 0.001  # left free around the blade where it comes down
 _END_STEP_M = 0.015
 _COLUMN_STEP_M = 0.05  # two blocks pushed one after the other along the same way have room
 _END_EDGE_M = 0.03  # ends keep this far from the zone's edge
@@ -65,22 +64,32 @@ class View:
         """Ids and footprints of all blocks but the goal's."""
         return ((i, block) for i, block in self.footprints.items() if i != goal.object_id)
 
-    def is_clear(self, goal: InZone, push: Push) -> bool:
-        """Whether a push of the goal's block moves no other one, beyond `overlap_m`, and touches no line."""
+    def cleared(self, goal: InZone, push: Push) -> Push | None:
+        """Make a push of the goal's block move no other one, beyond `overlap_m`, and touch no line.
+
+        Returns:
+            The push, if need be with the blade a little aside; None if it is in any case in the way.
+        """
         if touches_line(push, self.lines):
-            return False
-        way, blade = push.way(), push.blade()
-        return not any(
-            way.comes_near(block, -self.overlap_m if object_id in self.met_ids else 0.0)
-            or blade.meets_box_around(block, _BLADE_GAP_M)
+            return None
+        others = [
+            (block, -self.overlap_m if object_id in self.met_ids else 0.0)
             for object_id, block in self.others(goal)
-        )
+        ]
+        block_way = push.block_way()
+        if any(block_way.comes_near(other, margin) for other, margin in others):
+            return None
+        for shifted in push.variants():
+            blade, blade_way = shifted.blade_at_start(), shifted.blade_way()
+            if not any(blade_way.comes_near(o, m) or blade.meets_box_around(o) for o, m in others):
+                return shifted
+        return None
 
 
 def touches_line(push: Push, lines: Sequence[Zone]) -> bool:
     """Whether a block that is pushed may touch one of the lines."""
-    track = push.track()
-    return any(track.comes_near(Rectangle.of_zone(line)) for line in lines)
+    way = push.block_way()
+    return any(way.comes_near(Rectangle.of_zone(line)) for line in lines)
 
 
 def ends(zone: Zone, start: Point) -> Iterator[Point]:

@@ -56,8 +56,9 @@ def _direct_sweeps(view: View) -> Iterator[Sweep]:
         return  # nothing can be overlapped
     for pushes in itertools.zip_longest(*(_pushes_into_zone(view, goal) for goal in view.goals)):
         for goal, push in zip(view.goals, pushes, strict=True):
-            if push and view.is_clear(goal, push):
-                yield push.sweep(goal)
+            clear = push and view.cleared(goal, push)
+            if clear:
+                yield clear.sweep(goal)
 
 
 def _pushes_into_zone(view: View, goal: InZone) -> Iterator[Push]:
@@ -74,16 +75,17 @@ def _detours(view: View) -> Iterator[Sweep]:
     ]
     for _, rank, stop in sorted(stops):
         goal = view.goals[rank]
-        push = Push.between(view.place(goal), stop)
-        if view.is_clear(goal, push) and _can_finish(view.after(goal, push).only(goal)):
+        push = view.cleared(goal, Push.between(view.place(goal), stop))
+        if push and _can_finish(view.after(goal, push).only(goal)):
             yield push.sweep(goal)
 
 
 def _aside_sweeps(view: View) -> Iterator[Sweep]:
     """Clear sweeps that park a block elsewhere, so that a direct sweep becomes possible."""
     for goal, push in _parking_pushes(view):
-        if view.is_clear(goal, push) and _can_finish(view.after(goal, push)):
-            yield push.sweep(goal)
+        clear = view.cleared(goal, push)
+        if clear and _can_finish(view.after(goal, clear)):
+            yield clear.sweep(goal)
 
 
 def _can_finish(view: View) -> bool:
@@ -93,24 +95,28 @@ def _can_finish(view: View) -> bool:
 def _parting_sweeps(view: View) -> Iterator[Sweep]:
     """Sweeps that park a block of a group too tight for the blade; other open blocks may be pushed along.
 
-    The blade still comes down on free ground. First come those whose way covers least of the others' width.
+    The blade still comes down on free ground. First come those that push nothing along at the workspace's
+    edge, and of these the ones whose ways cover least of the others' width.
     """
     open_ids = {goal.object_id for goal in view.goals}
-    candidates: list[tuple[float, int, Sweep]] = []
+    candidates: list[tuple[bool, float, int, Sweep]] = []
     for goal, push in _parking_pushes(view):
-        way, blade = push.way(), push.blade()
         group = [block for object_id, block in view.others(goal) if object_id in open_ids]
         apart = [block for object_id, block in view.others(goal) if object_id not in open_ids]
         apart += [Rectangle.of_zone(line) for line in view.lines]
-        if any(blade.meets_box_around(block) for block in group):
-            continue
-        if any(way.comes_near(other, 2 * BLOCK_REACH_M) for other in apart):  # room for what is pushed along
-            continue
-        moved = [block for block in group if way.comes_near(block)]
-        if all(_stays(block, push, way) for block in moved):
-            cover = max((_cover(way, block) for block in moved), default=0.0)
-            candidates.append((cover, len(candidates), push.sweep(goal)))
-    yield from (sweep for _, _, sweep in sorted(candidates, key=lambda candidate: candidate[:2]))
+        for shifted in push.variants():
+            ways = (shifted.blade_way(), shifted.block_way())
+            blade = shifted.blade_at_start()
+            if any(blade.meets_box_around(block) for block in group):
+                continue
+            # Room for what is pushed along.
+            if any(way.comes_near(other, 2 * BLOCK_REACH_M) for way in ways for other in apart):
+                continue
+            moved = [block for block in group if any(way.comes_near(block) for way in ways)]
+            risky = not all(_stays(block, shifted) for block in moved)
+            cover = max((_cover(way, block) for way in ways for block in moved), default=0.0)
+            candidates.append((risky, cover, len(candidates), shifted.sweep(goal)))
+    yield from (sweep for *_, sweep in sorted(candidates, key=lambda candidate: candidate[:3]))
 
 
 def _last_resort(view: View) -> Iterator[Sweep]:
@@ -145,14 +151,13 @@ def _is_inside(point: Point, edge_m: float) -> bool:
     )
 
 
-def _stays(block: Rectangle, push: Push, way: Rectangle) -> bool:
-    """Whether a block that is pushed along stays in the workspace: it may go to the way's front and turn."""
-    ahead = (block.x - way.x) * push.ux + (block.y - way.y) * push.uy
-    distance = max(0.0, way.half_x + BLOCK_REACH_M - ahead)
-    return all(
-        _is_inside((block.x + share * push.ux, block.y + share * push.uy), BLOCK_REACH_M)
-        for share in (0.0, distance)
-    )
+def _stays(block: Rectangle, push: Push) -> bool:
+    """Whether a block that is pushed along stays in the workspace: at most it goes before the pushed one."""
+    x, y = push.start
+    ahead = (block.x - x) * push.ux + (block.y - y) * push.uy
+    distance = max(0.0, push.length_m + 2 * BLOCK_REACH_M - ahead)
+    places = ((block.x + way * push.ux, block.y + way * push.uy) for way in (0.0, distance))
+    return all(_is_inside(place, BLOCK_REACH_M) for place in places)
 
 
 def _cover(way: Rectangle, footprint: Rectangle) -> float:
