@@ -53,8 +53,8 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
     centres = [_cell_centre(row, column) for row in range(NUM_ROWS) for column in range(NUM_COLUMNS)]
     centres = [centres[index] for index in table.rng.permutation(len(centres))]
     name, texture = table.choose(pool.dragged_objects), table.choose(pool.dragged_textures)
-    shapes = [table.choose(pool.base_objects) for _ in centres[: 1 if same_bases else None]]
-    shapes *= len(centres) // len(shapes)
+    num_shapes = 1 if same_bases else len(centres)
+    shapes = [table.choose(pool.base_objects) for _ in range(num_shapes)] * (len(centres) // num_shapes)
     textures = table.rng.choice(pool.base_textures, size=len(centres), replace=False).tolist()
     size = table.sample_size(name)
     base_sizes = {shape: table.sample_size(shape) for shape in dict.fromkeys(shapes)}
