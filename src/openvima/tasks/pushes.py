@@ -96,6 +96,10 @@ class Push:
         """Everything that the block covers."""
         return self._strip(BLOCK_REACH_M, BLOCK_REACH_M + OVERRUN_M, half_width=BLOCK_REACH_M + _DRIFT_M)
 
+    def ways(self) -> tuple[Rectangle, Rectangle]:
+        """Everything that is covered: the ways of blade and block."""
+        return self.blade_way(), self.block_way()
+
     def _point(self, along_m: float) -> Point:
         """Point on the line of the blade's middle, so far after the block's start."""
         x, y = self.start

@@ -60,6 +60,10 @@ class View:
         """Return the same with no other goal open."""
         return replace(self, goals=(goal,))
 
+    def alone(self, goal: InZone) -> "View":
+        """Return the same with no other goal open and no other block there."""
+        return replace(self.only(goal), footprints={goal.object_id: self.footprints[goal.object_id]})
+
     def others(self, goal: InZone) -> Iterator[tuple[int, Rectangle]]:
         """Ids and footprints of all blocks but the goal's."""
         return ((i, block) for i, block in self.footprints.items() if i != goal.object_id)
@@ -102,7 +106,6 @@ def ends(zone: Zone, start: Point) -> Iterator[Point]:
     side = 1 if start[1] >= zone.y else -1
     num_steps = int((zone.size_y / 2 - _END_EDGE_M) / _END_STEP_M + 1e-9)
     shifts = (0.0, *(sign * _END_STEP_M * step for step in range(1, num_steps + 1) for sign in (side, -side)))
-    columns = (
-        (0.0, -_COLUMN_STEP_M, _COLUMN_STEP_M) if zone.size_x / 2 > _COLUMN_STEP_M + _END_EDGE_M else (0.0,)
-    )
+    has_columns = zone.size_x / 2 > _COLUMN_STEP_M + _END_EDGE_M
+    columns = (0.0, -_COLUMN_STEP_M, _COLUMN_STEP_M) if has_columns else (0.0,)
     return ((zone.x + column, zone.y + shift) for column in columns for shift in shifts)

@@ -11,17 +11,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, InZone, Problem, Scene, Zone
+from openvima.scene import InZone, Problem, Scene
 from openvima.tasks.detours import waypoints
-from openvima.tasks.footprints import Rectangle
+from openvima.tasks.parting import parking_pushes, parting_sweeps
 from openvima.tasks.published_sweeps import published_sweep
-from openvima.tasks.pushes import BLOCK_REACH_M, Point, Push, Sweep
+from openvima.tasks.pushes import Push, Sweep
 from openvima.tasks.sweep_view import View, ends
 
 _NUDGE_M, _SHOVE_M = 0.012, 0.03  # how far a way may overlap a block that counts already
-_ASIDE_LENGTHS_M = (0.06, 0.1)
-_ASIDE_ANGLES_RAD = tuple(2 * math.pi * step / 24 for step in range(24))
-_PARKING_EDGE_M = 0.03  # a parked block keeps this far from the zone and the edge of the workspace
 
 
 def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compat: bool = False) -> Sweep:
@@ -44,7 +41,7 @@ def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compa
         _aside_sweeps(view),
         _direct_sweeps(shoving),
         _detours(shoving),
-        _parting_sweeps(view),
+        parting_sweeps(view),
         _last_resort(view),
     )
     return next(sweeps)
@@ -82,7 +79,7 @@ def _detours(view: View) -> Iterator[Sweep]:
 
 def _aside_sweeps(view: View) -> Iterator[Sweep]:
     """Clear sweeps that park a block elsewhere, so that a direct sweep becomes possible."""
-    for goal, push in _parking_pushes(view):
+    for goal, push in parking_pushes(view):
         clear = view.cleared(goal, push)
         if clear and _can_finish(view.after(goal, clear)):
             yield clear.sweep(goal)
@@ -92,76 +89,10 @@ def _can_finish(view: View) -> bool:
     return any(True for _ in _direct_sweeps(view))
 
 
-def _parting_sweeps(view: View) -> Iterator[Sweep]:
-    """Sweeps that park a block of a group too tight for the blade; other open blocks may be pushed along.
-
-    The blade still comes down on free ground. First come those that push nothing along at the workspace's
-    edge, and of these the ones whose ways cover least of the others' width.
-    """
-    open_ids = {goal.object_id for goal in view.goals}
-    candidates: list[tuple[bool, float, int, Sweep]] = []
-    for goal, push in _parking_pushes(view):
-        group = [block for object_id, block in view.others(goal) if object_id in open_ids]
-        apart = [block for object_id, block in view.others(goal) if object_id not in open_ids]
-        apart += [Rectangle.of_zone(line) for line in view.lines]
-        for shifted in push.variants():
-            ways = (shifted.blade_way(), shifted.block_way())
-            blade = shifted.blade_at_start()
-            if any(blade.meets_box_around(block) for block in group):
-                continue
-            # Room for what is pushed along.
-            if any(way.comes_near(other, 2 * BLOCK_REACH_M) for way in ways for other in apart):
-                continue
-            moved = [block for block in group if any(way.comes_near(block) for way in ways)]
-            risky = not all(_stays(block, shifted) for block in moved)
-            cover = max((_cover(way, block) for way in ways for block in moved), default=0.0)
-            candidates.append((risky, cover, len(candidates), shifted.sweep(goal)))
-    yield from (sweep for *_, sweep in sorted(candidates, key=lambda candidate: candidate[:3]))
-
-
 def _last_resort(view: View) -> Iterator[Sweep]:
-    """The nearest block straight to the zone's middle, whatever is in the way."""
+    """Sweeps of the nearest block as if there were no others, at the very end over the line."""
     goal = view.goals[0]
+    alone = view.alone(goal)
+    yield from _direct_sweeps(alone)
+    yield from _detours(alone)
     yield Push.between(view.place(goal), (goal.zone.x, goal.zone.y)).sweep(goal)
-
-
-def _parking_pushes(view: View) -> Iterator[tuple[InZone, Push]]:
-    """Goals, and pushes of their blocks to points nearby, inside the workspace and outside of the zone."""
-    for length in _ASIDE_LENGTHS_M:
-        for goal in view.goals:
-            x, y = view.place(goal)
-            for angle in _ASIDE_ANGLES_RAD:
-                end = (x + length * math.cos(angle), y + length * math.sin(angle))
-                if _may_park(end, goal.zone):
-                    yield goal, Push.between((x, y), end)
-
-
-def _may_park(point: Point, zone: Zone) -> bool:
-    edge = _PARKING_EDGE_M
-    beside_zone = abs(point[1] - zone.y) > zone.size_y / 2 + edge and point[0] > zone.x
-    before_zone = point[0] > zone.x + zone.size_x / 2 + edge
-    return (beside_zone or before_zone) and _is_inside(point, edge)
-
-
-def _is_inside(point: Point, edge_m: float) -> bool:
-    """Whether a point lies in the workspace and keeps off its edge."""
-    return all(
-        low + edge_m < value < high - edge_m
-        for value, low, high in zip(point, WORKSPACE_LOW, WORKSPACE_HIGH, strict=True)
-    )
-
-
-def _stays(block: Rectangle, push: Push) -> bool:
-    """Whether a block that is pushed along stays in the workspace: at most it goes before the pushed one."""
-    x, y = push.start
-    ahead = (block.x - x) * push.ux + (block.y - y) * push.uy
-    distance = max(0.0, push.length_m + 2 * BLOCK_REACH_M - ahead)
-    places = ((block.x + way * push.ux, block.y + way * push.uy) for way in (0.0, distance))
-    return all(_is_inside(place, BLOCK_REACH_M) for place in places)
-
-
-def _cover(way: Rectangle, footprint: Rectangle) -> float:
-    """Width of a footprint, in metres, that lies within the way's width."""
-    across = way.yaw_rad + math.pi / 2
-    offset = (footprint.x - way.x) * math.cos(across) + (footprint.y - way.y) * math.sin(across)
-    return way.half_y + footprint.half_width(across) - abs(offset)
