@@ -149,7 +149,7 @@ def decode_file(files: PackFiles, relative_path: str) -> None:
         files.read(relative_path)
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def _protected_geometry(files: PackFiles, object_name: str, size: Vector3, scale: Vector3) -> Geometry:
     spec = object_spec(object_name)
     try:

@@ -13,7 +13,7 @@ from openvima.catalog.geometry import Geometry, Vector3, protect
 from openvima.catalog.textures import texture_spec
 
 _DRAWING_MODULES = (cache, images, materials, noise, patterns, textures)  # cache: the form of its files
-_GEOMETRIES_KEPT = 1024  # containers come in any size, so the memory of shapes needs a bound
+_GEOMETRIES_KEPT = 256  # containers come in any size, so the memory of shapes needs a bound
 
 
 class ProceduralAssets:

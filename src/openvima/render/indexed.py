@@ -32,7 +32,7 @@ class IndexedMesh:
     upward: np.ndarray
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def indexed(mesh: TriangleMesh) -> IndexedMesh:
     """Return a mesh in indexed form; the same mesh object gives the same arrays."""
     num_triangles = len(mesh.vertices)

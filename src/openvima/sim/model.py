@@ -74,7 +74,7 @@ class BodyShape:
     inertia: Vector3
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
     """Prepare the body of an object; one that nothing can touch counts as fixed."""
     spec = object_spec(object_name)

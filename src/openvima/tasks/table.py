@@ -365,7 +365,7 @@ def is_in_the_way(placement: Placement, other: Placement) -> bool:
     return placement.pose.planar_distance(other.pose) <= reach
 
 
-@functools.lru_cache(maxsize=1024)
+@functools.lru_cache(maxsize=256)
 def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
     """Largest planar distance of anything drawn of an object from its link frame, in metres."""
     vertices = assets.geometry(object_name, size).visual.vertices
