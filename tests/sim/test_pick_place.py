@@ -155,3 +155,13 @@ def test_the_joint_path_leads_from_where_the_arm_was_to_where_it_is() -> None:
     np.testing.assert_array_equal(first.joint_path[-1], world.joints.astype(np.float32))
     second = world.execute(Action.planar((0.5, 0.0), (0.6, 0.1)))
     np.testing.assert_array_equal(second.joint_path[0], first.joint_path[-1])
+
+
+def test_a_body_on_edge_that_leans_on_nothing_falls_over() -> None:
+    scene = table(("letter A", 0.5, 0.0, 0.0))
+    lean = Pose((0.5, 0.0, 0.0), (math.sin(0.65), 0.0, 0.0, math.cos(0.65)))  # 75 degrees up
+    lowest = Bodies(scene, ASSETS).lowest_z(0, lean.quaternion)
+    world = World(scene.with_poses({5: lean.moved(dz=-0.001 - lowest)}), ASSETS)
+    world.execute(Action.planar((0.3, 0.4), (0.3, 0.3)))  # elsewhere
+    assert abs(world.scene[5].pose.matrix()[2, 2]) > 0.99
+    assert world.scene[5].pose.z < 0.035

@@ -17,7 +17,7 @@ from openvima.sim.arm_path import reachable_joints
 from openvima.sim.blade import Blade
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import FLOOR_Z_M
-from openvima.sim.stage import RESTING_GAP_M, Stage
+from openvima.sim.stage import RESTING_GAP_M, Stage, is_level
 from openvima.sim.touch import body_gap, gap, way_to_touch
 
 _DOWN = (0.0, 0.0, -1.0)
@@ -119,7 +119,7 @@ class _HeldBody:
 
 
 def _lift(stage: Stage, held: _HeldBody) -> bool:
-    """Take a body out of the physics, let others settle that leaned on it; whether it stood by itself."""
+    """Take a body out of the physics, let others settle that leaned on it; whether it lay by itself."""
     bodies = stage.bodies
     touching = [
         other
@@ -130,7 +130,7 @@ def _lift(stage: Stage, held: _HeldBody) -> bool:
     bodies.park(held.index)
     if any(other in bodies.rigid for other in touching):
         stage.settle((held.index, held.grasped_at.moved(dz=tools.HOVER_TIP_Z_M)))
-    return not touching and on_floor < RESTING_GAP_M
+    return not touching and on_floor < RESTING_GAP_M and is_level(held.grasped_at)
 
 
 def _set_down(stage: Stage, held: _HeldBody, *, stands_alone: bool) -> None:

@@ -11,6 +11,7 @@ from openvima.sim.model import FLOOR_Z_M
 from openvima.sim.touch import body_gap
 
 RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
+LEVEL_RAD = 0.03  # the pan rests tilted by 0.01
 STILL_M = 5e-5  # a body that physics moved by less than this, and turned by less than …
 STILL_RAD = 5e-4  # … this, keeps its pose: nothing creeps, however many steps an episode has
 
@@ -96,10 +97,18 @@ def _is_still(before: Pose, after: Pose) -> bool:
     return cosine > math.cos(STILL_RAD / 2)
 
 
+def is_level(pose: Pose) -> bool:
+    """Whether a body lies flat, either way up; one on edge may have leaned on something."""
+    x, y, _, _ = pose.quaternion
+    return abs(1 - 2 * (x * x + y * y)) > math.cos(LEVEL_RAD)
+
+
 def is_at_rest(bodies: Bodies) -> bool:
-    """Whether every free body stands on the floor and overlaps no other: nothing would move."""
+    """Whether every free body lies flat on the floor and overlaps no other: nothing would move."""
     for index in bodies.rigid:
         pose = bodies.pose(index)
+        if not is_level(pose):
+            return False
         if abs(pose.z + bodies.lowest_z(index, pose.quaternion) - FLOOR_Z_M) > RESTING_GAP_M:
             return False
     return not any(
