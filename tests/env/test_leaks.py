@@ -1,0 +1,29 @@
+"""Long use leaves memory and file handles as they were."""
+
+import os
+from pathlib import Path
+
+from openvima.env import TabletopEnv
+
+NUM_RESETS = 1000
+MB = 2**20
+
+
+def resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def num_handles() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_a_thousand_resets_leave_memory_and_file_handles_flat() -> None:
+    env = TabletopEnv("rotate")
+    for seed in range(300):  # fills the caches of shapes, textures and models
+        env.reset(seed=seed)
+    before = resident_bytes(), num_handles()
+    for seed in range(NUM_RESETS):
+        env.reset(seed=1000 + seed)
+    assert num_handles() == before[1]
+    assert resident_bytes() - before[0] < 10 * MB
