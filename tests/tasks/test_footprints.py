@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openvima.scene import Zone
 from openvima.tasks.footprints import Rectangle
 
 rectangles = st.builds(
@@ -53,3 +54,15 @@ def test_a_turned_square_reaches_farther() -> None:
     a, b = Rectangle(0, 0, 0, 0.015, 0.015), Rectangle(0.035, 0, 0, 0.015, 0.015)
     assert not a.comes_near(b)
     assert a.comes_near(Rectangle(0.035, 0, math.pi / 4, 0.015, 0.015))
+
+
+def test_the_box_around_a_turned_square_reaches_farther_than_the_square() -> None:
+    blade = Rectangle(0, 0, 0, 0.0025, 0.025)
+    turned = Rectangle(0.02, 0.042, math.pi / 4, 0.015, 0.015)
+    assert blade.meets_box_around(turned) and not blade.comes_near(turned)
+    assert not blade.meets_box_around(Rectangle(0.02, 0.047, math.pi / 4, 0.015, 0.015))
+
+
+def test_a_zone_is_a_rectangle() -> None:
+    zone = Rectangle.of_zone(Zone(0.4, 0.1, 0.2, 0.04))
+    assert (zone.x, zone.y, zone.yaw_rad, zone.half_x, zone.half_y) == (0.4, 0.1, 0.0, 0.1, 0.02)

@@ -4,27 +4,35 @@ import math
 
 import pytest
 
+from openvima.env import TabletopEnv
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone, ZoneKeptClear
 from openvima.tasks import sample_episode
 from openvima.tasks.footprints import Rectangle
 from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Sweep
 from openvima.tasks.sweeping import plan_sweep
 
-ZONE = Zone(0.5, 0.0, 0.1, 0.27)
+ZONE, LINE = Zone(0.5, 0.0, 0.1, 0.27), Zone(0.41, 0.0, 0.04, 0.34)
+AREA = Zone(0.39, 0.0, 0.172, 0.3)  # with a line at its mouth
+SHORT, LONG = Zone(0.496, 0.0, 0.04, 0.1875), Zone(0.496, 0.0, 0.04, 0.4625)
 FAR = (0.6, 0.3)
 
 
 def problem_with(
-    swept: dict[int, tuple[float, float]], distractors: dict[int, tuple[float, float]]
+    swept: dict[int, tuple[float, float]],
+    distractors: dict[int, tuple[float, float]],
+    *,
+    zone: Zone = ZONE,
+    line: Zone = LINE,
+    yaw_rad: float = 0.0,
 ) -> Problem:
     blocks = tuple(
-        Placement(object_id, "small block", "red", (0.03, 0.03, 0.03), Pose.planar(x, y, z=0.014))
+        Placement(object_id, "small block", "red", (0.03, 0.03, 0.03), Pose.planar(x, y, yaw_rad, z=0.014))
         for object_id, (x, y) in sorted((swept | distractors).items())
     )
-    goals = tuple(InZone(object_id, ZONE) for object_id in swept)
-    line = NeverTouches(tuple(swept), Zone(0.41, 0, 0.04, 0.34), "line")
-    clear = ZoneKeptClear(tuple(distractors), ZONE)
-    return Problem(Scene(blocks, "spatula"), Prompt("", ()), goals, (line, clear))
+    goals = tuple(InZone(object_id, zone) for object_id in swept)
+    never = NeverTouches(tuple(swept), line, "line")
+    clear = ZoneKeptClear(tuple(distractors), zone)
+    return Problem(Scene(blocks, "spatula"), Prompt("", ()), goals, (never, clear))
 
 
 def plan(problem: Problem, *, open_ids: tuple[int, ...] | None = None, compat: bool = False) -> Sweep:
@@ -41,13 +49,24 @@ def pushed_to(sweep: Sweep) -> tuple[float, float]:
 
 
 def covered(sweep: Sweep) -> Rectangle:
-    """What blade and block pass over, without any margin."""
+    """What the blade passes over, and a block in front of its middle, without any margin."""
     dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
     length = math.hypot(dx, dy)
     back, front = -0.0225, length - SHORTFALL_M + 0.015
     middle = (back + front) / 2
     x, y = sweep.start[0] + middle * dx / length, sweep.start[1] + middle * dy / length
     return Rectangle(x, y, math.atan2(dy, dx), (front - back) / 2, 0.025)
+
+
+def block_meets(problem: Problem, sweep: Sweep, line: Zone) -> bool:
+    """Whether the block that is swept passes over the line."""
+    pose = problem.scene[sweep.goal.object_id].pose
+    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
+    length = math.hypot(dx, dy)
+    way = length - STANDOFF_M - SHORTFALL_M
+    x, y = pose.x + way / 2 * dx / length, pose.y + way / 2 * dy / length
+    block = Rectangle(x, y, math.atan2(dy, dx), way / 2 + 0.0212, 0.0212)
+    return block.comes_near(Rectangle.of_zone(line))
 
 
 def test_a_lone_block_goes_straight_to_the_middle_of_the_zone() -> None:
@@ -81,6 +100,88 @@ def test_neighbours_too_close_for_the_blade_are_parted_first() -> None:
     problem = problem_with({4: (0.65, -0.1), 5: (0.65, -0.066)}, {})
     x, y = pushed_to(plan(problem))
     assert x > ZONE.x + ZONE.size_x / 2 + 0.02 or abs(y) > ZONE.size_y / 2 + 0.02  # none goes in
+
+
+def test_with_a_neighbour_beside_the_blade_it_comes_down_a_little_aside() -> None:
+    sweep = plan(problem_with({4: (0.65, 0.0)}, {5: (0.69, 0.04)}))
+    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
+    aside_m = (dx * (0.0 - sweep.start[1]) - dy * (0.65 - sweep.start[0])) / math.hypot(dx, dy)
+    assert abs(aside_m) == pytest.approx(0.015)
+    assert not covered(sweep).comes_near(Rectangle(0.69, 0.04, 0.0, 0.015, 0.015))
+    assert sweep.end[0] < ZONE.x
+
+
+def test_the_blade_comes_down_clear_of_the_box_around_a_turned_neighbour() -> None:
+    # The simulation shifts a block off the blade's place by the box around it, seen from the blade.
+    problem = problem_with({4: (0.6938, 0.0596), 5: (0.7478, 0.0365)}, {}, yaw_rad=math.radians(72))
+    sweep = plan(problem)
+    other = {4: 5, 5: 4}[sweep.goal.object_id]
+    dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
+    length = math.hypot(dx, dy)
+    blade = Rectangle(
+        sweep.start[0] - 0.02 * dx / length,
+        sweep.start[1] - 0.02 * dy / length,
+        math.atan2(dy, dx),
+        0.0025,
+        0.025,
+    )
+    assert not blade.meets_box_around(Rectangle.of_box(problem.scene[other].pose, 0.03, 0.03))
+
+
+@pytest.mark.parametrize(("y", "side"), [(0.15, 1), (-0.18, -1)])
+def test_a_block_beside_a_short_line_goes_through_the_gap(y: float, side: int) -> None:
+    problem = problem_with({4: (0.65, y)}, {}, zone=AREA, line=SHORT)
+    sweep = plan(problem)
+    x, y = pushed_to(sweep)
+    assert not block_meets(problem, sweep, SHORT)
+    assert abs(x - AREA.x) < AREA.size_x / 2 - 0.02 and 0.0 < side * y < AREA.size_y / 2 - 0.02
+
+
+@pytest.mark.parametrize("line", [SHORT, LONG])
+@pytest.mark.parametrize("y", [0.05, -0.1])
+def test_a_block_in_front_of_a_line_stops_beside_it_first(line: Zone, y: float) -> None:
+    problem = problem_with({4: (0.62, y)}, {}, zone=AREA, line=line)
+    first = plan(problem)
+    stop = pushed_to(first)
+    assert not block_meets(problem, first, line)
+    assert stop[1] * y > 0 and abs(stop[1]) > line.size_y / 2
+    moved = problem_with({4: stop}, {}, zone=AREA, line=line)
+    second = plan(moved)
+    x, y = pushed_to(second)
+    assert not block_meets(moved, second, line)
+    assert abs(x - AREA.x) < AREA.size_x / 2 - 0.02 and abs(y) < AREA.size_y / 2 - 0.02
+
+
+def test_a_detour_goes_around_the_other_end_if_distractors_fence_the_near_one_off() -> None:
+    fence = {5 + i: (0.47 + 0.031 * i, 0.16) for i in range(9)}
+    problem = problem_with({4: (0.62, 0.01)}, fence, zone=AREA, line=SHORT)
+    sweep = plan(problem)
+    assert pushed_to(sweep)[1] < 0 and not block_meets(problem, sweep, SHORT)
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
+def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
+    num_clear = 0
+    for seed in range(100):
+        problem = sample_episode(
+            "sweep_without_touching", level="L4", seed=seed, difficulty=difficulty
+        ).problem
+        line = problem.constraints[0]
+        assert isinstance(line, NeverTouches)
+        sweep = plan(problem)
+        assert not block_meets(problem, sweep, line.zone)
+        others = [p for p in problem.scene.placements if not p.fixed and p.id != sweep.goal.object_id]
+        num_clear += not any(covered(sweep).comes_near(Rectangle.of_box(p.pose, 0.03, 0.03)) for p in others)
+    assert num_clear >= 97
+
+
+@pytest.mark.parametrize(("level", "seed"), [("train", 449), ("L1", 94), ("L2", 790)])
+def test_tight_groups_at_the_edge_stay_on_the_table(level: str, seed: int) -> None:
+    env = TabletopEnv("sweep_without_exceeding", level=level, domain="eval")
+    env.reset(seed=seed)
+    while not env.outcome.is_over:
+        env.step(env.oracle_decision().action)
+    assert env.outcome.success, env.outcome.reason
 
 
 def test_compat_takes_the_first_block_and_does_not_look() -> None:
