@@ -8,7 +8,9 @@ from openvima.env import TabletopEnv
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone, ZoneKeptClear
 from openvima.tasks import sample_episode
 from openvima.tasks.footprints import Rectangle
+from openvima.tasks.parting import parting_sweeps
 from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Sweep
+from openvima.tasks.sweep_view import View
 from openvima.tasks.sweeping import plan_sweep
 
 ZONE, LINE = Zone(0.5, 0.0, 0.1, 0.27), Zone(0.41, 0.0, 0.04, 0.34)
@@ -173,6 +175,22 @@ def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
         others = [p for p in problem.scene.placements if not p.fixed and p.id != sweep.goal.object_id]
         num_clear += not any(covered(sweep).comes_near(Rectangle.of_box(p.pose, 0.03, 0.03)) for p in others)
     assert num_clear >= 97
+
+
+def test_a_group_is_parted_without_pushing_a_block_along_the_edge() -> None:
+    problem = problem_with({4: (0.713, 0.107), 5: (0.748, 0.113)}, {})
+    goals = [goal for goal in problem.goals if isinstance(goal, InZone)]
+    parting = next(parting_sweeps(View.of(goals, problem.scene, problem)))
+    assert parting.goal.object_id == 5
+    inwards = problem_with({4: (0.643, 0.107), 5: (0.678, 0.113)}, {})
+    assert next(parting_sweeps(View.of(goals, inwards.scene, inwards))).goal.object_id == 4
+
+
+def test_sweeps_of_blocks_at_the_edge_start_within_reach_of_an_action() -> None:
+    for y in (-0.2, -0.1, 0.0, 0.1, 0.2):
+        for line in (SHORT, LONG):
+            sweep = plan(problem_with({4: (0.749, y)}, {5: (0.749, y + 0.045)}, zone=AREA, line=line))
+            assert sweep.start[0] <= 0.756 and sweep.end[0] <= 0.75
 
 
 @pytest.mark.parametrize(("level", "seed"), [("train", 449), ("L1", 94), ("L2", 790)])

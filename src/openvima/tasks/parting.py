@@ -3,9 +3,9 @@
 import math
 from collections.abc import Iterator
 
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, InZone, Zone
+from openvima.scene import InZone, Zone
 from openvima.tasks.footprints import Rectangle
-from openvima.tasks.pushes import BLOCK_REACH_M, Point, Push, Sweep
+from openvima.tasks.pushes import BLOCK_REACH_M, Point, Push, Sweep, is_inside
 from openvima.tasks.sweep_view import View
 
 _LENGTHS_M = (0.06, 0.1)
@@ -50,15 +50,7 @@ def parting_sweeps(view: View) -> Iterator[Sweep]:
 def _may_park(point: Point, zone: Zone) -> bool:
     beside_zone = abs(point[1] - zone.y) > zone.size_y / 2 + _EDGE_M and point[0] > zone.x
     before_zone = point[0] > zone.x + zone.size_x / 2 + _EDGE_M
-    return (beside_zone or before_zone) and _is_inside(point, _EDGE_M)
-
-
-def _is_inside(point: Point, edge_m: float) -> bool:
-    """Whether a point lies in the workspace and keeps off its edge."""
-    return all(
-        low + edge_m < value < high - edge_m
-        for value, low, high in zip(point, WORKSPACE_LOW, WORKSPACE_HIGH, strict=True)
-    )
+    return (beside_zone or before_zone) and is_inside(point, _EDGE_M)
 
 
 def _comes_down_on(push: Push, blocks: list[Rectangle]) -> bool:
@@ -77,7 +69,7 @@ def _stays(block: Rectangle, push: Push) -> bool:
     ahead = (block.x - x) * push.ux + (block.y - y) * push.uy
     distance = max(0.0, push.length_m + 2 * BLOCK_REACH_M - ahead)
     places = ((block.x + way * push.ux, block.y + way * push.uy) for way in (0.0, distance))
-    return all(_is_inside(place, BLOCK_REACH_M) for place in places)
+    return all(is_inside(place, BLOCK_REACH_M) for place in places)
 
 
 def _cover(push: Push, block: Rectangle) -> float:

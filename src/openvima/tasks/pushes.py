@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from openvima.scene import InZone
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, InZone
 from openvima.tasks.footprints import Rectangle
 
 Point = tuple[float, float]
@@ -74,12 +74,19 @@ class Push:
         return math.atan2(self.uy, self.ux)
 
     def variants(self) -> Iterator["Push"]:
-        """The same push with the blade in the middle of the block, to the left of it and to the right."""
-        return (replace(self, aside_m=aside_m) for aside_m in (0.0, _ASIDE_M, -_ASIDE_M))
+        """The same push with the blade in the middle of the block, to the left of it and to the right.
+
+        Left out are those that actions, which stay in the workspace, cannot describe; behind a block at its
+        edge a sweep may start a little nearer.
+        """
+        for aside_m in (0.0, _ASIDE_M, -_ASIDE_M):
+            push = replace(self, aside_m=aside_m)
+            if is_inside(push._first(), -STANDOFF_M) and is_inside(push._last(), 0.0):
+                yield push
 
     def sweep(self, goal: InZone) -> Sweep:
         """Return the sweep that pushes the goal's block like this."""
-        return Sweep(goal, self._point(-STANDOFF_M), self._point(self.length_m + SHORTFALL_M))
+        return Sweep(goal, self._first(), self._last())
 
     def blade_at_start(self) -> Rectangle:
         """Where the blade comes down."""
@@ -100,6 +107,12 @@ class Push:
         """Everything that is covered: the ways of blade and block."""
         return self.blade_way(), self.block_way()
 
+    def _first(self) -> Point:
+        return self._point(-STANDOFF_M)
+
+    def _last(self) -> Point:
+        return self._point(self.length_m + SHORTFALL_M)
+
     def _point(self, along_m: float) -> Point:
         """Point on the line of the blade's middle, so far after the block's start."""
         x, y = self.start
@@ -112,3 +125,11 @@ class Push:
         x = self.start[0] + middle * self.ux - aside_m * self.uy
         y = self.start[1] + middle * self.uy + aside_m * self.ux
         return Rectangle(x, y, self.yaw_rad, half_length, half_width)
+
+
+def is_inside(point: Point, edge_m: float) -> bool:
+    """Whether a point lies in the workspace and keeps off its edge; if negative, so far outside will do."""
+    return all(
+        low + edge_m <= value <= high - edge_m
+        for value, low, high in zip(point, WORKSPACE_LOW, WORKSPACE_HIGH, strict=True)
+    )
