@@ -19,8 +19,8 @@ def num_handles() -> int:
 
 
 def test_a_thousand_resets_leave_memory_and_file_handles_flat() -> None:
-    env = TabletopEnv("rotate")
-    for seed in range(300):  # fills the caches of shapes, textures and models
+    env = TabletopEnv("novel_adj_and_noun")
+    for seed in range(600):  # fills the caches of shapes, textures, hulls and models
         env.reset(seed=seed)
     before = resident_bytes(), num_handles()
     for seed in range(NUM_RESETS):

@@ -29,6 +29,10 @@ from openvima.sim.end_effectors import BLADE_HALF_SIZE_M, NEEDLE_RADIUS_M
 
 # Left alone, MuJoCo writes its warnings into a file in the working directory.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
+# Left alone, MuJoCo keeps up to 500 MB of hulls; containers come in any size, so few are met again. With this
+# much, compiling takes as long.
+if hasattr(mujoco, "mj_setCacheCapacity"):
+    mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 8 << 20)
 
 TICK_S = 1 / 240
 GRAVITY_M_S2 = 9.8
