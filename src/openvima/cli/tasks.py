@@ -52,7 +52,7 @@ def main(
     table = Table(title=f"{len(specs)} tasks", show_lines=True)
     columns = ["task", "family", "prompt", "tool", "levels", "steps", "oracle"]
     if console.width < FULL_WIDTH:  # else words of the prompts would break
-        columns.remove("family")
+        columns = [name for name in columns if name not in ("family", "oracle")]
     for name in columns:
         table.add_column(name, no_wrap=name in ("task", "tool", "steps", "oracle"), overflow="fold")
         if name == "levels" and console.width < FULL_WIDTH:
