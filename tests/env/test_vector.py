@@ -275,12 +275,13 @@ def test_gymnasiums_own_function_gives_the_same_bytes(kind: str, settings: dict)
 
 
 def test_gymnasiums_wrappers_take_the_infos() -> None:
-    envs = DictInfoToList(RecordEpisodeStatistics(openvima.make_vec("rotate", 2)))
-    _, infos = envs.reset(seed=[4, 9])
-    single = TabletopEnv("rotate")
-    assert frozen(infos[1]) == frozen(single.reset(seed=9)[1])
-    *_, infos = envs.step(oracle_actions(envs.unwrapped))
-    assert infos[0]["episode"]["r"] == 1.0
+    listed = DictInfoToList(openvima.make_vec("rotate", 2))
+    _, infos = listed.reset(seed=[4, 9])
+    assert frozen(infos[1]) == frozen(TabletopEnv("rotate").reset(seed=9)[1])
+    counted = RecordEpisodeStatistics(openvima.make_vec("rotate", 2))
+    counted.reset(seed=[4, 9])
+    *_, infos = counted.step(oracle_actions(counted.unwrapped))
+    assert infos["episode"]["r"].tolist() == [1.0, 1.0]
 
 
 def test_seeds_are_dealt_in_turn_and_begin_again() -> None:
