@@ -322,3 +322,14 @@ def test_what_cannot_be_built_is_refused_at_once(kind: str) -> None:
 def test_an_unknown_kind_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"vectorization mode 'threads'.*sync, async"):
         openvima.make_vec("rotate", 2, vectorization_mode="threads")
+
+
+def test_all_tasks_fit_into_one_batch() -> None:
+    envs = openvima.make_vec(openvima.list_tasks())
+    observations, _ = envs.reset(seed=20)
+    after, *_ = envs.step(oracle_actions(envs))
+    starts, ends = rows(envs, observations), rows(envs, after)
+    for index, task in enumerate(openvima.list_tasks()):
+        single = TabletopEnv(task)
+        assert frozen(starts[index]) == frozen(single.reset(seed=20 + index)[0])
+        assert frozen(ends[index]) == frozen(single.step(single.oracle_decision().action)[0])
