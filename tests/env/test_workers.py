@@ -22,6 +22,7 @@ from openvima.errors import SamplingError, WorkerError
 
 IDLE = stack_actions([None, None])
 SCRIPT = """
+import mujoco  # starts a process that looks for a graphics library, and is none of ours
 import openvima
 from openvima.env import stack_actions
 

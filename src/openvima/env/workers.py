@@ -6,10 +6,12 @@ says where it happened; an error, a killed worker or Ctrl-C ends all workers, qu
 a call, such as an oracle without an action, ends none.
 """
 
+import atexit
 import contextlib
 import functools
 import os
 import queue
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any  # actions, observations and infos are nested dictionaries
@@ -53,6 +55,7 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
         except BaseException:
             self._end_workers(at_once=True)
             raise
+        _OPEN.add(self)
 
     def reset_async(self, seed: Any = None, options: dict[str, Any] | None = None) -> None:
         """Send a reset to the workers; arguments as in `SyncTabletopEnvs.reset`."""
@@ -161,6 +164,16 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
             process.join()
         for pipe in pipes:
             pipe.close()
+
+
+_OPEN: weakref.WeakSet[AsyncTabletopEnvs] = weakref.WeakSet()
+
+
+@atexit.register
+def _end_all_workers() -> None:
+    """End what a script left open, while the modules that this needs are still there."""
+    for envs in list(_OPEN):
+        envs.close(terminate=True)
 
 
 @dataclass(frozen=True, slots=True)
