@@ -119,8 +119,8 @@ def interrupts_held() -> Iterator[None]:
         return
     resource_tracker.ensure_running()  # it would be started later, and its start lets signals through again
     held: list[int] = []
-    # Blocking holds for this thread and for processes that it starts; another thread (of a matrix library, say)
-    # may still take the signal, whose handler Python then runs here.
+    # Blocking holds for this thread and for processes that it starts; another thread (of a matrix library,
+    # say) may still take the signal, whose handler Python then runs here.
     in_main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number)) if in_main else None
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
