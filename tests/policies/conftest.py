@@ -56,7 +56,7 @@ def small_sizes():
     sizes = preset("nano")
     return replace(
         sizes,
-        objects=replace(sizes.objects, crop=ConvConfig(width=8, output_width=32), width=64),
-        text=replace(sizes.text, num_layers=1),
-        decoder=replace(sizes.decoder, width=64, num_layers=1),
+        images=replace(sizes.images, crop=ConvConfig(width=8, output_width=32), width=64),
+        prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
+        trunk=replace(sizes.trunk, width=64, num_layers=1),
     )

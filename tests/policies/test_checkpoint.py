@@ -9,14 +9,14 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_folder, load_policy  # noqa: E402
-from openvima.policies.vima.checkpoint import (  # noqa: E402
+from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
     WEIGHTS_FILE,
     load_checkpoint,
     load_weights,
     save_checkpoint,
 )
-from openvima.policies.vima.model import build_model  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
 
 
 @pytest.fixture
@@ -24,12 +24,12 @@ def saved(small_sizes, tmp_path):
     """A checkpoint folder of a small network."""
     folder = tmp_path / "checkpoint"
     folder.mkdir()
-    save_checkpoint(build_model(small_sizes, seed=3), folder)
+    save_checkpoint(build_network(small_sizes, seed=3), folder)
     return folder
 
 
 def test_weights_and_sizes_come_back_bit_for_bit(saved, small_sizes) -> None:
-    loaded, model = load_checkpoint(saved), build_model(small_sizes, seed=3)
+    loaded, model = load_checkpoint(saved), build_network(small_sizes, seed=3)
     assert loaded.config == small_sizes
     assert not loaded.training
     expected = model.state_dict()
@@ -46,7 +46,7 @@ def test_saving_again_gives_the_same_bytes(saved, small_sizes, tmp_path) -> None
 
 
 def test_every_kind_of_problem_is_in_one_message_and_nothing_is_loaded(small_sizes) -> None:
-    model = build_model(small_sizes, seed=0)
+    model = build_network(small_sizes, seed=0)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     weights = {name: tensor + 1 for name, tensor in before.items()}
     del weights["query"]
@@ -69,7 +69,7 @@ def test_every_kind_of_problem_is_in_one_message_and_nothing_is_loaded(small_siz
 
 
 def test_many_missing_weights_are_counted_rather_than_listed(small_sizes) -> None:
-    model = build_model(small_sizes, seed=0)
+    model = build_network(small_sizes, seed=0)
     with pytest.raises(CheckpointError, match=rf"and {len(model.state_dict()) - 5} more"):
         load_weights(model, {}, source="here")
 
@@ -94,9 +94,9 @@ def test_a_missing_file_is_named(saved, name: str) -> None:
     [
         ("{", "no valid YAML"),
         ("", "does not describe"),
-        ("policy: gato\nconfig: {}\n", "does not describe a 'vima' policy"),
-        ("policy: vima\nconfig: 3\n", "must be a mapping"),
-        ("policy: vima\nconfig: {}\n", "missing 6 required"),
+        ("policy: gato\nconfig: {}\n", "does not describe a 'network' policy"),
+        ("policy: network\nconfig: 3\n", "must be a mapping"),
+        ("policy: network\nconfig: {}\n", "missing 5 required"),
     ],
 )
 def test_a_config_that_makes_no_sense_is_a_checkpoint_error(saved, text: str, message: str) -> None:

@@ -15,15 +15,16 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file  # noqa: E402
 from tests.policies.published import translated  # noqa: E402
 
-from openvima.policies.layers.decoder import DecoderConfig, position_ids  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.heads.base import ACTION_PARTS, from_unit_range, to_unit_range  # noqa: E402
+from openvima.policies.heads.bins import BinsConfig, decode_bins, encode_bins  # noqa: E402
+from openvima.policies.inputs import HistoryBatch, PromptBatch  # noqa: E402
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig  # noqa: E402
+from openvima.policies.layers.prompt_encoder import PromptEncoderConfig  # noqa: E402
 from openvima.policies.layers.text_encoder import TextEncoderConfig, relative_bucket  # noqa: E402
+from openvima.policies.layers.trunk import DecoderConfig, position_ids  # noqa: E402
 from openvima.policies.layers.vit import VitConfig  # noqa: E402
-from openvima.policies.vima.config import VimaConfig  # noqa: E402
-from openvima.policies.vima.heads.base import ACTION_PARTS, from_unit_range, to_unit_range  # noqa: E402
-from openvima.policies.vima.heads.bins import BinsConfig, decode_bins, encode_bins  # noqa: E402
-from openvima.policies.vima.inputs import HistoryBatch, PromptBatch  # noqa: E402
-from openvima.policies.vima.model import Memory, Vima, build_model  # noqa: E402
+from openvima.policies.network import Memory, PolicyNetwork, build_network  # noqa: E402
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 pytestmark = pytest.mark.skipif(
@@ -39,18 +40,17 @@ def golden() -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def model() -> Vima:
+def model() -> PolicyNetwork:
     crop = VitConfig(width=96, num_layers=2, num_heads=24, output_width=96)
-    config = VimaConfig(
-        objects=ObjectEncoderConfig(crop, box_width=96, width=64),
-        text=TextEncoderConfig(width=768, num_layers=2, num_heads=12, head_width=8, hidden_width=64),
-        decoder=DecoderConfig(width=64, num_layers=2, num_self_heads=4, num_cross_heads=2),
-        prompt_object_width=768,
+    text = TextEncoderConfig(width=768, num_layers=2, num_heads=12, head_width=8, hidden_width=64)
+    config = PolicyConfig(
+        images=ObjectEncoderConfig(crop, box_width=96, width=64),
+        prompt=PromptEncoderConfig(text, image_width=768, vocabulary_size=256, tokenizer="t5"),
+        trunk=DecoderConfig(width=64, num_layers=2, num_self_heads=4, num_cross_heads=2),
+        head=BinsConfig(hidden_width=128),
         action_width=256,
-        vocabulary_size=256,
-        bins=BinsConfig(hidden_width=128),
     )
-    network = build_model(config, seed=0)
+    network = build_network(config, seed=0)
     network.load_state_dict(translated(load_file(FOLDER / "vima_tiny.safetensors")))
     return network.eval()
 
@@ -103,7 +103,7 @@ def prompt_batch(golden: dict[str, np.ndarray]) -> tuple[PromptBatch, np.ndarray
     crops = by_view(crops)
     batch = PromptBatch(
         words_BL=tensor(padded[..., 0]),
-        slots_BL=tensor(padded[..., 1]),
+        images_BL=tensor(padded[..., 1]),
         mask_BL=tensor(padded[..., 2].astype(bool)),
         crops_VS=torch.arange(2 * entries * size).view(2, -1),
         boxes_VS4=tensor(by_view(boxes)),
@@ -122,6 +122,7 @@ def history_batch(golden: dict[str, np.ndarray]) -> tuple[HistoryBatch, np.ndarr
         crops_BTVN=torch.arange(masks.size).view(masks.shape),
         boxes_BTVN4=tensor(boxes),
         masks_BTVN=tensor(masks),
+        counts_BT=torch.full((batch, steps), size),
         positions_BTN2=points,
         grasps_BTN2=points,
         end_effector_BT=tensor(golden["in.ee"].T),
@@ -138,9 +139,9 @@ def past_actions(golden: dict[str, np.ndarray]):
 
 
 @torch.no_grad()
-def encoded_prompt(model: Vima, golden: dict[str, np.ndarray]) -> Memory:
+def encoded_prompt(model: PolicyNetwork, golden: dict[str, np.ndarray]) -> Memory:
     batch, crops = prompt_batch(golden)
-    return model.encode_prompt(batch, model.objects.encode_crops(tensor(crops).flatten(0, 1)))
+    return model.encode_prompts(batch, model.encode_images(tensor(crops).flatten(0, 1)))
 
 
 def assert_close(actual, expected: np.ndarray) -> None:
@@ -149,7 +150,7 @@ def assert_close(actual, expected: np.ndarray) -> None:
 
 def test_golden_crop_features(model, golden):
     assert_close(
-        model.objects.encode_crops(tensor(golden["in.prompt.cropped_img.front"])), golden["prompt.vit.front"]
+        model.encode_images(tensor(golden["in.prompt.cropped_img.front"])), golden["prompt.vit.front"]
     )
 
 
@@ -177,7 +178,7 @@ def test_golden_prompt_is_encoded_alike(model, golden):
 @torch.no_grad()
 def test_golden_observations_become_the_same_tokens(model, golden):
     history, crops = history_batch(golden)
-    tokens, mask = model.observe(history, model.objects.encode_crops(tensor(crops)))
+    tokens, mask, _ = model.observe(history, model.encode_images(tensor(crops)))
     np.testing.assert_array_equal(mask.numpy(), golden["obs.mask"].swapaxes(0, 1))
     assert_close(tokens, golden["obs.tokens"].swapaxes(0, 1))
 
@@ -199,7 +200,7 @@ def test_golden_positions_count_valid_places_only(golden):
 def test_golden_decoder_gives_the_same_outputs(model, golden):
     memory, mask = encoded_prompt(model, golden), tensor(golden["seq.mask"])
     tokens = tensor(golden["seq.tokens"]).transpose(0, 1)
-    outputs = model.decoder(tokens, mask, prompt_BPD=memory.tokens_BLD, prompt_mask_BP=memory.mask_BL)
+    outputs, _ = model.trunk.extend(model.begin(memory), tokens, mask)
     expected = golden["seq.block1_out"]
     expected = expected if expected.shape[0] == len(mask) else expected.swapaxes(0, 1)
     assert_close(outputs[mask], expected[golden["seq.mask"]])
@@ -210,7 +211,7 @@ def test_golden_predictions_and_bins_are_the_same(model, golden):
     """Masked places are left out of the sequence here and kept there; the predictions must not notice."""
     memory = encoded_prompt(model, golden)
     history, crops = history_batch(golden)
-    features = model.objects.encode_crops(tensor(crops).flatten(0, 3))
+    features = model.encode_images(tensor(crops).flatten(0, 3))
     inputs = model(memory, history, features, past_actions(golden))
     assert_close(inputs.query_BTD, golden["out.pred_tokens"].swapaxes(0, 1))
     decided = to_unit_range(model.head.decide(replace(inputs)).double())

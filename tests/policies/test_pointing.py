@@ -8,8 +8,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.vima.heads.base import ACTION_PARTS, ActionTargets, HeadInputs  # noqa: E402
-from openvima.policies.vima.heads.pointing import (  # noqa: E402
+from openvima.policies.heads.base import ACTION_PARTS, ActionTargets, HeadInputs  # noqa: E402
+from openvima.policies.heads.pointing import (  # noqa: E402
     PointingConfig,
     PointingHead,
     at,

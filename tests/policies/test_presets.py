@@ -10,25 +10,25 @@ import yaml  # noqa: E402
 
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
 from openvima.policies import PRESETS, preset  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.heads.bins import NUM_BINS  # noqa: E402
 from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.layers.vit import VitConfig  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
-from openvima.policies.vima.config import VimaConfig  # noqa: E402
-from openvima.policies.vima.heads.bins import NUM_BINS  # noqa: E402
-from openvima.policies.vima.model import build_model  # noqa: E402
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", ["nano", "nano-bins"])
 def test_presets_have_the_size_that_they_promise(name: str) -> None:
-    model = build_model(preset(name), seed=0)
+    model = build_network(preset(name), seed=0)
     count = sum(parameter.numel() for parameter in model.parameters())
     assert 2e6 < count < 4e6  # "about 3 M"
-    assert model.words.num_embeddings == vocabulary_size()
+    assert model.prompt.words.num_embeddings == vocabulary_size()
     assert all(p.dtype == torch.float32 for p in model.parameters())
 
 
 def test_the_bins_preset_classifies_over_the_published_bins() -> None:
-    model = build_model(preset("nano-bins"), seed=0)
+    model = build_network(preset("nano-bins"), seed=0)
     assert tuple(layers[-1].out_features for layers in model.head.classifiers) == NUM_BINS
 
 
@@ -37,9 +37,9 @@ def test_the_bins_preset_classifies_over_the_published_bins() -> None:
 )
 def test_either_crop_encoder_survives_its_file(crop) -> None:
     sizes = preset("nano")
-    sizes = replace(sizes, objects=replace(sizes.objects, crop=crop))
+    sizes = replace(sizes, images=replace(sizes.images, crop=crop))
     text = yaml.safe_dump(sizes.to_dict())
-    assert VimaConfig.from_dict(yaml.safe_load(text)) == sizes
+    assert PolicyConfig.from_dict(yaml.safe_load(text)) == sizes
 
 
 def test_an_unknown_preset_gets_a_suggestion() -> None:
@@ -49,17 +49,17 @@ def test_an_unknown_preset_gets_a_suggestion() -> None:
 
 def test_the_pointing_head_needs_one_token_for_each_object_and_its_appearance() -> None:
     sizes = preset("nano")
-    without = replace(sizes.objects, appearance_width=0)
-    with pytest.raises(ConfigError, match="pointing head needs fuse_views and an appearance width"):
-        replace(sizes, objects=without)
+    without = replace(sizes.images, appearance_width=0)
+    with pytest.raises(ConfigError, match="pointing head needs objects with fuse_views, an appearance width"):
+        replace(sizes, images=without)
     with pytest.raises(ConfigError, match="fuse_views"):
-        replace(sizes.objects, fuse_views=False)
+        replace(sizes.images, fuse_views=False)
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_a_share_of_dropped_crops_out_of_range_is_named(share: float) -> None:
     with pytest.raises(ConfigError, match=f"crop_dropout is {share}"):
-        replace(preset("nano").objects, crop_dropout=share)
+        replace(preset("nano").images, crop_dropout=share)
 
 
 @pytest.mark.parametrize("width", [0, 6])
@@ -73,18 +73,18 @@ def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -
     values = preset("nano").to_dict()
     if isinstance(values[name], dict):
         with pytest.raises(OpenVimaError, match=rf"policy\.{name} is 3"):
-            VimaConfig.from_dict({**values, name: 3})
-    if name not in ("bins", "query_token"):  # they have defaults
+            PolicyConfig.from_dict({**values, name: 3})
+    if name != "query_token":  # it has a default
         del values[name]
-        with pytest.raises(OpenVimaError, match="one action head" if name == "pointing" else name):
-            VimaConfig.from_dict(values)
+        with pytest.raises(OpenVimaError, match=name):
+            PolicyConfig.from_dict(values)
 
 
 def test_a_file_with_a_field_too_many_names_it_and_those_allowed() -> None:
-    with pytest.raises(ConfigError, match=r"policy has unknown fields depth; allowed: objects, text"):
-        VimaConfig.from_dict({**preset("nano").to_dict(), "depth": 3})
+    with pytest.raises(ConfigError, match=r"policy has unknown fields depth; allowed: images, prompt"):
+        PolicyConfig.from_dict({**preset("nano").to_dict(), "depth": 3})
 
 
 def test_a_file_that_is_no_mapping_is_refused() -> None:
     with pytest.raises(ConfigError, match="must be a mapping"):
-        VimaConfig.from_dict([])  # type: ignore[arg-type]
+        PolicyConfig.from_dict([])  # type: ignore[arg-type]

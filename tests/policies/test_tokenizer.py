@@ -8,10 +8,10 @@ from openvima.catalog import OBJECTS, TEXTURES
 from openvima.catalog.packs import load_assets
 from openvima.errors import PromptError
 from openvima.policies.tokenizer import (
+    CLOSED_TOKENIZER,
     END_ID,
     LARGEST_NUMBER,
     PADDING_ID,
-    encode_prompt,
     encode_text,
     vocabulary_size,
     word_ids,
@@ -83,10 +83,18 @@ def blank_images(text: str) -> RenderedPrompt:
     return RenderedPrompt(text, {name: PromptImage(name, "object", {}, {}, ()) for name in names})
 
 
+def encoded(prompt: RenderedPrompt) -> list[int | PromptImage]:
+    """Ids and images in reading order, as a reader interleaves them."""
+    sequence: list[int | PromptImage] = []
+    for part in prompt.sequence():
+        sequence += CLOSED_TOKENIZER.encode(part) if isinstance(part, str) else [part]
+    return [*sequence, CLOSED_TOKENIZER.end_id]
+
+
 @pytest.mark.parametrize("template", TEMPLATES + HARDER, ids=lambda template: template[:24])
 def test_every_prompt_of_the_17_tasks_is_encoded(template: str) -> None:
     for text in filled(template):
-        sequence = encode_prompt(blank_images(text))
+        sequence = encoded(blank_images(text))
         assert sequence[-1] == END_ID
         assert sum(isinstance(part, PromptImage) for part in sequence) == text.count("{")
         ids = [part for part in sequence if isinstance(part, int)]
@@ -115,12 +123,12 @@ def test_sampled_prompts_of_every_task_are_encoded(task: str) -> None:
     for level in task_spec(task).levels:
         for seed in range(3):
             prompt = sample_episode(task, level=level, seed=seed).problem.prompt
-            assert encode_prompt(rasteriser.prompt(prompt))[-1] == END_ID
+            assert encoded(rasteriser.prompt(prompt))[-1] == END_ID
 
 
 def test_images_stand_where_their_placeholders_stood() -> None:
     prompt = blank_images("Put the {a} into the {b}.")
-    sequence = encode_prompt(prompt)
+    sequence = encoded(prompt)
     ids = word_ids()
     put, into, the, stop = (ids[word] for word in ("put", "into", "the", "."))
     assert sequence == [put, the, prompt.images["a"], into, the, prompt.images["b"], stop, END_ID]
@@ -128,7 +136,7 @@ def test_images_stand_where_their_placeholders_stood() -> None:
 
 def test_a_placeholder_that_stands_twice_gives_its_image_twice() -> None:
     prompt = blank_images("From {a} to {a}.")
-    assert encode_prompt(prompt).count(prompt.images["a"]) == 2
+    assert encoded(prompt).count(prompt.images["a"]) == 2
 
 
 def test_no_two_words_share_an_id() -> None:
@@ -166,9 +174,9 @@ def test_numbers_and_letters_beyond_the_vocabulary_are_refused(text: str) -> Non
 
 def test_a_placeholder_without_image_is_refused() -> None:
     with pytest.raises(PromptError):
-        encode_prompt(RenderedPrompt("Put the {a} away.", {}))
+        encoded(RenderedPrompt("Put the {a} away.", {}))
 
 
 def test_empty_text_has_no_ids() -> None:
     assert encode_text("") == []
-    assert encode_prompt(RenderedPrompt("", {})) == [END_ID]
+    assert encoded(RenderedPrompt("", {})) == [END_ID]

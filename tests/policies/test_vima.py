@@ -12,19 +12,20 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 from openvima.errors import CheckpointError, ConfigError, PolicyError, PromptError  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
-from openvima.policies.layers.decoder import Decoder, DecoderConfig  # noqa: E402
-from openvima.policies.vima.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.vima.config import VimaConfig  # noqa: E402
-from openvima.policies.vima.heads.base import from_unit_range, to_unit_range  # noqa: E402
-from openvima.policies.vima.heads.bins import BinsConfig, decode_bins, encode_bins  # noqa: E402
-from openvima.policies.vima.heads.pointing import carried_place, yaw_bin  # noqa: E402
-from openvima.policies.vima.model import Vima, build_model  # noqa: E402
-from openvima.policies.vima.policy import VimaPolicy  # noqa: E402
+from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa: E402
+from openvima.policies.heads.bins import BinsConfig, decode_bins, encode_bins  # noqa: E402
+from openvima.policies.heads.pointing import carried_place, yaw_bin  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.layers.trunk import Decoder, DecoderConfig  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from openvima.training.dataset import make_batch, read_examples  # noqa: E402
 
 
-def played(policy: VimaPolicy, demonstrations, *, num_steps: int = 2) -> list[list[dict]]:
+def played(policy: NetworkPolicy, demonstrations, *, num_steps: int = 2) -> list[list[dict]]:
     """Feed the observations of demonstrations, whatever the policy does, each to its own end."""
     policy.reset([demo.prompt for demo in demonstrations])
     actions: list[list[dict]] = [[] for _ in demonstrations]
@@ -38,7 +39,7 @@ def played(policy: VimaPolicy, demonstrations, *, num_steps: int = 2) -> list[li
 
 
 def test_nano_has_two_to_five_million_parameters():
-    count = sum(parameter.numel() for parameter in Vima(preset("nano")).parameters())
+    count = sum(parameter.numel() for parameter in PolicyNetwork(preset("nano")).parameters())
     assert 2e6 < count < 5e6
 
 
@@ -52,8 +53,8 @@ def test_actions_are_within_bounds_and_float32(demonstrations, name):
 
 @pytest.mark.parametrize("bins", [False, True])
 def test_a_batch_gives_the_same_actions_as_each_episode_alone(demonstrations, small_sizes, bins):
-    sizes = replace(small_sizes, pointing=None, bins=BinsConfig(32)) if bins else small_sizes
-    policy = VimaPolicy(build_model(sizes, seed=1))
+    sizes = replace(small_sizes, head=BinsConfig(32)) if bins else small_sizes
+    policy = NetworkPolicy(build_network(sizes, seed=1))
     together = played(policy, demonstrations)
     backwards = played(policy, demonstrations[::-1])[::-1]
     for row, demo in enumerate(demonstrations):
@@ -68,22 +69,22 @@ def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_s
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    first, second, other = (build_model(small_sizes, seed=seed) for seed in (0, 0, 1))
+    first, second, other = (build_network(small_sizes, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(torch.rand(3), expected)
     for name, weight in first.state_dict().items():
         assert torch.equal(weight, second.state_dict()[name])
-    assert not torch.equal(first.words.weight, other.words.weight)
+    assert not torch.equal(first.prompt.words.weight, other.prompt.words.weight)
 
 
 def test_gradients_reach_every_parameter(demonstrations, small_sizes):
-    model = build_model(small_sizes, seed=0).eval()  # without dropout
+    model = build_network(small_sizes, seed=0).eval()  # without dropout
     with torch.no_grad():
         for parameter in model.head.parameters():  # some start at zero, which would stop the gradient
             parameter.add_(0.01 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
-    examples = read_examples(demonstrations, fuse_views=True, validation_share=0, seed=0)
+    examples = read_examples(demonstrations, Reader.of(small_sizes.images), validation_share=0, seed=0)
     batch = make_batch(examples.training)
-    features = model.objects.encode_crops(examples.crops)
-    memory = model.encode_prompt(batch.prompts, features)
+    features = model.encode_images(examples.images)
+    memory = model.encode_prompts(batch.prompts, features)
     loss, _ = model.head.loss(
         model(memory, batch.history, features, batch.targets.actions_BTC), batch.targets
     )
@@ -100,7 +101,7 @@ def test_the_future_and_masked_places_change_nothing_before_them():
     mask[0, 3] = False
 
     def run(tokens, prompt):
-        return decoder(tokens, mask, prompt_BPD=prompt, prompt_mask_BP=prompt_mask)
+        return decoder.extend(decoder.begin(prompt, prompt_mask), tokens, mask)[0]
 
     expected = run(tokens, prompt)
     changed = tokens.clone()
@@ -118,7 +119,7 @@ def test_too_long_a_history_is_refused():
     tokens, prompt = torch.zeros(1, 513, 4), torch.zeros(1, 1, 4)
     mask = torch.ones(1, 513, dtype=torch.bool)
     with pytest.raises(PolicyError, match="513 tokens; this policy takes 512"):
-        decoder(tokens, mask, prompt_BPD=prompt, prompt_mask_BP=mask[:, :1])
+        decoder.extend(decoder.begin(prompt, mask[:, :1]), tokens, mask)
 
 
 def test_bins_follow_the_published_rule():
@@ -163,35 +164,33 @@ def test_acting_before_a_reset_is_an_error(demonstrations):
 def test_a_config_survives_its_file():
     for name in ("nano", "nano-bins"):
         text = yaml.safe_dump(preset(name).to_dict())
-        assert VimaConfig.from_dict(yaml.safe_load(text)) == preset(name)
+        assert PolicyConfig.from_dict(yaml.safe_load(text)) == preset(name)
 
 
 def test_sizes_that_do_not_fit_are_named():
     sizes = preset("nano")
-    with pytest.raises(ConfigError, match="exactly one action head"):
-        replace(sizes, bins=BinsConfig())
     with pytest.raises(ConfigError, match="make them equal"):
-        replace(sizes, decoder=replace(sizes.decoder, width=64))
-    with pytest.raises(ConfigError, match=r"policy\.decoder has unknown fields depth"):
-        VimaConfig.from_dict({**sizes.to_dict(), "decoder": {"depth": 3}})
+        replace(sizes, trunk=replace(sizes.trunk, width=64))
+    with pytest.raises(ConfigError, match=r"policy\.trunk has unknown fields depth"):
+        PolicyConfig.from_dict({**sizes.to_dict(), "trunk": {"depth": 3}})
 
 
 def test_a_checkpoint_gives_the_same_policy_back(demonstrations, small_sizes, tmp_path):
-    model = build_model(small_sizes, seed=7)
+    model = build_network(small_sizes, seed=7)
     save_checkpoint(model, tmp_path)
     loaded = load_policy(str(tmp_path))
     for mine, theirs in zip(
-        played(VimaPolicy(model), demonstrations), played(loaded, demonstrations), strict=True
+        played(NetworkPolicy(model), demonstrations), played(loaded, demonstrations), strict=True
     ):
         assert all(np.array_equal(a[key], b[key]) for a, b in zip(mine, theirs, strict=True) for key in a)
 
 
 def test_everything_wrong_with_a_checkpoint_is_told_at_once(small_sizes, tmp_path):
-    save_checkpoint(build_model(small_sizes, seed=0), tmp_path)
+    save_checkpoint(build_network(small_sizes, seed=0), tmp_path)
     weights = load_file(tmp_path / "model.safetensors")
     del weights["query"]
-    weights["words.weight"] = weights["words.weight"][:5].contiguous()
-    weights["prompt_objects.0.bias"] = weights["prompt_objects.0.bias"].half()
+    weights["prompt.words.weight"] = weights["prompt.words.weight"][:5].contiguous()
+    weights["prompt.images.0.bias"] = weights["prompt.images.0.bias"].half()
     weights["spare"] = torch.zeros(1)
     save_file(weights, tmp_path / "model.safetensors")
     with pytest.raises(CheckpointError) as error:
@@ -201,7 +200,7 @@ def test_everything_wrong_with_a_checkpoint_is_told_at_once(small_sizes, tmp_pat
 
 
 def test_a_truncated_checkpoint_is_named(small_sizes, tmp_path):
-    save_checkpoint(build_model(small_sizes, seed=0), tmp_path)
+    save_checkpoint(build_network(small_sizes, seed=0), tmp_path)
     file = tmp_path / "model.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     with pytest.raises(CheckpointError, match="is damaged"):

@@ -28,9 +28,9 @@ def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
         sizes = presets.nano()
         return replace(
             sizes,
-            objects=replace(sizes.objects, crop=ConvConfig(width=4, output_width=16), width=32),
-            text=replace(sizes.text, num_layers=1),
-            decoder=replace(sizes.decoder, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
+            images=replace(sizes.images, crop=ConvConfig(width=4, output_width=16), width=32),
+            prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
+            trunk=replace(sizes.trunk, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
         )
 
     monkeypatch.setitem(presets.PRESETS, "tiny", tiny)

@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.training.augment import augmented  # noqa: E402
 from openvima.training.dataset import (  # noqa: E402
     groups_of_equal_length,
@@ -20,7 +21,7 @@ from openvima.training.dataset import (  # noqa: E402
 
 @pytest.fixture(scope="module")
 def examples(data):
-    return read_examples(Dataset(data), fuse_views=True, validation_share=0.0, seed=0)
+    return read_examples(Dataset(data), Reader("objects"), validation_share=0.0, seed=0)
 
 
 def test_slots_point_at_the_objects_that_were_picked(data, examples):
@@ -32,18 +33,18 @@ def test_slots_point_at_the_objects_that_were_picked(data, examples):
 
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
-    split = read_examples(Dataset(data), fuse_views=True, validation_share=0.3, seed=0)
+    split = read_examples(Dataset(data), Reader("objects"), validation_share=0.3, seed=0)
     names = [{(e.task, e.seed) for e in part} for part in (split.training, split.validation)]
     assert names[0].isdisjoint(names[1])
     assert len(names[0] | names[1]) == 24
     assert 1 <= len(names[1]) <= 14
-    fewer = read_examples(list(Dataset(data))[:10], fuse_views=True, validation_share=0.3, seed=0)
+    fewer = read_examples(list(Dataset(data))[:10], Reader("objects"), validation_share=0.3, seed=0)
     assert {(e.task, e.seed) for e in fewer.validation} <= names[1]
 
 
 def test_no_demonstration_is_an_error():
     with pytest.raises(DatasetError, match="no demonstration to learn from"):
-        read_examples([], fuse_views=True, validation_share=0.1, seed=0)
+        read_examples([], Reader("objects"), validation_share=0.1, seed=0)
 
 
 def test_every_epoch_shows_each_example_once():

@@ -19,11 +19,11 @@ TRAIN = """
 import json, sys
 from pathlib import Path
 from openvima.policies import presets
-from openvima.policies.vima.config import VimaConfig
+from openvima.policies.config import PolicyConfig
 from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS["tiny"] = lambda: VimaConfig.from_dict(sizes)
+presets.PRESETS["tiny"] = lambda: PolicyConfig.from_dict(sizes)
 folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
 train(TrainingConfig(**folders, **settings), lambda done, total, note: print(note, flush=True))
 """

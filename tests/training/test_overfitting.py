@@ -8,8 +8,9 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.vima.model import build_model  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.dataset import read_examples  # noqa: E402
 from openvima.training.stages import Cloning  # noqa: E402
@@ -22,12 +23,12 @@ def test_32_demonstrations_are_learnt_by_heart(tmp_path):
     sizes = preset("nano")
     sizes = replace(
         sizes,
-        objects=replace(sizes.objects, crop=ConvConfig(8, 32), width=64, crop_dropout=0.0),
-        text=replace(sizes.text, num_layers=1),
-        decoder=replace(sizes.decoder, width=64, num_layers=1, dropout=0.0),
+        images=replace(sizes.images, crop=ConvConfig(8, 32), width=64, crop_dropout=0.0),
+        prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
+        trunk=replace(sizes.trunk, width=64, num_layers=1, dropout=0.0),
     )
-    examples = read_examples(Dataset(folder), fuse_views=True, validation_share=0.0, seed=0)
-    model = build_model(sizes, seed=0)
+    examples = read_examples(Dataset(folder), Reader.of(sizes.images), validation_share=0.0, seed=0)
+    model = build_network(sizes, seed=0)
     config = TrainingConfig(data=folder, out=tmp_path, batch=32, spurious_probability=0.0)
     stage = Cloning(model, config, replace(examples, validation=examples.training))
     optimizer = torch.optim.AdamW(stage.parameters, lr=2e-3)

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -36,8 +36,19 @@ class Policy(Protocol):
         """
         ...
 
+    @staticmethod
+    def from_pretrained(path_or_hub_id: str | Path, **options: Any) -> "Policy":  # Any: of several kinds
+        """Load a network's policy from a folder or the Hugging Face Hub; see `load_pretrained`.
 
-class RandomPolicy:
+        A helper for convenience, which a policy of your own need not have.
+        """
+        require_torch("loading a policy")
+        from openvima.policies.checkpoint import load_pretrained
+
+        return load_pretrained(path_or_hub_id, **options)
+
+
+class RandomPolicy(Policy):
     """Picks and places anywhere on the table, turned by any angle.
 
     Each episode draws from a generator of its own, which follows from the seed and the prompt alone.
@@ -50,7 +61,7 @@ class RandomPolicy:
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         """Begin a batch of episodes."""
         self._rngs = [
-            np.random.default_rng(np.random.SeedSequence([self.seed, _prompt_number(prompt)]))
+            np.random.default_rng(np.random.SeedSequence([self.seed, prompt_number(prompt)]))
             for prompt in prompts
         ]
 
@@ -88,22 +99,23 @@ def load_policy(name_or_run: str, *, seed: int = 0) -> Policy:
         return RandomPolicy(seed)
     if name_or_run == "untrained" or name_or_run in PRESETS:
         require_torch(f"policy {name_or_run!r}")
+        from openvima.policies.acting import NetworkPolicy
+        from openvima.policies.network import build_network
         from openvima.policies.presets import preset
-        from openvima.policies.vima.model import build_model
-        from openvima.policies.vima.policy import VimaPolicy
 
-        sizes = preset("nano" if name_or_run == "untrained" else name_or_run)
-        return VimaPolicy(build_model(sizes, seed=seed))
+        config = preset("nano" if name_or_run == "untrained" else name_or_run)
+        return NetworkPolicy(build_network(config, seed=seed))
     if not Path(name_or_run).is_dir():
         known = ("random", "untrained", *PRESETS)
         raise UnknownPolicyError(
-            unknown_name("policy", name_or_run, known, f"Give a run folder or one of {', '.join(known)}.")
+            unknown_name(
+                "policy", name_or_run, known, "Give a run folder or one that `openvima policies` lists."
+            )
         )
     require_torch(f"the policy in {name_or_run}")
-    from openvima.policies.vima.checkpoint import load_checkpoint
-    from openvima.policies.vima.policy import VimaPolicy
+    from openvima.policies.checkpoint import load_pretrained
 
-    return VimaPolicy(load_checkpoint(checkpoint_folder(Path(name_or_run))))
+    return load_pretrained(name_or_run)
 
 
 def checkpoint_folder(folder: Path) -> Path:
@@ -131,7 +143,7 @@ def require_torch(what: str) -> None:
             ) from error
 
 
-def _prompt_number(prompt: RenderedPrompt) -> int:
+def prompt_number(prompt: RenderedPrompt) -> int:
     """A number that follows from the content of a prompt."""
     digest = hashlib.blake2b(prompt.text.encode(), digest_size=8)
     for image in prompt.images.values():

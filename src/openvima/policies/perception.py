@@ -6,7 +6,8 @@ pixels around the object, and the resize is OpenCV's area interpolation bit for 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -71,6 +72,34 @@ class ObjectViews:
             self.grasps[rows, order],
         )
 
+    def padded(self, count: int) -> "ObjectViews":
+        """Return at least so many slots; the new ones are black, hidden and at the end."""
+        extra = max(0, count - len(self))
+
+        def longer(array: np.ndarray) -> np.ndarray:
+            return np.pad(array, [(0, 0), (0, extra)] + [(0, 0)] * (array.ndim - 2))
+
+        return ObjectViews(
+            np.pad(self.ids, (0, extra), constant_values=-1),
+            longer(self.crops),
+            longer(self.boxes),
+            longer(self.masks),
+            longer(self.grasps),
+        )
+
+    @staticmethod
+    def concatenated(images: Sequence["ObjectViews"]) -> "ObjectViews":
+        """Put the objects of several images into one record, image after image."""
+        if not images:
+            return see_nothing()
+        return ObjectViews(
+            np.concatenate([image.ids for image in images]),
+            np.concatenate([image.crops for image in images], axis=1),
+            np.concatenate([image.boxes for image in images], axis=1),
+            np.concatenate([image.masks for image in images], axis=1),
+            np.concatenate([image.grasps for image in images], axis=1),
+        )
+
     def visible(self) -> np.ndarray:
         """Whether each object shows in some view, shape (N,), bool."""
         return np.asarray(self.masks.any(axis=0))
@@ -92,6 +121,76 @@ class ObjectViews:
         return np.where(self.masks[TOP][:, None], top, front)
 
 
+class ObjectFinder(Protocol):
+    """Finds the objects in images: by their segmentation, or by a detector that knows pixels only."""
+
+    def in_observation(self, observation: Mapping) -> ObjectViews:
+        """Find the objects of an observation (`rgb`, `segm`, `ee`), from left to right."""
+        ...
+
+    def in_prompt_image(self, image: PromptImage) -> ObjectViews:
+        """Find the objects that a prompt's image shows."""
+        ...
+
+
+class GroundTruth:
+    """Finds the objects by the simulator's segmentation, as the published policies do."""
+
+    def in_observation(self, observation: Mapping) -> ObjectViews:
+        """Find the objects of an observation; see `observe`."""
+        return observe(observation)
+
+    def in_prompt_image(self, image: PromptImage) -> ObjectViews:
+        """Find the objects that a prompt's image shows; see `observe_prompt_image`."""
+        return observe_prompt_image(image)
+
+
+GROUND_TRUTH = GroundTruth()
+
+
+def see_nothing(count: int = 0) -> ObjectViews:
+    """Return so many hidden objects."""
+    views = len(VIEWS)
+    return ObjectViews(
+        np.full(count, -1, np.int64),
+        np.zeros((views, count, 3, CROP_SIZE, CROP_SIZE), np.uint8),
+        np.zeros((views, count, 4), np.int64),
+        np.zeros((views, count), np.bool_),
+        np.zeros((views, count, 2), np.int64),
+    )
+
+
+def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
+    """Take both frames as one object that fills them, for the policies that see no objects.
+
+    The frames are halved in both directions by averages over 2 × 2 pixels, rounded half up.
+
+    Args:
+        rgb: View name to image, shape (3, H, W), uint8; height and width even.
+
+    Returns:
+        One slot, its crops of shape (2, 1, 3, H / 2, W / 2).
+
+    Raises:
+        ShapeError: An image has another shape or dtype.
+    """
+    for view in VIEWS:
+        _check_rgb(view, rgb[view])
+    frames = np.stack([rgb[view] for view in VIEWS])[:, None]
+    height, width = frames.shape[-2:]
+    blocks = frames.reshape(*frames.shape[:-2], height // 2, 2, width // 2, 2)
+    sums = blocks.sum(axis=(-3, -1), dtype=np.uint16)
+    centre = np.array([(width - 1) // 2, (height - 1) // 2])
+    boxes = np.tile(np.array([*centre, height - 1, width - 1]), (len(VIEWS), 1, 1))
+    return ObjectViews(
+        np.full(1, -1),
+        ((sums + 2) >> 2).astype(np.uint8),
+        boxes,
+        np.ones((len(VIEWS), 1), np.bool_),
+        np.tile(centre, (len(VIEWS), 1, 1)),
+    )
+
+
 def see_objects(
     rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray], object_ids: Sequence[int] | np.ndarray
 ) -> ObjectViews:
@@ -109,14 +208,7 @@ def see_objects(
         ShapeError: An image has another shape or dtype.
     """
     ids = np.asarray(object_ids, dtype=np.int64)
-    count = len(ids)
-    views = ObjectViews(
-        ids,
-        np.zeros((len(VIEWS), count, 3, CROP_SIZE, CROP_SIZE), np.uint8),
-        np.zeros((len(VIEWS), count, 4), np.int64),
-        np.zeros((len(VIEWS), count), np.bool_),
-        np.zeros((len(VIEWS), count, 2), np.int64),
-    )
+    views = replace(see_nothing(len(ids)), ids=ids)
     for view, name in enumerate(VIEWS):
         _check_images(name, rgb[name], segm[name])
         _cut_view(rgb[name], segm[name], views, view)
@@ -189,7 +281,11 @@ def _cut_view(rgb: np.ndarray, segm: np.ndarray, views: ObjectViews, view: int) 
 
 
 def _check_images(view: str, rgb: np.ndarray, segm: np.ndarray) -> None:
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ShapeError(f"rgb {view!r} is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")
+    _check_rgb(view, rgb)
     if segm.dtype != np.uint8 or segm.shape != rgb.shape[1:]:
         raise ShapeError(f"segm {view!r} is {segm.dtype} {segm.shape}; it must be uint8 {rgb.shape[1:]}.")
+
+
+def _check_rgb(view: str, rgb: np.ndarray) -> None:
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
+        raise ShapeError(f"rgb {view!r} is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")

@@ -1,57 +1,78 @@
-"""Named network sizes. A preset is a function that returns a config; configs check themselves."""
+"""Named networks. A preset is a function that returns a config; configs check themselves."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from openvima.errors import UnknownPolicyError, unknown_name
 from openvima.policies.tokenizer import vocabulary_size
 
 if TYPE_CHECKING:
-    from openvima.policies.vima.config import VimaConfig
+    from openvima.policies.config import PolicyConfig
+
+FAMILIES = ("vima", "gato", "flamingo", "gpt")
+# Written out, so that listing the names needs no torch; a test compares them with `families.common.SIZES`.
+SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
 
-def nano() -> "VimaConfig":
+def nano() -> "PolicyConfig":
     """2.5 M parameters: small enough to train on two cores within minutes. It points."""
+    from openvima.policies.config import PolicyConfig
+    from openvima.policies.heads.pointing import PointingConfig
     from openvima.policies.layers.conv_encoder import ConvConfig
-    from openvima.policies.layers.decoder import DecoderConfig
     from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+    from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
     from openvima.policies.layers.text_encoder import TextEncoderConfig
-    from openvima.policies.vima.config import VimaConfig
-    from openvima.policies.vima.heads.pointing import PointingConfig
+    from openvima.policies.layers.trunk import DecoderConfig
 
     crop = ConvConfig(width=32, output_width=128)
-    return VimaConfig(
-        objects=ObjectEncoderConfig(
+    text = TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256)
+    return PolicyConfig(
+        images=ObjectEncoderConfig(
             crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
         ),
-        text=TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256),
-        decoder=DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4),
-        prompt_object_width=128,
+        prompt=PromptEncoderConfig(text, image_width=128, vocabulary_size=vocabulary_size()),
+        trunk=DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4),
+        head=PointingConfig(),
         action_width=64,
-        vocabulary_size=vocabulary_size(),
-        pointing=PointingConfig(),
         query_token=True,
     )
 
 
-def nano_bins() -> "VimaConfig":
+def nano_bins() -> "PolicyConfig":
     """As `nano`, with the table bins of the published policies instead of pointing."""
     from dataclasses import replace
 
-    from openvima.policies.vima.heads.bins import BinsConfig
+    from openvima.policies.heads.bins import BinsConfig
 
-    return replace(nano(), pointing=None, bins=BinsConfig(hidden_width=256))
-
-
-PRESETS: dict[str, Callable[[], "VimaConfig"]] = {"nano": nano, "nano-bins": nano_bins}
+    return replace(nano(), head=BinsConfig(hidden_width=256))
 
 
-def preset(name: str) -> "VimaConfig":
-    """Return the sizes of a named network.
+def _member(family: str, size_name: str) -> "PolicyConfig":
+    from openvima.policies.families.common import size
+    from openvima.policies.families.flamingo import flamingo
+    from openvima.policies.families.gato import gato
+    from openvima.policies.families.gpt import gpt
+    from openvima.policies.families.vima import vima
+
+    members = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+    return members[family](size(size_name))
+
+
+PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
+    "nano": nano,
+    "nano-bins": nano_bins,
+    **{f"{family}-{size}": partial(_member, family, size) for family in FAMILIES for size in SIZE_NAMES},
+}
+
+
+def preset(name: str) -> "PolicyConfig":
+    """Return the config of a named network, such as "nano" or "vima-200m".
 
     Raises:
         UnknownPolicyError: There is no preset of that name.
     """
     if name not in PRESETS:
-        raise UnknownPolicyError(unknown_name("preset", name, PRESETS))
+        hint = f"Allowed: nano, nano-bins, and {'|'.join(FAMILIES)}-{'|'.join(SIZE_NAMES)}."
+        raise UnknownPolicyError(unknown_name("preset", name, PRESETS, hint))
     return PRESETS[name]()

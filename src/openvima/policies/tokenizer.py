@@ -8,9 +8,9 @@ import difflib
 import re
 from functools import cache
 from importlib import resources
+from typing import Protocol
 
 from openvima.errors import PromptError
-from openvima.scene import PromptImage, RenderedPrompt
 
 PADDING_ID, END_ID = 0, 1
 LARGEST_NUMBER = 360
@@ -59,22 +59,30 @@ def encode_text(text: str) -> list[int]:
     return ids
 
 
-def encode_prompt(prompt: RenderedPrompt) -> list[int | PromptImage]:
-    """Turn a prompt into word ids and images in reading order, with the end mark last.
+class Tokenizer(Protocol):
+    """Splits the text of prompts into word ids."""
 
-    Args:
-        prompt: Text with placeholders, and an image for each of them.
+    @property
+    def end_id(self) -> int:
+        """Id that ends every prompt."""
+        ...
 
-    Returns:
-        Ids of words, and the image itself wherever a placeholder stood.
+    def encode(self, text: str) -> list[int]:
+        """Turn a piece of text without placeholders into ids, without the end mark."""
+        ...
 
-    Raises:
-        PromptError: A word is not in the vocabulary, or placeholders and images do not match.
-    """
-    sequence: list[int | PromptImage] = []
-    for part in prompt.sequence():
-        sequence += encode_text(part) if isinstance(part, str) else [part]
-    return [*sequence, END_ID]
+
+class ClosedTokenizer:
+    """The benchmark's closed vocabulary: a few hundred ids, nothing to download. See `encode_text`."""
+
+    end_id = END_ID
+
+    def encode(self, text: str) -> list[int]:
+        """Turn a piece of text without placeholders into ids, without the end mark."""
+        return encode_text(text)
+
+
+CLOSED_TOKENIZER = ClosedTokenizer()
 
 
 def _number_id(digits: str) -> int | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from openvima.policies.vima.inputs import HistoryBatch
+from openvima.policies.inputs import HistoryBatch
 from openvima.training.dataset import Batch
 
 NUM_VIEWS = 2
@@ -52,6 +52,7 @@ def _with_spurious(batch: Batch, probability: float, generator: torch.Generator)
         crops_BTVN=torch.cat([history.crops_BTVN, crops_BTVN], dim=3),
         boxes_BTVN4=torch.cat([history.boxes_BTVN4, boxes_BTVN4], dim=3),
         masks_BTVN=torch.cat([history.masks_BTVN, visible_BTVN], dim=3),
+        counts_BT=history.counts_BT + NUM_VIEWS,
         positions_BTN2=torch.cat([history.positions_BTN2, points_BTN2], dim=2),
         grasps_BTN2=torch.cat([history.grasps_BTN2, points_BTN2], dim=2),
     )

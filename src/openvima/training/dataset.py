@@ -12,19 +12,18 @@ import torch
 
 from openvima.data.records import Demonstration
 from openvima.errors import DatasetError
-from openvima.policies.perception import crop_box
-from openvima.policies.vima.heads.base import ACTION_PARTS, ACTION_WIDTH, ActionTargets
-from openvima.policies.vima.inputs import (
-    CropStack,
+from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, ActionTargets
+from openvima.policies.inputs import (
     HistoryBatch,
+    ImageStack,
     PromptBatch,
     PromptInput,
+    Reader,
     StepInput,
     batch_histories,
     batch_prompts,
-    read_prompt,
-    read_step,
 )
+from openvima.policies.perception import crop_box
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import Action
 from openvima.training.schedule import step_seed
@@ -98,16 +97,16 @@ class Examples:
     Args:
         training: Those to learn from.
         validation: Those that choose the best checkpoint.
-        crops: All crops, shape (K, 3, 32, 32), uint8.
+        images: All crops or frames, shape (K, 3, height, width), uint8.
     """
 
     training: tuple[Example, ...]
     validation: tuple[Example, ...]
-    crops: torch.Tensor
+    images: torch.Tensor
 
 
 def read_examples(
-    demonstrations: Iterable[Demonstration], *, fuse_views: bool, validation_share: float, seed: int
+    demonstrations: Iterable[Demonstration], reader: Reader, *, validation_share: float, seed: int
 ) -> Examples:
     """Turn demonstrations into examples.
 
@@ -115,7 +114,7 @@ def read_examples(
 
     Args:
         demonstrations: The demonstrations.
-        fuse_views: Whether the policy has one token for both views of an object.
+        reader: How the network sees prompts and observations.
         validation_share: Share of the demonstrations to keep for validation.
         seed: Seed of the run; false detections are drawn with it.
 
@@ -123,11 +122,11 @@ def read_examples(
         DatasetError: There is none to learn from.
         PromptError: A prompt has a word that the vocabulary lacks.
     """
-    stack = CropStack()
+    stack = ImageStack(reader.image_size)
     rng = np.random.default_rng(step_seed(seed, "spurious", 0))
     parts: tuple[list[Example], list[Example]] = ([], [])
     for demonstration in demonstrations:
-        example = _read_example(demonstration, stack, rng, fuse_views=fuse_views)
+        example = _read_example(demonstration, reader, stack, rng)
         parts[_is_held_out(example, validation_share)].append(example)
     if not parts[0]:
         raise DatasetError(
@@ -176,11 +175,11 @@ def groups_of_equal_length(examples: Sequence[Example]) -> list[list[Example]]:
 
 
 def _read_example(
-    demo: Demonstration, stack: CropStack, rng: np.random.Generator, *, fuse_views: bool
+    demo: Demonstration, reader: Reader, stack: ImageStack, rng: np.random.Generator
 ) -> Example:
-    prompt = read_prompt(demo.prompt, fuse_views=fuse_views)
+    prompt, episode = reader.read_prompt(demo.prompt), reader.begin_episode()
     observations = [demo.observation(t) for t in range(demo.num_steps)]
-    steps = tuple(read_step(observation, fuse_views=fuse_views) for observation in observations)
+    steps = tuple(episode.read_step(observation) for observation in observations)
     return Example(
         task=demo.task,
         seed=demo.seed,
@@ -191,12 +190,14 @@ def _read_example(
         actions=np.array([_action_vector(action) for action in demo.actions]),
         pick_slots=_slots(demo.pick_ids, steps),
         place_slots=_slots(demo.place_ids, steps),
-        spurious=_draw_spurious(observations, steps, stack, rng),
+        spurious=_draw_spurious(observations, steps, stack, rng)
+        if reader.layout == "objects"
+        else _none(steps),
     )
 
 
 def _draw_spurious(
-    observations: Sequence[dict], steps: Sequence[StepInput], stack: CropStack, rng: np.random.Generator
+    observations: Sequence[dict], steps: Sequence[StepInput], stack: ImageStack, rng: np.random.Generator
 ) -> Spurious:
     """Cut a rectangle of the size of a real box out of a random place of every image."""
     crops = np.zeros((len(steps), len(VIEWS)), np.int64)
@@ -212,6 +213,11 @@ def _draw_spurious(
             crops[t, v] = stack.add(crop)
             points[t, v] = unproject(boxes[t, v, :2], CAMERAS[view])
     return Spurious(crops, boxes, points)
+
+
+def _none(steps: Sequence[StepInput]) -> Spurious:
+    shape = (len(steps), len(VIEWS))
+    return Spurious(np.zeros(shape, np.int64), np.zeros((*shape, 4), np.int64), np.zeros((*shape, 2)))
 
 
 def _batch_spurious(examples: Sequence[Example], num_steps: int) -> Spurious:

@@ -14,8 +14,10 @@ from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError
+from openvima.policies.inputs import Reader
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.presets import preset
-from openvima.policies.vima.model import Vima, build_model
 from openvima.training.config import TrainingConfig
 from openvima.training.dataset import read_examples
 from openvima.training.pretrain import render_pairs
@@ -49,7 +51,9 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
         CheckpointError: The last checkpoint is damaged.
     """
     sizes = preset(config.preset)
-    if config.pretraining_steps and not sizes.objects.appearance_width:
+    images = sizes.images
+    has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
+    if config.pretraining_steps and not has_appearance:
         raise ConfigError(
             f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0."
         )
@@ -57,7 +61,7 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
     dataset = Dataset(config.data)
     run = RunFolder(config.out, _settings(config, dataset), force=config.force)
     with _threads(config.threads):
-        model = build_model(sizes, seed=step_seed(config.seed, "weights", 0))
+        model = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
         _Trainer(config, dataset, model, run, report or _ignore).train()
     return run.path
 
@@ -66,7 +70,7 @@ class _Trainer:
     """One run in progress."""
 
     def __init__(
-        self, config: TrainingConfig, dataset: Dataset, model: Vima, run: RunFolder, report: Report
+        self, config: TrainingConfig, dataset: Dataset, model: PolicyNetwork, run: RunFolder, report: Report
     ) -> None:
         self.config, self.dataset, self.model, self.run, self.report = config, dataset, model, run, report
         self.started = time.monotonic()
@@ -157,7 +161,7 @@ class _Trainer:
         self._report(f"reading {len(self.dataset)} demonstrations")
         examples = read_examples(
             self.dataset,
-            fuse_views=self.model.config.objects.fuse_views,
+            Reader.of(self.model.config.images),
             validation_share=self.config.validation_share,
             seed=self.config.seed,
         )
@@ -168,7 +172,7 @@ class _Trainer:
         self.report(before + self.progress.step, self.num_steps, note)
 
 
-def _optimizer(model: Vima, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
+def _optimizer(model: PolicyNetwork, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
     """AdamW; vectors (biases, norms) and tables do not decay."""
     tables = {id(m.weight) for m in model.modules() if isinstance(m, torch.nn.Embedding)}
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]

@@ -135,7 +135,7 @@ def embed_looks(
     """Embed K objects; crops (K, 2, 3, 32, 32), masks (K, 2), optional mixing of colours (3, 3)."""
     if mixing is not None:
         crops = torch.einsum("cd,kvdyx->kvcyx", mixing, crops.to(mixing.dtype))
-    features = encoder.encode_crops(crops)
+    features = encoder.encode_images(crops)
     return encoder.embed_appearance(features.transpose(0, 1), masks.T)
 
 

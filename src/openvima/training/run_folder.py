@@ -23,8 +23,8 @@ from safetensors.torch import load_file, save_file
 from openvima.errors import CheckpointError, ConfigError
 from openvima.files import write_whole
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
-from openvima.policies.vima.checkpoint import WEIGHTS_FILE, load_weights, save_checkpoint
-from openvima.policies.vima.model import Vima
+from openvima.policies.checkpoint import WEIGHTS_FILE, load_weights, save_checkpoint
+from openvima.policies.network import PolicyNetwork
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -84,7 +84,9 @@ class RunFolder:
         found = sorted(path for path in self.checkpoints.iterdir() if path.is_dir())
         return found[-1] if found else None
 
-    def save(self, name: str, model: Vima, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
+    def save(
+        self, name: str, model: PolicyNetwork, optimizer: torch.optim.Optimizer, progress: Progress
+    ) -> None:
         """Write a checkpoint and delete those that are neither the latest nor the best."""
         partial = self.checkpoints / f"{name}{_PARTIAL}"
         shutil.rmtree(partial, ignore_errors=True)
@@ -102,7 +104,7 @@ class RunFolder:
             if other.is_dir() and other.name not in (name, progress.best_checkpoint):
                 shutil.rmtree(other)
 
-    def resume(self, model: Vima) -> Progress:
+    def resume(self, model: PolicyNetwork) -> Progress:
         """Load the weights of the last checkpoint, if there is one, and forget what was logged after it.
 
         Returns:

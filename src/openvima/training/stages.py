@@ -6,8 +6,9 @@ from typing import Protocol
 
 import torch
 
-from openvima.policies.vima.heads.base import HeadInputs
-from openvima.policies.vima.model import Vima
+from openvima.policies.heads.base import HeadInputs
+from openvima.policies.layers.object_encoder import ObjectEncoder
+from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
 from openvima.training.config import TrainingConfig
 from openvima.training.dataset import (
@@ -52,11 +53,12 @@ class Matching:
 
     name = "1-matching"
 
-    def __init__(self, model: Vima, config: TrainingConfig, pairs: Pairs) -> None:
+    def __init__(self, model: PolicyNetwork, config: TrainingConfig, pairs: Pairs) -> None:
         self.num_steps = config.pretraining_steps
         self.learning_rate = config.pretraining_learning_rate
-        self.encoder = model.objects
-        self.parameters = [*model.objects.crop_encoder.parameters(), *model.objects.appearance.parameters()]
+        assert isinstance(model.images, ObjectEncoder)  # the loop has seen to it
+        self.encoder = model.images
+        self.parameters = _crop_parameters(model)
         held_out = pairs.scenes >= int(pairs.scenes.max()) * 0.95
         self._training = pairs.select(torch.nonzero(~held_out)[:, 0])
         self._validation = pairs.select(torch.nonzero(held_out)[:, 0])
@@ -88,17 +90,18 @@ class Cloning:
 
     name = "2-cloning"
 
-    def __init__(self, model: Vima, config: TrainingConfig, examples: Examples) -> None:
+    def __init__(self, model: PolicyNetwork, config: TrainingConfig, examples: Examples) -> None:
         self.num_steps = config.steps
         self.learning_rate = config.learning_rate
         self.model = model
         self._config = config
         self._examples = examples
         self._features: torch.Tensor | None = None
-        frozen = set() if config.tune_crops else set(_crop_parameters(model))
-        self.parameters = [p for p in model.parameters() if p not in frozen]
-        if not config.tune_crops:
-            self._features = encode_in_chunks(model, examples.crops)
+        tunes = config.tune_crops or not config.pretraining_steps  # a fresh encoder must be trained here
+        frozen = set() if tunes else set(_crop_parameters(model))
+        self.parameters = [p for p in model.parameters() if p.requires_grad and p not in frozen]
+        if not tunes:
+            self._features = encode_in_chunks(model, examples.images)
 
     def backward(self, step: int) -> Metrics:
         """Take the step's demonstrations, in groups of like length, and add their gradients."""
@@ -110,7 +113,9 @@ class Cloning:
         total = sum(len(example.steps) for example in chosen)
         sums: Metrics = {}
         for group in groups_of_equal_length(chosen):
-            batch = augmented(make_batch(group), probability=config.spurious_probability, generator=generator)
+            batch = make_batch(group)
+            if _shuffles_objects(self.model):
+                batch = augmented(batch, probability=config.spurious_probability, generator=generator)
             share = sum(len(example.steps) for example in group) / total
             loss, metrics = self._loss(batch)
             (loss * share).backward()
@@ -139,7 +144,7 @@ class Cloning:
         return self.model.head.loss(self._inputs(batch, features), batch.targets)
 
     def _inputs(self, batch: Batch, features: torch.Tensor) -> HeadInputs:
-        memory = self.model.encode_prompt(batch.prompts, features)
+        memory = self.model.encode_prompts(batch.prompts, features)
         return self.model(memory, batch.history, features, batch.targets.actions_BTC)
 
     def _encoded(self, batch: Batch) -> tuple[torch.Tensor, Batch]:
@@ -150,16 +155,25 @@ class Cloning:
         prompt_places, history_places = places.split([prompts.crops_VS.numel(), history.crops_BTVN.numel()])
         prompts = replace(prompts, crops_VS=prompt_places.view_as(prompts.crops_VS))
         history = replace(history, crops_BTVN=history_places.view_as(history.crops_BTVN))
-        features = self.model.objects.encode_crops(self._examples.crops[used])
+        features = self.model.encode_images(self._examples.images[used])
         return features, replace(batch, prompts=prompts, history=history)
 
 
 @torch.no_grad()
-def encode_in_chunks(model: Vima, crops: torch.Tensor, *, chunk: int = 1024) -> torch.Tensor:
-    """Encode many crops without gradients, shape (K, F)."""
-    return torch.cat([model.objects.encode_crops(part) for part in crops.split(chunk)])
+def encode_in_chunks(model: PolicyNetwork, images: torch.Tensor, *, chunk: int = 1024) -> torch.Tensor:
+    """Encode many images without gradients, shape (K, F)."""
+    return torch.cat([model.encode_images(part) for part in images.split(chunk)])
 
 
-def _crop_parameters(model: Vima) -> list[torch.nn.Parameter]:
-    """What the first stage trained, and cloning leaves alone."""
-    return [*model.objects.crop_encoder.parameters(), *model.objects.appearance.parameters()]
+def _crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
+    """What the first stage trains, and cloning leaves alone."""
+    images = model.images
+    if not isinstance(images, ObjectEncoder):
+        return list(images.frame_encoder.parameters())
+    appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
+    return [*images.crop_encoder.parameters(), *appearance]
+
+
+def _shuffles_objects(model: PolicyNetwork) -> bool:
+    """Whether slots have no order, so that they may be shuffled with false detections among them."""
+    return isinstance(model.images, ObjectEncoder) and model.images.config.fuse_views

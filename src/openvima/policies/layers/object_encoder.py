@@ -45,6 +45,11 @@ class ObjectEncoderConfig:
     appearance_width: int = 0
     crop_dropout: float = 0.0
 
+    @property
+    def token_width(self) -> int:
+        """Width of what `forward` gives."""
+        return self.width
+
     def __post_init__(self) -> None:
         if self.appearance_width and not self.fuse_views:
             raise ConfigError(
@@ -55,7 +60,7 @@ class ObjectEncoderConfig:
 
 
 class ObjectEncoder(nn.Module):
-    """Crops -> features (`encode_crops`), then features and boxes -> tokens (`forward`).
+    """Crops -> features (`encode_images`), then features and boxes -> tokens (`forward`).
 
     Three objects, views apart: [front 1, front 2, front 3, top 1, top 2, top 3]; fused: [1, 2, 3].
     The two parts are apart so that the features of crops that never change can be computed once.
@@ -77,7 +82,7 @@ class ObjectEncoder(nn.Module):
         if config.appearance_width:
             self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
 
-    def encode_crops(self, crops: torch.Tensor) -> torch.Tensor:
+    def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
         return self.crop_encoder(crops.flatten(0, -4)).unflatten(0, crops.shape[:-3])
 

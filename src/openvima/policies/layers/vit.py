@@ -1,6 +1,7 @@
-"""The vision transformer that turns a 32 × 32 crop into one feature vector.
+"""The vision transformer that turns a crop, or a whole frame, into features.
 
-Shape suffixes: N crops, C channels, P patches plus the class token, H heads, W width, K width of one head.
+Shape suffixes: N images, C channels, P patches (after the class token, if there is one), H heads, W width, K
+width of one head.
 """
 
 from dataclasses import dataclass
@@ -18,15 +19,17 @@ PIXEL_STD = (0.3011, 0.2961, 0.2956)
 
 @dataclass(frozen=True, slots=True)
 class VitConfig:
-    """Sizes of the crop encoder.
+    """Sizes of the transformer.
 
     Args:
         width: Width of its tokens.
         num_layers: Residual blocks.
         num_heads: Attention heads in each.
-        output_width: Length of the feature vector.
+        output_width: Length of a feature vector.
         patch_size: Side of a patch in pixels.
-        crop_size: Side of the crop in pixels.
+        image_height: Height of an image in pixels.
+        image_width: Width of an image in pixels.
+        class_token: Whether a class token sums up the image in one vector; else each patch gives one.
     """
 
     width: int
@@ -34,19 +37,29 @@ class VitConfig:
     num_heads: int
     output_width: int
     patch_size: int = 16
-    crop_size: int = 32
+    image_height: int = 32
+    image_width: int = 32
+    class_token: bool = True
 
     def __post_init__(self) -> None:
         if self.width % self.num_heads:
             raise ConfigError(
-                f"crop encoder: width {self.width} must be a multiple of {self.num_heads} heads."
+                f"image encoder: width {self.width} must be a multiple of {self.num_heads} heads."
             )
-        if self.crop_size % self.patch_size:
-            raise ConfigError(f"crop encoder: {self.patch_size} px patches do not tile {self.crop_size} px.")
+        height, width = self.image_height, self.image_width
+        if height % self.patch_size or width % self.patch_size:
+            raise ConfigError(
+                f"image encoder: {self.patch_size} px patches do not tile {height} × {width} px."
+            )
+
+    @property
+    def num_patches(self) -> int:
+        """How many patches tile an image."""
+        return (self.image_height // self.patch_size) * (self.image_width // self.patch_size)
 
 
 class VisionTransformer(nn.Module):
-    """Class token and patches of one crop -> pre-norm blocks -> features of the class token.
+    """Class token, if any, and patches of one image -> pre-norm blocks -> features.
 
     For a 32 × 32 crop in patches of 16: [class, upper left, upper right, lower left, lower right].
     """
@@ -57,34 +70,35 @@ class VisionTransformer(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         width, scale = config.width, config.width**-0.5
-        num_patches = (config.crop_size // config.patch_size) ** 2
         self.register_buffer("pixel_mean", torch.tensor(PIXEL_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("pixel_std", torch.tensor(PIXEL_STD).view(3, 1, 1), persistent=False)
         self.patches = nn.Conv2d(3, width, config.patch_size, stride=config.patch_size, bias=False)
-        self.class_token = nn.Parameter(torch.randn(width) * scale)
-        self.positions = nn.Parameter(torch.randn(num_patches + 1, width) * scale)
+        self.class_token = nn.Parameter(torch.randn(width) * scale) if config.class_token else None
+        self.positions = nn.Parameter(torch.randn(config.num_patches + config.class_token, width) * scale)
         self.norm_before = nn.LayerNorm(width)
         self.blocks = nn.ModuleList(VitBlock(width, config.num_heads) for _ in range(config.num_layers))
         self.norm_after = nn.LayerNorm(width)
         self.projection = nn.Linear(width, config.output_width, bias=False)
         nn.init.normal_(self.projection.weight, std=scale)
 
-    def forward(self, crops_NCYX: torch.Tensor) -> torch.Tensor:
-        """Encode crops.
+    def forward(self, images_NCYX: torch.Tensor) -> torch.Tensor:
+        """Encode images.
 
         Args:
-            crops_NCYX: Shape (N, 3, 32, 32), uint8, or floating-point in the same range of 0 to 255.
+            images_NCYX: Shape (N, 3, height, width), uint8, or floating-point in the same range of 0 to 255.
 
         Returns:
-            Shape (N, output_width), in the precision of the weights.
+            Shape (N, output_width), or (N, P, output_width) without a class token, in the precision of the
+            weights.
         """
-        pixels = crops_NCYX.to(self.positions.dtype) / 255
-        patches_NPW = self.patches((pixels - self.pixel_mean) / self.pixel_std).flatten(2).transpose(1, 2)
-        class_N1W = self.class_token.expand(len(patches_NPW), 1, -1)
-        x_NPW = self.norm_before(torch.cat([class_N1W, patches_NPW], dim=1) + self.positions)
+        pixels = images_NCYX.to(self.positions.dtype) / 255
+        x_NPW = self.patches((pixels - self.pixel_mean) / self.pixel_std).flatten(2).transpose(1, 2)
+        if self.class_token is not None:
+            x_NPW = torch.cat([self.class_token.expand(len(x_NPW), 1, -1), x_NPW], dim=1)
+        x_NPW = self.norm_before(x_NPW + self.positions)
         for block in self.blocks:
             x_NPW = block(x_NPW)
-        return self.projection(self.norm_after(x_NPW[:, 0]))
+        return self.projection(self.norm_after(x_NPW if self.class_token is None else x_NPW[:, 0]))
 
 
 class VitBlock(nn.Module):

@@ -11,15 +11,17 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError
-from openvima.policies.layers.mlp import mlp
-from openvima.policies.vima.heads.base import (
+from openvima.policies.heads.base import (
     ActionHead,
     ActionTargets,
+    Choose,
     HeadInputs,
     from_unit_range,
+    likeliest,
     masked_mean,
     to_unit_range,
 )
+from openvima.policies.layers.mlp import mlp
 
 _OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
 _RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
@@ -103,12 +105,12 @@ class PointingHead(ActionHead):
             }
         return torch.stack(list(losses.values())).sum(), metrics
 
-    def decide(self, inputs: HeadInputs) -> torch.Tensor:
+    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
         """Point, then place: at the grasp point of the picked object, and by the offset from the other."""
-        pick = self.pick(inputs).argmax(-1)
-        place = self.place_scores(inputs, pick).argmax(-1)
+        pick = choose(self.pick(inputs))
+        place = choose(self.place_scores(inputs, pick))
         offset, yaw_scores = self.relate(inputs, pick, place)
-        turn = yaw_scores.argmax(-1).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
+        turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
         zero, one = torch.zeros_like(turn), torch.ones_like(turn)
         pose0 = [at(inputs.grasps_BTN2, pick), torch.stack([zero, zero, zero, one], dim=-1)]
         pose1 = [at(inputs.positions_BTN2, place) + offset]

@@ -10,16 +10,18 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.layers.mlp import mlp, scale_last
-from openvima.policies.vima.heads.base import (
+from openvima.policies.heads.base import (
     ACTION_PARTS,
     ActionHead,
     ActionTargets,
+    Choose,
     HeadInputs,
     from_unit_range,
+    likeliest,
     masked_mean,
     to_unit_range,
 )
+from openvima.policies.layers.mlp import mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
 
@@ -67,9 +69,9 @@ class BinsHead(ActionHead):
         accuracy = masked_mean(all_hit, targets.steps_BT)
         return masked_mean(torch.stack(parts).sum(0), targets.steps_BT), {"accuracy": accuracy}
 
-    def decide(self, inputs: HeadInputs) -> torch.Tensor:
-        """Take the likeliest bin of each component, the lowest one among equals."""
-        bins = torch.stack([scores.argmax(-1) for scores in self.logits(inputs.query_BTD)], dim=-1)
+    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
+        """Choose a bin for each component, independently of the others."""
+        bins = torch.stack([choose(scores) for scores in self.logits(inputs.query_BTD)], dim=-1)
         return from_unit_range(decode_bins(bins, inputs.query_BTD.dtype))
 
     def as_history(self, unit_actions: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Sizes of a VIMA policy, as a frozen record that checks itself and travels beside the weights."""
+"""Sizes of a policy network, as a frozen record that checks itself and travels beside the weights."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
@@ -6,63 +6,62 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_type_hints
 
 from openvima.errors import ConfigError
-from openvima.policies.layers.decoder import DecoderConfig
+from openvima.policies.heads.bins import BinsConfig
+from openvima.policies.heads.pointing import PointingConfig
+from openvima.policies.layers.frame_encoder import FrameEncoderConfig
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.text_encoder import TextEncoderConfig
-from openvima.policies.vima.heads.bins import BinsConfig
-from openvima.policies.vima.heads.pointing import PointingConfig
+from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
+from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig
 
 
 @dataclass(frozen=True, slots=True)
-class VimaConfig:
-    """All sizes of the network.
+class PolicyConfig:
+    """All sizes of a network. The members of the family differ in `images` and `trunk`.
 
     Args:
-        objects: Object encoder; its token width is the decoder's.
-        text: Prompt encoder.
-        decoder: Decoder.
-        prompt_object_width: Hidden width of the stack that takes object tokens into the prompt.
+        images: How images become tokens: object by object, or as whole frames.
+        prompt: Prompt encoder.
+        trunk: How the history is read in the light of the prompt.
+        head: How actions are given: as table bins, or by pointing.
         action_width: Width of the features of each part of a past action.
-        vocabulary_size: Number of word ids.
-        pointing: Pointing head, or None.
-        bins: Bins head, or None. Exactly one head is given.
-        query_token: Append a learned token to each step's objects and act from there; without it the policy
-            acts from its last object, as the published ones do.
+        query_token: Append a learned token to each step's images and act from there; without it the policy
+            acts from its last image token, as the published ones do.
     """
 
-    objects: ObjectEncoderConfig
-    text: TextEncoderConfig
-    decoder: DecoderConfig
-    prompt_object_width: int
+    images: ObjectEncoderConfig | FrameEncoderConfig
+    prompt: PromptEncoderConfig
+    trunk: DecoderConfig | PrefixConfig
+    head: BinsConfig | PointingConfig
     action_width: int
-    vocabulary_size: int
-    pointing: PointingConfig | None = None
-    bins: BinsConfig | None = None
     query_token: bool = False
 
     def __post_init__(self) -> None:
-        if (self.pointing is None) == (self.bins is None):
-            raise ConfigError("policy: give exactly one action head, either pointing or bins.")
-        if self.objects.width != self.decoder.width:
+        if self.images.width != self.trunk.width:
             raise ConfigError(
-                f"policy: object tokens are {self.objects.width} wide, the decoder {self.decoder.width}; "
+                f"policy: image tokens are {self.images.width} wide, the trunk {self.trunk.width}; "
                 "make them equal."
             )
-        if self.pointing and not (self.objects.fuse_views and self.objects.appearance_width):
-            raise ConfigError("policy: the pointing head needs fuse_views and an appearance width above 0.")
+        if isinstance(self.head, PointingConfig):
+            images = self.images
+            points = isinstance(images, ObjectEncoderConfig) and images.fuse_views and images.appearance_width
+            if not (points and self.query_token):
+                raise ConfigError(
+                    "policy: the pointing head needs objects with fuse_views, an appearance width above 0 "
+                    "and a query token."
+                )
 
     def to_dict(self) -> dict[str, Any]:  # Any: plain YAML values
         """Return nested dictionaries of plain values, for files."""
         return asdict(self)
 
     @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> "VimaConfig":
+    def from_dict(values: Mapping[str, Any]) -> "PolicyConfig":
         """Build a config from what `to_dict` returned.
 
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
         """
-        return _build(VimaConfig, values, "policy")
+        return _build(PolicyConfig, values, "policy")
 
 
 def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of several kinds
@@ -82,7 +81,7 @@ def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of s
 
 def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written in the dataclass
     if isinstance(hint, UnionType):
-        if value is None:
+        if value is None and NoneType in get_args(hint):
             return None
         options = [option for option in get_args(hint) if option is not NoneType]
         hint = max(options, key=lambda option: _num_shared_fields(option, value))

@@ -3,21 +3,31 @@
 Shape suffixes: B batch, T steps, N objects in view, M objects in the prompt, D width, A width of appearance.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+from openvima.policies.layers.action_encoder import ACTION_PARTS, ACTION_WIDTH
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
-# Positions and quaternions of both poses in one vector, in this order, as everywhere in the policies.
-ACTION_PARTS = {
-    "pose0_position": slice(0, 2),
-    "pose0_rotation": slice(2, 6),
-    "pose1_position": slice(6, 8),
-    "pose1_rotation": slice(8, 12),
-}
-ACTION_WIDTH = 12
+__all__ = [
+    "ACTION_PARTS",
+    "ACTION_WIDTH",
+    "ActionHead",
+    "ActionTargets",
+    "Choose",
+    "HeadInputs",
+    "from_unit_range",
+    "likeliest",
+    "masked_mean",
+    "to_unit_range",
+]
+
+# Scores (B, ..., classes) to indices (B, ...): how a head chooses between its classes.
+Choose = Callable[[torch.Tensor], torch.Tensor]
+
 _LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
 _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
 
@@ -68,6 +78,11 @@ class ActionTargets:
     steps_BT: torch.Tensor
 
 
+def likeliest(scores: torch.Tensor) -> torch.Tensor:
+    """Choose the class of the highest score, the lowest one among equals."""
+    return scores.argmax(-1)
+
+
 class ActionHead(nn.Module):
     """Base of the heads: a loss for training, a decision for acting."""
 
@@ -77,8 +92,8 @@ class ActionHead(nn.Module):
         """Return the mean loss over existing steps, and metrics by name."""
         raise NotImplementedError
 
-    def decide(self, inputs: HeadInputs) -> torch.Tensor:
-        """Return the best action of every step, shape (B, T, 12), metres and quaternions, within bounds."""
+    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
+        """Return an action for every step, shape (B, T, 12), metres and quaternions, within bounds."""
         raise NotImplementedError
 
     def as_history(self, unit_actions: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """Checkpoints: weights in `model.safetensors`, sizes in `config.yaml` beside them."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -9,16 +10,18 @@ from safetensors.torch import load_file, save_file
 
 from openvima import __version__
 from openvima.errors import CheckpointError, ConfigError
-from openvima.policies.vima.config import VimaConfig
-from openvima.policies.vima.model import Vima, build_model
+from openvima.policies.acting import NetworkPolicy
+from openvima.policies.base import checkpoint_folder
+from openvima.policies.config import PolicyConfig
+from openvima.policies.network import PolicyNetwork, build_network
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.yaml"
-_KIND = "vima"
+_KIND = "network"
 _SHOWN = 5  # names of each kind of problem that a message lists
 
 
-def save_checkpoint(model: Vima, folder: Path) -> None:
+def save_checkpoint(model: PolicyNetwork, folder: Path) -> None:
     """Write weights and sizes into an existing folder."""
     tensors = {name: tensor.detach().contiguous().cpu() for name, tensor in model.state_dict().items()}
     save_file(tensors, folder / WEIGHTS_FILE)
@@ -28,7 +31,7 @@ def save_checkpoint(model: Vima, folder: Path) -> None:
     (folder / CONFIG_FILE).write_text(text, encoding="utf-8")
 
 
-def load_checkpoint(folder: Path) -> Vima:
+def load_checkpoint(folder: Path) -> PolicyNetwork:
     """Read a network from a checkpoint folder.
 
     Args:
@@ -42,12 +45,32 @@ def load_checkpoint(folder: Path) -> Vima:
     """
     config = _read_config(folder / CONFIG_FILE)
     tensors = _read_weights(folder / WEIGHTS_FILE)
-    model = build_model(config, seed=0)
+    model = build_network(config, seed=0)
     load_weights(model, tensors, source=str(folder / WEIGHTS_FILE))
     return model.eval()
 
 
-def load_weights(model: Vima, tensors: dict[str, torch.Tensor], *, source: str) -> None:
+def load_pretrained(path_or_hub_id: str | Path, **options: Any) -> NetworkPolicy:  # Any: of several kinds
+    """Load a policy.
+
+    Args:
+        path_or_hub_id: A folder that `save_pretrained` or `openvima train` wrote (of a run the best
+            checkpoint is taken), or an id on the Hugging Face Hub such as "name/policy".
+        **options: Of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
+
+    Raises:
+        CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
+    """
+    folder = checkpoint_folder(Path(path_or_hub_id))
+    return NetworkPolicy(load_checkpoint(folder), **options)
+
+
+def save_pretrained(policy: NetworkPolicy, folder: str | Path) -> None:
+    """Write a policy into a folder, which `load_pretrained` reads; in float32, whatever it computes in."""
+    save_checkpoint(policy.network, Path(folder))
+
+
+def load_weights(model: PolicyNetwork, tensors: dict[str, torch.Tensor], *, source: str) -> None:
     """Copy weights into a network.
 
     Raises:
@@ -70,7 +93,7 @@ def load_weights(model: Vima, tensors: dict[str, torch.Tensor], *, source: str) 
     model.load_state_dict(tensors)
 
 
-def _read_config(file: Path) -> VimaConfig:
+def _read_config(file: Path) -> PolicyConfig:
     if not file.is_file():
         raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {CONFIG_FILE}.")
     try:
@@ -80,7 +103,7 @@ def _read_config(file: Path) -> VimaConfig:
     if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
         raise CheckpointError(f"{file} does not describe a {_KIND!r} policy.")
     try:
-        return VimaConfig.from_dict(values["config"])
+        return PolicyConfig.from_dict(values["config"])
     except ConfigError as error:
         raise CheckpointError(f"{file}: {error}") from error
 

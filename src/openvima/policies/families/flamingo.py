@@ -1,0 +1,26 @@
+"""VIMA-Flamingo: four tokens sum up a pair of frames, and cross-attention looks at the prompt, as in VIMA.
+
+prompt   [put, the, 4 latents, into, the, 4 latents, ., end]
+history  [4 latents, action, 4 latents, action, …]
+                  |
+             1st action
+"""
+
+from openvima.policies.config import PolicyConfig
+from openvima.policies.families.common import Size
+from openvima.policies.families.frames import frame_transformer
+from openvima.policies.layers.frame_encoder import FrameEncoderConfig
+from openvima.policies.layers.resampler import ResamplerConfig
+from openvima.policies.layers.trunk import DecoderConfig
+
+
+def flamingo(size: Size) -> PolicyConfig:
+    """Return VIMA-Flamingo in a size."""
+    frame = frame_transformer(size, class_token=False)
+    return PolicyConfig(
+        images=FrameEncoderConfig(frame, "resampled", ResamplerConfig(dropout=size.dropout)),
+        prompt=size.prompt,
+        trunk=DecoderConfig(size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout),
+        head=size.head,
+        action_width=size.action_width,
+    )

@@ -1,0 +1,322 @@
+"""Prompts and observations as tensors: sequences, slots, masks.
+
+Numpy records of single prompts and steps come first, batches of them after. Nothing here has weights. Images
+(crops of objects, or whole frames) are given by their number in one stack, so that each is encoded once, or
+taken from a store of encoded ones.
+
+Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Literal, Self
+
+import numpy as np
+import torch
+
+from openvima.errors import PolicyError, PromptError
+from openvima.policies.kernels import CROP_SIZE
+from openvima.policies.layers.frame_encoder import FrameEncoderConfig
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.perception import GROUND_TRUTH, ObjectFinder, ObjectViews, whole_frames
+from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
+from openvima.render.camera import VIEWS
+from openvima.scene import PromptImage, RenderedPrompt
+
+WORD = -1  # entry of a place that holds a word
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PromptInput:
+    """One prompt.
+
+    Args:
+        words: Word id at each place, shape (L,), int64; padding where an image token stands.
+        entries: Row of the object (or frame pair) at each place, shape (L,), int64; `WORD` where a word
+            stands.
+        parts: Which of its tokens stands there, shape (L,), int64: the view, front before top; the number of
+            the token, with frames; 0 where one token shows both views.
+        mask: Which places count, shape (L,), bool; not those of objects hidden in their view.
+        objects: All objects of all images, one row an appearance in the text.
+    """
+
+    words: np.ndarray
+    entries: np.ndarray
+    parts: np.ndarray
+    mask: np.ndarray
+    objects: ObjectViews
+
+
+class _Tensors:
+    """A record of tensors that can be moved as a whole."""
+
+    __slots__ = ()
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the record on another device."""
+        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+        return type(self)(*(value.to(device) for value in values))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PromptBatch(_Tensors):
+    """Prompts of a batch; image tokens are numbered through the batch.
+
+    Args:
+        words_BL: Word ids.
+        images_BL: Image token that stands at a place, numbered through the first tokens of all objects, then
+            all second ones, and so on; `WORD` where a word stands.
+        mask_BL: Which places exist.
+        crops_VS: Number of each object's image in the stack of images.
+        boxes_VS4: Boxes in pixels.
+        masks_VS: Whether the object is visible in the view.
+    """
+
+    words_BL: torch.Tensor
+    images_BL: torch.Tensor
+    mask_BL: torch.Tensor
+    crops_VS: torch.Tensor
+    boxes_VS4: torch.Tensor
+    masks_VS: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepInput:
+    """One observation.
+
+    Args:
+        objects: The objects in view; or both frames, as one object that fills them.
+        positions: Table points under their boxes, shape (N, 2), metres.
+        grasps: Table points under their most interior pixels, shape (N, 2), metres.
+        end_effector: 0 suction cup, 1 spatula.
+    """
+
+    objects: ObjectViews
+    positions: np.ndarray
+    grasps: np.ndarray
+    end_effector: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryBatch(_Tensors):
+    """Observations of a batch of episodes, padded to equal numbers of steps and objects.
+
+    Args:
+        crops_BTVN: Number of each object's image in the stack of images.
+        boxes_BTVN4: Boxes in pixels.
+        masks_BTVN: Whether the object is visible in the view.
+        counts_BT: Number of objects of the step, padding of the batch not counted.
+        positions_BTN2: Table points under the boxes, metres.
+        grasps_BTN2: Table points under the most interior pixels, metres.
+        end_effector_BT: 0 suction cup, 1 spatula.
+        steps_BT: Which steps exist.
+    """
+
+    crops_BTVN: torch.Tensor
+    boxes_BTVN4: torch.Tensor
+    masks_BTVN: torch.Tensor
+    counts_BT: torch.Tensor
+    positions_BTN2: torch.Tensor
+    grasps_BTN2: torch.Tensor
+    end_effector_BT: torch.Tensor
+    steps_BT: torch.Tensor
+
+
+class ImageStack:
+    """Collects images in the order in which they come; each is known by its number.
+
+    Args:
+        image_size: Height and width of every image.
+    """
+
+    def __init__(self, image_size: tuple[int, int]) -> None:
+        self._images = [np.zeros((0, 3, *image_size), np.uint8)]
+        self._size = 0
+
+    def add(self, images: np.ndarray) -> np.ndarray:
+        """Append images of shape (..., 3, height, width) and return their numbers, shape (...), int64."""
+        shape = images.shape[:-3]
+        flat = images.reshape(-1, *self._images[0].shape[1:])
+        self._images.append(flat)
+        self._size += len(flat)
+        return np.arange(self._size - len(flat), self._size).reshape(shape)
+
+    def stacked(self) -> np.ndarray:
+        """Return all images, shape (K, 3, height, width), uint8."""
+        return np.concatenate(self._images)
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """Turns prompts and observations into what a network takes; the same for training and acting.
+
+    Args:
+        layout: What a token shows: an object in both views, an object in one view, or part of a whole frame.
+        image_size: Height and width of a crop or frame.
+        tokens_per_frame_pair: With frames, how many tokens a pair of them becomes.
+        tokenizer: Splits text into word ids.
+        finder: Finds the objects in images.
+    """
+
+    layout: Literal["objects", "views", "frames"]
+    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
+    tokens_per_frame_pair: int = 0
+    tokenizer: Tokenizer = CLOSED_TOKENIZER
+    finder: ObjectFinder = GROUND_TRUTH
+
+    @staticmethod
+    def of(
+        images: ObjectEncoderConfig | FrameEncoderConfig,
+        tokenizer: Tokenizer | None = None,
+        finder: ObjectFinder = GROUND_TRUTH,
+    ) -> "Reader":
+        """Make the reader for a network whose images are encoded in this way."""
+        tokenizer = tokenizer or CLOSED_TOKENIZER
+        if isinstance(images, FrameEncoderConfig):
+            size = (images.frame.image_height, images.frame.image_width)
+            return Reader("frames", size, images.num_tokens, tokenizer, finder)
+        layout = "objects" if images.fuse_views else "views"
+        return Reader(layout, tokenizer=tokenizer, finder=finder)
+
+    def read_prompt(self, prompt: RenderedPrompt) -> PromptInput:
+        """Turn a prompt into words and images.
+
+        Raises:
+            PromptError: It is empty, a word is unknown, or placeholders and images do not match.
+            ShapeError: An image has another shape or dtype.
+        """
+        places: list[tuple[int, int, int, bool]] = []  # word, entry, part, counts
+        images: list[ObjectViews] = []
+        count = 0
+        sequence = prompt.sequence()
+        if not sequence:
+            raise PromptError("the prompt is empty; it must hold at least one word or image.")
+        for piece in sequence:
+            if isinstance(piece, str):
+                places += [(word, WORD, 0, True) for word in self.tokenizer.encode(piece)]
+                continue
+            images.append(self._see_prompt_image(piece))
+            places += [
+                (PADDING_ID, count + entry, part, valid) for entry, part, valid in self._places(images[-1])
+            ]
+            count += len(images[-1])
+        places.append((self.tokenizer.end_id, WORD, 0, True))
+        words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
+        return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images))
+
+    def begin_episode(self) -> "EpisodeReader":
+        """Return the reader of one episode's observations."""
+        return EpisodeReader(self)
+
+    def _see_prompt_image(self, image: PromptImage) -> ObjectViews:
+        if self.layout == "frames":
+            return whole_frames(image.rgb)
+        objects = self.finder.in_prompt_image(image)
+        return objects if self.layout == "objects" else objects.compacted()
+
+    def _places(self, objects: ObjectViews) -> list[tuple[int, int, bool]]:
+        """Entry, part and validity of the tokens of one image, in the order of the prompt."""
+        count = len(objects)
+        if self.layout == "objects":
+            return [(k, 0, bool(visible)) for k, visible in enumerate(objects.visible())]
+        if self.layout == "frames":
+            return [(0, part, True) for part in range(self.tokens_per_frame_pair)]
+        return [(k, view, bool(objects.masks[view, k])) for view in range(len(VIEWS)) for k in range(count)]
+
+
+class EpisodeReader:
+    """Reads the observations of one episode, in order.
+
+    With a token for each view, an object that was seen once keeps its slots when it is hidden in both views.
+    So the number of slots never falls within an episode, as in the published evaluation.
+    """
+
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+        self._num_slots = 0
+
+    def read_step(self, observation: Mapping) -> StepInput:
+        """Turn an observation into objects.
+
+        Args:
+            observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
+
+        Raises:
+            ShapeError: An image has another shape or dtype.
+            PolicyError: No object is in view.
+        """
+        layout, end_effector = self._reader.layout, int(observation["ee"])
+        if layout == "frames":
+            frames = whole_frames(observation["rgb"])
+            centre = frames.positions()
+            return StepInput(frames, centre, centre, end_effector)
+        objects = self._reader.finder.in_observation(observation)
+        if not len(objects):
+            raise PolicyError("the observation shows no object; there is nothing to act on.")
+        if layout == "views":
+            self._num_slots = max(self._num_slots, len(objects))
+            objects = objects.compacted().padded(self._num_slots)
+        return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
+
+
+def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -> PromptBatch:
+    """Pad prompts to equal length and number their objects through.
+
+    Args:
+        prompts: The prompts.
+        crops: For each prompt the numbers of its objects' images, shape (2, objects).
+    """
+    length = max(len(prompt.words) for prompt in prompts)
+    words = np.full((len(prompts), length), PADDING_ID)
+    images = np.full((len(prompts), length), WORD)
+    mask = np.zeros((len(prompts), length), np.bool_)
+    first, total = 0, sum(len(prompt.objects) for prompt in prompts)
+    for row, prompt in enumerate(prompts):
+        size = len(prompt.words)
+        words[row, :size] = prompt.words
+        numbered = prompt.entries + first + prompt.parts * total
+        images[row, :size] = np.where(prompt.entries == WORD, WORD, numbered)
+        mask[row, :size] = prompt.mask
+        first += len(prompt.objects)
+    return PromptBatch(
+        torch.from_numpy(words),
+        torch.from_numpy(images),
+        torch.from_numpy(mask),
+        torch.from_numpy(np.concatenate(list(crops), axis=1)),
+        torch.from_numpy(np.concatenate([prompt.objects.boxes for prompt in prompts], axis=1)),
+        torch.from_numpy(np.concatenate([prompt.objects.masks for prompt in prompts], axis=1)),
+    )
+
+
+def batch_histories(
+    histories: Sequence[Sequence[StepInput]], crops: Sequence[Sequence[np.ndarray]]
+) -> HistoryBatch:
+    """Pad episodes to equal numbers of steps and of objects.
+
+    Args:
+        histories: The steps of each episode.
+        crops: For each step the numbers of its objects' images, shape (2, objects).
+    """
+    batch, steps = len(histories), max(len(history) for history in histories)
+    count = max([1, *(len(step.objects) for history in histories for step in history)])
+    numbers = np.zeros((batch, steps, 2, count), np.int64)
+    boxes = np.zeros((batch, steps, 2, count, 4), np.int64)
+    masks = np.zeros((batch, steps, 2, count), np.bool_)
+    counts = np.zeros((batch, steps), np.int64)
+    positions = np.zeros((batch, steps, count, 2), np.float64)
+    grasps = np.zeros((batch, steps, count, 2), np.float64)
+    end_effector = np.zeros((batch, steps), np.int64)
+    exists = np.zeros((batch, steps), np.bool_)
+    for b, history in enumerate(histories):
+        for t, step in enumerate(history):
+            size = len(step.objects)
+            numbers[b, t, :, :size] = crops[b][t]
+            boxes[b, t, :, :size] = step.objects.boxes
+            masks[b, t, :, :size] = step.objects.masks
+            counts[b, t] = size
+            positions[b, t, :size] = step.positions
+            grasps[b, t, :size] = step.grasps
+            end_effector[b, t] = step.end_effector
+            exists[b, t] = True
+    arrays = (numbers, boxes, masks, counts, positions, grasps, end_effector, exists)
+    return HistoryBatch(*(torch.from_numpy(array) for array in arrays))

@@ -1,0 +1,98 @@
+"""The prompt encoder: words and image tokens, interleaved, through a T5 encoder into the trunk's width.
+
+Shape suffixes: B batch, L prompt places, I image tokens of all prompts, W width of the text encoder, D width
+of the trunk, E width of an image token.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import nn
+
+from openvima.errors import ConfigError
+from openvima.policies.layers.mlp import mlp
+from openvima.policies.layers.text_encoder import TextEncoder, TextEncoderConfig
+
+
+@dataclass(frozen=True, slots=True)
+class PromptEncoderConfig:
+    """Sizes of the prompt encoder, and what of it is trained.
+
+    Args:
+        text: The text encoder.
+        image_width: Hidden width of the stack that takes image tokens into the prompt.
+        vocabulary_size: Number of word ids.
+        tokenizer: "closed", the benchmark's own vocabulary; or "t5", that of T5, which needs its files.
+        train_words: Whether the word embedding is trained.
+        trained_layers: How many of the last layers of the text encoder are trained, with its last norm; 0 for
+            a frozen one. None trains all of it, position biases included.
+    """
+
+    text: TextEncoderConfig
+    image_width: int
+    vocabulary_size: int
+    tokenizer: Literal["closed", "t5"] = "closed"
+    train_words: bool = True
+    trained_layers: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.tokenizer not in ("closed", "t5"):
+            raise ConfigError(f"prompt encoder: tokenizer is {self.tokenizer!r}; allowed: 'closed', 't5'.")
+        layers = self.text.num_layers
+        if self.trained_layers is not None and not 0 <= self.trained_layers <= layers:
+            raise ConfigError(
+                f"prompt encoder: trained_layers is {self.trained_layers}; it must be between 0 and {layers}."
+            )
+
+
+class PromptEncoder(nn.Module):
+    """Words and image tokens -> one sequence -> text encoder -> linear layer to the trunk's width.
+
+    "Put the {a} into the {b}." with one object in each image:
+
+        [put, the, A, into, the, B, ., end]
+    """
+
+    def __init__(self, config: PromptEncoderConfig, *, image_token_width: int, width: int) -> None:
+        super().__init__()
+        words = config.text.width
+        self.words = nn.Embedding(config.vocabulary_size, words)
+        self.images = mlp((image_token_width, config.image_width, config.image_width, words))
+        self.text = TextEncoder(config.text)
+        # The published 768-wide policies have no layer here, since both widths are equal.
+        self.out = nn.Identity() if words == width else nn.Linear(words, width, bias=False)
+        self._freeze(config)
+
+    def forward(
+        self,
+        words_BL: torch.Tensor,
+        images_BL: torch.Tensor,
+        mask_BL: torch.Tensor,
+        image_tokens_IE: torch.Tensor,
+    ) -> torch.Tensor:
+        """Encode prompts.
+
+        Args:
+            words_BL: Word ids.
+            images_BL: Row of the image token that stands at a place; negative where a word stands.
+            mask_BL: Which places are valid.
+            image_tokens_IE: Image tokens.
+
+        Returns:
+            Shape (B, L, D); masked places are finite and mean nothing.
+        """
+        tokens_BLW = self.words(words_BL)
+        if len(image_tokens_IE):
+            chosen_BLW = self.images(image_tokens_IE)[images_BL.clamp(min=0)]
+            tokens_BLW = torch.where((images_BL >= 0)[..., None], chosen_BLW, tokens_BLW)
+        return self.out(self.text(tokens_BLW, mask_BL))
+
+    def _freeze(self, config: PromptEncoderConfig) -> None:
+        self.words.requires_grad_(config.train_words)
+        if config.trained_layers is None:
+            return
+        self.text.requires_grad_(False)
+        if config.trained_layers:
+            self.text.blocks[-config.trained_layers :].requires_grad_(True)
+            self.text.norm_after.requires_grad_(True)

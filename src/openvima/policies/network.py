@@ -1,0 +1,272 @@
+"""The network that all policies of the family are: prompt and history in, what an action head needs out.
+
+Its members differ in how images become tokens and in how the history is read in the light of the prompt; both
+are parts that the config names. See `openvima.policies.families`.
+
+Shape suffixes: B batch, T steps, L prompt places, I image tokens of all prompts, S objects in all prompts, V
+views, N objects in view, Q slots of a step, P places kept, D width of the trunk, F width of image features, C
+components of an action.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.policies.config import PolicyConfig
+from openvima.policies.heads.base import ActionHead, HeadInputs, to_unit_range
+from openvima.policies.heads.bins import BinsConfig, BinsHead
+from openvima.policies.heads.pointing import PointingHead
+from openvima.policies.inputs import HistoryBatch, PromptBatch
+from openvima.policies.layers.action_encoder import ActionEncoder
+from openvima.policies.layers.frame_encoder import FrameEncoder
+from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.policies.layers.prompt_encoder import PromptEncoder
+from openvima.policies.layers.trunk import TrunkState, build_trunk
+from openvima.scene import END_EFFECTORS
+
+NUM_END_EFFECTORS = len(END_EFFECTORS)
+SUCTION = END_EFFECTORS.index("suction")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """Encoded prompts: what stays the same through an episode.
+
+    Args:
+        tokens_BLD: Encoded words and images.
+        roles_BLD: The same, encoded without knowing what the objects look like.
+        mask_BL: Which places exist.
+        object_mask_BL: Which of them are images.
+        appearance_BLA: Appearance of their objects; zero elsewhere.
+    """
+
+    tokens_BLD: torch.Tensor
+    roles_BLD: torch.Tensor
+    mask_BL: torch.Tensor
+    object_mask_BL: torch.Tensor
+    appearance_BLA: torch.Tensor
+
+    def select(self, rows: Sequence[int]) -> "Memory":
+        """Return the prompts of some rows of the batch."""
+        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BL.device)
+        return Memory(
+            self.tokens_BLD[index],
+            self.roles_BLD[index],
+            self.mask_BL[index],
+            self.object_mask_BL[index],
+            self.appearance_BLA[index],
+        )
+
+
+class PolicyNetwork(nn.Module):
+    """Multimodal prompt -> trunk over the history -> action head.
+
+    "Put the {a} into the {b}." with one object in each image, two objects on the table, second step:
+
+        prompt   [put, the, A, into, the, B, ., end]
+        history  [obj, obj, query, action, obj, obj, query]
+                             |                        |
+                         1st action               2nd action
+
+    The query is a learned token, or, as in the published policies, simply the last image token of the step.
+    """
+
+    def __init__(self, config: PolicyConfig) -> None:
+        super().__init__()
+        width, images = config.trunk.width, config.images
+        self.config = config
+        self.images: ObjectEncoder | FrameEncoder = (
+            ObjectEncoder(images) if isinstance(images, ObjectEncoderConfig) else FrameEncoder(images)
+        )
+        self.prompt = PromptEncoder(config.prompt, image_token_width=images.token_width, width=width)
+        self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
+        self.observation_out = nn.Linear(images.token_width + NUM_END_EFFECTORS, width)
+        self.actions = ActionEncoder(config.action_width, width)
+        self.trunk = build_trunk(config.trunk)
+        self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
+        self.head: ActionHead = _head(config)
+
+    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
+        return self.images.encode_images(images)
+
+    def encode_prompts(self, prompts: PromptBatch, features_KF: torch.Tensor) -> Memory:
+        """Encode prompts; needed once an episode.
+
+        Args:
+            prompts: The prompts.
+            features_KF: Encoded images, by number.
+        """
+        features_VSF = features_KF[prompts.crops_VS]
+        is_image_BL = (prompts.images_BL >= 0) & prompts.mask_BL
+        encoded_BLD = self._read(prompts, features_VSF)
+        width = _appearance_width(self.config)
+        appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
+        if not width:
+            return Memory(encoded_BLD, encoded_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
+        assert isinstance(self.images, ObjectEncoder)
+        roles_BLD = self._read(prompts, torch.zeros_like(features_VSF))
+        if prompts.masks_VS.shape[1]:
+            looks_SA = self.images.embed_appearance(features_VSF, prompts.masks_VS)
+            appearance_BLA = looks_SA[prompts.images_BL.clamp(min=0)] * is_image_BL[..., None]
+        return Memory(encoded_BLD, roles_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
+
+    def begin(self, memory: Memory) -> TrunkState:
+        """Return the state of the trunk after the prompt and before the first step."""
+        return self.trunk.begin(memory.tokens_BLD, memory.mask_BL)
+
+    def forward(
+        self, memory: Memory, history: HistoryBatch, features_KF: torch.Tensor, actions_BTC: torch.Tensor
+    ) -> HeadInputs:
+        """Read whole histories, for training.
+
+        Args:
+            memory: Encoded prompts.
+            history: Observations.
+            features_KF: Encoded images, by number.
+            actions_BTC: Actions taken, metres and quaternions; the last step's is never looked at.
+
+        Returns:
+            What the action head needs at every step.
+        """
+        previous_BTC = torch.cat([torch.zeros_like(actions_BTC[:, :1]), actions_BTC[:, :-1]], dim=1)
+        has_previous_BT = F.pad(history.steps_BT[:, 1:], (1, 0), value=False)
+        return self.extend(memory, self.begin(memory), history, features_KF, previous_BTC, has_previous_BT)[0]
+
+    def extend(
+        self,
+        memory: Memory,
+        state: TrunkState,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+    ) -> tuple[HeadInputs, TrunkState]:
+        """Read the next steps of histories; those before them are in the state.
+
+        Args:
+            memory: Encoded prompts.
+            state: What the trunk has read.
+            history: Observations of the next steps.
+            features_KF: Encoded images, by number.
+            previous_BTC: The action that was taken before each of these observations, metres and quaternions.
+            has_previous_BT: Whether there was one.
+
+        Returns:
+            What the action head needs at these steps, and the state after them.
+
+        Raises:
+            PolicyError: Prompt or history is longer than the trunk takes.
+        """
+        features = features_KF[history.crops_BTVN]
+        slots_BTQD, mask_BTQ, read_BT = self.observe(history, features)
+        dtype = slots_BTQD.dtype
+        unit_BTC = self.head.as_history(to_unit_range(previous_BTC.to(torch.float64))).to(dtype)
+        outputs_BTQD, state = self._read_on(
+            state, self.actions(unit_BTC), has_previous_BT, slots_BTQD, mask_BTQ, read_BT, history.steps_BT
+        )
+        place_BT1D = read_BT[..., None, None].expand(-1, -1, 1, outputs_BTQD.shape[-1])
+        inputs = HeadInputs(
+            query_BTD=outputs_BTQD.gather(2, place_BT1D).squeeze(2),
+            objects_BTND=outputs_BTQD[:, :, :-1] if self.query is not None else outputs_BTQD,
+            masks_BTN=history.masks_BTVN.any(dim=2),
+            appearance_BTNA=self._appearance(features, history.masks_BTVN),
+            positions_BTN2=history.positions_BTN2.to(dtype),
+            grasps_BTN2=history.grasps_BTN2.to(dtype),
+            lifts_BT=history.end_effector_BT == SUCTION,
+            prompt_BMD=memory.roles_BLD,
+            prompt_masks_BM=memory.object_mask_BL,
+            prompt_appearance_BMA=memory.appearance_BLA,
+        )
+        return inputs, state
+
+    def observe(
+        self, history: HistoryBatch, features_BTVNF: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Make the slots of each step.
+
+        Returns:
+            Image tokens, then the query if there is one, (B, T, Q, D); which of them exist, (B, T, Q); and
+            the slot from whose output the step's action is read, (B, T).
+        """
+        tokens_BTQE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
+        effector = self.end_effectors(history.end_effector_BT)[:, :, None]
+        effector = effector.expand(*tokens_BTQE.shape[:3], NUM_END_EFFECTORS)
+        slots_BTQD = self.observation_out(torch.cat([tokens_BTQE, effector], dim=-1))
+        images = self.config.images
+        if not isinstance(images, ObjectEncoderConfig):
+            mask_BTQ = history.steps_BT[..., None].expand(slots_BTQD.shape[:3])
+        elif images.fuse_views:
+            mask_BTQ = history.masks_BTVN.any(dim=2)
+        else:
+            mask_BTQ = history.masks_BTVN.flatten(2)
+        if self.query is not None:
+            query_BT1D = self.query.expand(*slots_BTQD.shape[:2], 1, -1)
+            slots_BTQD = torch.cat([slots_BTQD, query_BT1D], dim=2)
+            mask_BTQ = torch.cat([mask_BTQ, history.steps_BT[..., None]], dim=2)
+        read_BT = torch.full_like(history.counts_BT, slots_BTQD.shape[2] - 1)
+        if self.query is None and isinstance(images, ObjectEncoderConfig):
+            # The last slot of the episode itself, be it padding or not; beyond it lies padding of the batch.
+            read_BT = read_BT - history.masks_BTVN.shape[-1] + history.counts_BT.clamp(min=1)
+        return slots_BTQD, mask_BTQ, read_BT
+
+    def _read(self, prompts: PromptBatch, features_VSF: torch.Tensor) -> torch.Tensor:
+        tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
+        return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE)
+
+    def _read_on(
+        self,
+        state: TrunkState,
+        previous_BTD: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+        slots_BTQD: torch.Tensor,
+        mask_BTQ: torch.Tensor,
+        read_BT: torch.Tensor,
+        steps_BT: torch.Tensor,
+    ) -> tuple[torch.Tensor, TrunkState]:
+        """Interleave actions and slots in time, read them, and return the outputs at the slots.
+
+        Masked places are left out, except the slot that is read: it is read even if it is padding.
+        """
+        batch, steps, slots = mask_BTQ.shape
+        sequence_BLD = torch.cat([previous_BTD[:, :, None], slots_BTQD], dim=2).flatten(1, 2)
+        mask_BL = torch.cat([has_previous_BT[..., None], mask_BTQ], dim=2).flatten(1)
+        is_read_BTQ = F.one_hot(read_BT, slots).bool() & steps_BT[..., None]
+        kept_BL = mask_BL | F.pad(is_read_BTQ, (1, 0), value=False).flatten(1)
+        order_BP = kept_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+        order_BP = order_BP[:, : int(kept_BL.sum(dim=1).max())]
+        places_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
+        read_BPD, state = self.trunk.extend(
+            state, sequence_BLD.gather(1, places_BPD), mask_BL.gather(1, order_BP)
+        )
+        outputs_BLD = torch.zeros_like(sequence_BLD).scatter(1, places_BPD, read_BPD)
+        return outputs_BLD.view(batch, steps, slots + 1, -1)[:, :, 1:], state
+
+    def _appearance(self, features_BTVNF: torch.Tensor, masks_BTVN: torch.Tensor) -> torch.Tensor:
+        if _appearance_width(self.config):
+            assert isinstance(self.images, ObjectEncoder)
+            return self.images.embed_appearance(features_BTVNF, masks_BTVN)
+        return features_BTVNF.new_zeros(*masks_BTVN.any(dim=2).shape, 0)
+
+
+def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:
+    """Build a network with fresh weights that follow from the seed; global random state stays as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return PolicyNetwork(config)
+
+
+def _appearance_width(config: PolicyConfig) -> int:
+    return config.images.appearance_width if isinstance(config.images, ObjectEncoderConfig) else 0
+
+
+def _head(config: PolicyConfig) -> ActionHead:
+    width = config.trunk.width
+    return (
+        BinsHead(config.head, width)
+        if isinstance(config.head, BinsConfig)
+        else PointingHead(config.head, width)
+    )

@@ -1,1 +1,0 @@
-"""The VIMA policy."""
