@@ -1,7 +1,8 @@
-"""Score a policy of your own: anything with `reset(prompts)` and `act(observations)`.
+"""Play episodes with a policy of your own: anything with `reset(prompts)` and `act(observations)`.
 
 Run it with `python examples/02_score_your_policy.py`. This policy never reads the prompt: it puts the second
-largest object in view into the largest, which is right about every second time.
+largest object in view into the largest, which is right about every second time. The loop over steps is
+written out; `custom_policy.py` has a policy that reads the prompt, and is scored in one line.
 """
 
 import numpy as np

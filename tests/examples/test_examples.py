@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from openvima.data import Dataset
+from openvima.evaluation import score
+from openvima.policies import RandomPolicy
 from openvima.tasks import list_tasks, registry
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
@@ -24,6 +26,15 @@ def test_the_example_runs_and_is_short(
     assert len(example.read_text(encoding="utf-8").splitlines()) <= 70
     runpy.run_path(str(example), run_name="__main__")
     assert "olved" in capsys.readouterr().out
+
+
+def test_the_custom_policy_reads_the_prompt_and_inherits_from_nothing() -> None:
+    policy = runpy.run_path(str(EXAMPLES[0].with_name("custom_policy.py")))["NearestColour"]
+    assert policy.__mro__ == (policy, object)
+    tasks = ("visual_manipulation", "rotate")
+    results = score({"mine": policy(), "random": RandomPolicy()}, tasks=tasks, levels=("L2",), episodes=6)
+    mine, random = results.level_means()
+    assert mine.mean >= 0.8 and random.mean <= 0.2
 
 
 def test_a_task_file_is_all_that_demonstrations_and_scores_need(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from openvima.evaluation.report import write_report
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
     from openvima.evaluation.runner import evaluate
+    from openvima.evaluation.scoring import score
     from openvima.evaluation.statistics import wilson_interval
 
 _HOMES = {
@@ -18,6 +19,7 @@ _HOMES = {
     "Row": "results",
     "evaluate": "runner",
     "save_episode_picture": "picture",
+    "score": "scoring",
     "wilson_interval": "statistics",
     "write_report": "report",
 }
@@ -29,6 +31,7 @@ __all__ = [
     "Row",
     "evaluate",
     "save_episode_picture",
+    "score",
     "wilson_interval",
     "write_report",
 ]

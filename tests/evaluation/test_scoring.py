@@ -1,0 +1,46 @@
+"""Scoring policies that exist as objects only."""
+
+import pytest
+
+from openvima.errors import UnknownTaskError
+from openvima.evaluation import EvaluationConfig, Results, evaluate, score
+from openvima.policies import RandomPolicy
+
+CELLS = {"tasks": ("rotate", "visual_manipulation"), "levels": ("L1", "L2"), "episodes": 3, "seed": 5}
+
+
+class Idle:
+    """Never moves anything, and notes the sizes of the batches."""
+
+    def __init__(self):
+        self.batches = []
+
+    def reset(self, prompts):
+        self.batches.append(len(prompts))
+        self.random = RandomPolicy()
+        self.random.reset(prompts)
+
+    def act(self, observations):
+        actions = self.random.act(observations)
+        for action in actions:
+            if action is not None:
+                action["pose0_position"][:] = action["pose1_position"][:] = (0.25, -0.5)
+        return actions
+
+
+def test_objects_play_the_very_episodes_that_evaluate_plays(tmp_path):
+    config = EvaluationConfig(("random",), out=tmp_path, report=False, **CELLS)
+    assert score({"random": RandomPolicy()}, **CELLS).rows == Results.read(evaluate(config)).rows
+
+
+def test_each_policy_has_rows_under_its_own_name():
+    idle = Idle()
+    results = score({"idle": idle, "random": RandomPolicy()}, **CELLS)
+    assert results.policy_names() == ["idle", "random"]
+    assert all(row.successes == 0 for row in results.rows if row.policy == "idle")
+    assert idle.batches == [3] * 4
+
+
+def test_a_task_that_is_not_there_is_named():
+    with pytest.raises(UnknownTaskError, match="rotat"):
+        score({"random": RandomPolicy()}, tasks=("rotat",))
