@@ -13,7 +13,6 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
-from tests.policies.published import translated  # noqa: E402
 
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, from_unit_range, to_unit_range  # noqa: E402
@@ -25,6 +24,7 @@ from openvima.policies.layers.text_encoder import TextEncoderConfig, relative_bu
 from openvima.policies.layers.trunk import DecoderConfig, position_ids  # noqa: E402
 from openvima.policies.layers.vit import VitConfig  # noqa: E402
 from openvima.policies.network import Memory, PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.published import from_published  # noqa: E402
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 pytestmark = pytest.mark.skipif(
@@ -51,7 +51,7 @@ def model() -> PolicyNetwork:
         action_width=256,
     )
     network = build_network(config, seed=0)
-    network.load_state_dict(translated(load_file(FOLDER / "vima_tiny.safetensors")))
+    network.load_state_dict(from_published(load_file(FOLDER / "vima_tiny.safetensors")))
     return network.eval()
 
 
