@@ -259,6 +259,16 @@ def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:
         return PolicyNetwork(config)
 
 
+def outline_network(config: PolicyConfig) -> PolicyNetwork:
+    """Build a network without weights: names and shapes, to count them or to put weights in their place.
+
+    It takes no time and no memory, whatever the sizes. `network.load_state_dict(weights, assign=True)` makes
+    a whole network of it.
+    """
+    with torch.device("meta"):
+        return PolicyNetwork(config)
+
+
 def _appearance_width(config: PolicyConfig) -> int:
     return config.images.appearance_width if isinstance(config.images, ObjectEncoderConfig) else 0
 

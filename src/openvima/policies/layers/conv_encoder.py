@@ -42,8 +42,10 @@ class ConvEncoder(nn.Module):
 
     def __init__(self, config: ConvConfig) -> None:
         super().__init__()
-        self.register_buffer("pixel_mean", torch.tensor(PIXEL_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("pixel_std", torch.tensor(PIXEL_STD).view(3, 1, 1), persistent=False)
+        # Constants have a device of their own, so that a network without weights has them, too.
+        mean, std = torch.tensor(PIXEL_MEAN, device="cpu"), torch.tensor(PIXEL_STD, device="cpu")
+        self.register_buffer("pixel_mean", mean.view(3, 1, 1), persistent=False)
+        self.register_buffer("pixel_std", std.view(3, 1, 1), persistent=False)
         width = config.width
         self.layers = nn.Sequential(
             _layer(3, width, stride=2),

@@ -72,7 +72,8 @@ class ObjectEncoder(nn.Module):
         super().__init__()
         self.config = config
         features = config.crop.output_width
-        self.register_buffer("box_units", torch.tensor(_BOX_UNITS), persistent=False)
+        # A constant has a device of its own, so that a network without weights has it, too.
+        self.register_buffer("box_units", torch.tensor(_BOX_UNITS, device="cpu"), persistent=False)
         self.crop_encoder = _crop_encoder(config.crop)
         box_widths = (4, config.box_width, config.box_width, config.box_width)
         self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))

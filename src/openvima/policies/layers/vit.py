@@ -70,8 +70,10 @@ class VisionTransformer(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         width, scale = config.width, config.width**-0.5
-        self.register_buffer("pixel_mean", torch.tensor(PIXEL_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("pixel_std", torch.tensor(PIXEL_STD).view(3, 1, 1), persistent=False)
+        # Constants have a device of their own, so that a network without weights has them, too.
+        mean, std = torch.tensor(PIXEL_MEAN, device="cpu"), torch.tensor(PIXEL_STD, device="cpu")
+        self.register_buffer("pixel_mean", mean.view(3, 1, 1), persistent=False)
+        self.register_buffer("pixel_std", std.view(3, 1, 1), persistent=False)
         self.patches = nn.Conv2d(3, width, config.patch_size, stride=config.patch_size, bias=False)
         self.class_token = nn.Parameter(torch.randn(width) * scale) if config.class_token else None
         self.positions = nn.Parameter(torch.randn(config.num_patches + config.class_token, width) * scale)
