@@ -1,7 +1,8 @@
-"""Files that bear their name only once they are whole."""
+"""Files and folders that bear their name only once they are whole."""
 
 import contextlib
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -45,6 +46,59 @@ def write_whole(path: Path, content: bytes | str) -> Path:
     with whole_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
     return path
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Fill a folder under a temporary name; it gets its own when the block ends well.
+
+    After an exception nothing is left, after a crash a hidden `.tmp` folder. A folder that bears the name is
+    moved aside before and deleted after. Should the process die between, `restore_folder` puts it back.
+
+    Args:
+        path: Final name; missing parents are made.
+
+    Yields:
+        The folder to fill.
+    """
+    path = path.resolve()  # what a link leads to
+    restore_folder(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        yield temporary
+        _sync_files(temporary)
+        aside = _aside(path)
+        if path.exists():
+            shutil.rmtree(aside, ignore_errors=True)
+            os.replace(path, aside)
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+        shutil.rmtree(aside, ignore_errors=True)
+    finally:
+        restore_folder(path)
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def restore_folder(path: Path) -> None:
+    """Put back a folder that was moved aside to be replaced, if its replacement never came."""
+    path = path.resolve()
+    aside = _aside(path)
+    if not path.exists() and aside.is_dir():
+        os.replace(aside, path)
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.old")
+
+
+def _sync_files(folder: Path) -> None:
+    for file in folder.rglob("*"):
+        if file.is_file():
+            with open(file, "rb+") as stream:
+                os.fsync(stream.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

@@ -8,10 +8,21 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from openvima.errors import MissingExtraError, PolicyError, UnknownPolicyError, unknown_name
+from openvima.errors import (
+    CheckpointError,
+    MissingExtraError,
+    PolicyError,
+    UnknownPolicyError,
+    unknown_name,
+)
+from openvima.files import restore_folder
+from openvima.policies.hub import fetch_from_hub, is_hub_id
 from openvima.policies.presets import PRESETS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
+WEIGHTS_FILE = "model.safetensors"
+CONFIG_FILE = "config.yaml"
+TOKENIZER_FOLDER = "tokenizer"
 CHECKPOINTS_FOLDER = "checkpoints"
 BEST_FILE = "best.txt"  # in the checkpoints folder: name of the best one
 
@@ -38,7 +49,7 @@ class Policy(Protocol):
 
     @staticmethod
     def from_pretrained(path_or_hub_id: str | Path, **options: Any) -> "Policy":  # Any: of several kinds
-        """Load a network's policy from a folder or the Hugging Face Hub; see `load_pretrained`.
+        """Load a network's policy from a folder, a file or the Hugging Face Hub; see `load_pretrained`.
 
         A helper for convenience, which a policy of your own need not have.
         """
@@ -79,21 +90,25 @@ class RandomPolicy(Policy):
         ]
 
 
-def load_policy(name_or_run: str, *, seed: int = 0) -> Policy:
-    """Load a policy by name or from a folder.
+def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  # Any: of several kinds
+    """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
 
     Args:
-        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; or a run folder or
-            checkpoint folder that `openvima train` wrote. Of a run folder the best checkpoint is taken.
+        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; a run folder that
+            `openvima train` wrote, of which the best checkpoint is taken; a checkpoint folder; a published
+            `.ckpt` file; or an id on the Hub such as "owner/policy".
         seed: Seed of the random policy's draws and of fresh weights.
+        **options: Of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy has none
+            and leaves them aside.
 
     Returns:
         The policy, ready for `reset`.
 
     Raises:
-        UnknownPolicyError: It is neither a name nor a folder.
-        CheckpointError: The folder holds no checkpoint that can be read.
-        MissingExtraError: The policy needs torch, which is not installed.
+        UnknownPolicyError: It is neither a name, nor a folder or file, nor like an id on the Hub.
+        CheckpointError: The folder or file holds no checkpoint that can be read, or the Hub does not give it.
+        PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given.
+        MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
     if name_or_run == "random":
         return RandomPolicy(seed)
@@ -104,18 +119,39 @@ def load_policy(name_or_run: str, *, seed: int = 0) -> Policy:
         from openvima.policies.presets import preset
 
         config = preset("nano" if name_or_run == "untrained" else name_or_run)
-        return NetworkPolicy(build_network(config, seed=seed))
-    if not Path(name_or_run).is_dir():
+        return NetworkPolicy(build_network(config, seed=seed), **options)
+    if not (Path(name_or_run).exists() or is_hub_id(name_or_run)):
         known = ("random", "untrained", *PRESETS)
-        raise UnknownPolicyError(
-            unknown_name(
-                "policy", name_or_run, known, "Give a run folder or one that `openvima policies` lists."
-            )
-        )
+        hint = "Give a run folder, a published .ckpt file or a name that `openvima policies` lists."
+        raise UnknownPolicyError(unknown_name("policy", name_or_run, known, hint))
     require_torch(f"the policy in {name_or_run}")
     from openvima.policies.checkpoint import load_pretrained
 
-    return load_pretrained(name_or_run)
+    return load_pretrained(name_or_run, **options)
+
+
+def find_checkpoint(path_or_hub_id: str | Path) -> Path:
+    """Find the checkpoint folder, or the published file, that a path or an id on the Hub stands for.
+
+    Args:
+        path_or_hub_id: A run folder, a checkpoint folder, a file, or an id such as "owner/policy"; what is
+            not here but on the Hub is fetched.
+
+    Raises:
+        CheckpointError: There is no such path, or the Hub does not give it.
+        MissingExtraError: The Hub's client is needed and not installed.
+    """
+    path, name = Path(path_or_hub_id), str(path_or_hub_id)
+    restore_folder(path)
+    if path.is_dir():
+        return checkpoint_folder(path)
+    if path.exists():
+        return path
+    if is_hub_id(name):
+        return fetch_from_hub(name, (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*"))
+    raise CheckpointError(
+        f"there is no checkpoint at {name}; give a folder, a .ckpt file or an id owner/name."
+    )
 
 
 def checkpoint_folder(folder: Path) -> Path:

@@ -1,5 +1,12 @@
-"""Checkpoints: weights in `model.safetensors`, sizes in `config.yaml` beside them."""
+"""Checkpoints: a folder with weights and sizes, and with the tokenizer where the policy needs files for it.
 
+model.safetensors    weights
+config.yaml          sizes, and the precision of the weights
+tokenizer/           of policies that read prompts with the tokenizer of T5
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,102 +17,224 @@ from safetensors.torch import load_file, save_file
 
 from openvima import __version__
 from openvima.errors import CheckpointError, ConfigError
+from openvima.files import restore_folder, whole_folder
 from openvima.policies.acting import NetworkPolicy
-from openvima.policies.base import checkpoint_folder
+from openvima.policies.base import (
+    CONFIG_FILE,
+    TOKENIZER_FOLDER,
+    WEIGHTS_FILE,
+    find_checkpoint,
+)
 from openvima.policies.config import PolicyConfig
-from openvima.policies.network import PolicyNetwork, build_network
+from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.t5 import T5Tokenizer, tokenizer_for
+from openvima.policies.tokenizer import Tokenizer
 
-WEIGHTS_FILE = "model.safetensors"
-CONFIG_FILE = "config.yaml"
 _KIND = "network"
 _SHOWN = 5  # names of each kind of problem that a message lists
+_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 
 
-def save_checkpoint(model: PolicyNetwork, folder: Path) -> None:
-    """Write weights and sizes into an existing folder."""
-    tensors = {name: tensor.detach().contiguous().cpu() for name, tensor in model.state_dict().items()}
+@dataclass(frozen=True, slots=True)
+class CheckpointInfo:
+    """What `config.yaml` says.
+
+    Args:
+        config: Sizes of the network.
+        dtype: Precision of the stored weights.
+    """
+
+    config: PolicyConfig
+    dtype: torch.dtype
+
+
+def save_checkpoint(
+    network: PolicyNetwork,
+    folder: str | Path,
+    tokenizer: Tokenizer | None = None,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> None:
+    """Write a checkpoint folder, whole or not at all; a checkpoint that is there is replaced.
+
+    Args:
+        network: The network.
+        folder: Where to; it must not exist, be empty, or be a checkpoint.
+        tokenizer: Stored beside the weights if it is that of T5.
+        dtype: Precision of the stored weights: float32, bfloat16 or float64, whatever the network computes
+            in.
+
+    Raises:
+        CheckpointError: The folder holds other files, or there is no such precision.
+    """
+    folder = Path(folder)
+    _refuse_to_delete(folder)
+    with whole_folder(folder) as partial:
+        write_checkpoint(network, partial, tokenizer, dtype=dtype)
+
+
+def write_checkpoint(
+    network: PolicyNetwork,
+    folder: Path,
+    tokenizer: Tokenizer | None = None,
+    *,
+    dtype: torch.dtype = torch.float32,
+) -> None:
+    """Write the files of a checkpoint into a folder that is still being filled; see `save_checkpoint`."""
+    precision = _described(dtype)
+    if precision not in _PRECISIONS:
+        raise CheckpointError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
+    tensors = {
+        name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in network.state_dict().items()
+    }
     save_file(tensors, folder / WEIGHTS_FILE)
-    text = yaml.safe_dump(
-        {"policy": _KIND, "openvima": __version__, "config": model.config.to_dict()}, sort_keys=False
-    )
-    (folder / CONFIG_FILE).write_text(text, encoding="utf-8")
+    values = {
+        "policy": _KIND,
+        "openvima": __version__,
+        "precision": precision,
+        "config": network.config.to_dict(),
+    }
+    (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    if isinstance(tokenizer, T5Tokenizer):
+        tokenizer.save(folder / TOKENIZER_FOLDER)
 
 
-def load_checkpoint(folder: Path) -> PolicyNetwork:
+def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     """Read a network from a checkpoint folder.
+
+    The weights stay in their file, from which the system reads what is used; the file may be replaced or
+    deleted, but not written into.
 
     Args:
         folder: Holds `model.safetensors` and `config.yaml`.
 
     Returns:
-        The network, in evaluation mode.
+        The network, in the precision of the stored weights and in evaluation mode.
 
     Raises:
         CheckpointError: A file is missing or unreadable, or weights and sizes do not fit.
     """
-    config = _read_config(folder / CONFIG_FILE)
+    folder = Path(folder)
+    restore_folder(folder)
+    info = read_info(folder)
     tensors = _read_weights(folder / WEIGHTS_FILE)
-    model = build_network(config, seed=0)
-    load_weights(model, tensors, source=str(folder / WEIGHTS_FILE))
-    return model.eval()
+    network = outline_network(info.config)
+    _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
+    network.load_state_dict(tensors, assign=True)
+    return network.to(info.dtype).eval()  # constants, too
 
 
-def load_pretrained(path_or_hub_id: str | Path, **options: Any) -> NetworkPolicy:  # Any: of several kinds
+def read_info(folder: Path) -> CheckpointInfo:
+    """Read the sizes of a checkpoint without its weights.
+
+    Raises:
+        CheckpointError: The config is missing or makes no sense.
+    """
+    file = folder / CONFIG_FILE
+    if not file.is_file():
+        raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.")
+    try:
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{file} is no valid YAML: {error}") from error
+    if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
+        raise CheckpointError(f"{file} does not describe a {_KIND!r} policy.")
+    precision = values.get("precision", "float32")
+    if precision not in _PRECISIONS:
+        raise CheckpointError(f"{file}: precision is {precision!r}; allowed: {', '.join(_PRECISIONS)}.")
+    try:
+        return CheckpointInfo(PolicyConfig.from_dict(values["config"]), _PRECISIONS[precision])
+    except ConfigError as error:
+        raise CheckpointError(f"{file}: {error}") from error
+
+
+def load_pretrained(
+    path_or_hub_id: str | Path,
+    *,
+    tokenizer: Tokenizer | None = None,
+    **options: Any,  # Any: of several kinds
+) -> NetworkPolicy:
     """Load a policy.
 
     Args:
         path_or_hub_id: A folder that `save_pretrained` or `openvima train` wrote (of a run the best
-            checkpoint is taken), or an id on the Hugging Face Hub such as "name/policy".
+            checkpoint is taken), a published `.ckpt` file, or an id on the Hugging Face Hub such as
+            "owner/policy".
+        tokenizer: By default the one that is stored with the policy, or the closed vocabulary where the
+            policy was trained with that.
         **options: Of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
 
     Raises:
         CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
+        PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given.
     """
-    folder = checkpoint_folder(Path(path_or_hub_id))
-    return NetworkPolicy(load_checkpoint(folder), **options)
+    found = find_checkpoint(path_or_hub_id)
+    if found.is_file():
+        from openvima.policies.published import load_published
+
+        network, stored = load_published(found), None
+    else:
+        network = load_checkpoint(found)
+        stored = found / TOKENIZER_FOLDER
+    if tokenizer is None:
+        tokenizer = tokenizer_for(network.config.prompt, stored if stored and stored.is_dir() else None)
+    return NetworkPolicy(network, tokenizer=tokenizer, **options)
 
 
 def save_pretrained(policy: NetworkPolicy, folder: str | Path) -> None:
     """Write a policy into a folder, which `load_pretrained` reads; in float32, whatever it computes in."""
-    save_checkpoint(policy.network, Path(folder))
+    save_checkpoint(policy.network, folder, policy.reader.tokenizer)
 
 
-def load_weights(model: PolicyNetwork, tensors: dict[str, torch.Tensor], *, source: str) -> None:
+def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
     """Copy weights into a network.
 
     Raises:
         CheckpointError: Names, shapes or dtypes differ; one message tells all of them.
     """
-    expected = model.state_dict()
-    problems = _listed("missing", [name for name in expected if name not in tensors])
+    _check(model, tensors, None, source=source)
+    model.load_state_dict(tensors)
+
+
+def _check(
+    network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], dtype: torch.dtype | None, *, source: str
+) -> None:
+    """Compare weights with what a network takes; by default in its own precision."""
+    expected = network.state_dict()
+    problems = _other_size(tensors, expected)
+    problems += _listed("missing", [name for name in expected if name not in tensors])
     problems += _listed("unexpected", [name for name in tensors if name not in expected])
-    differing = [
-        f"{name} is {_described(tensors[name])} instead of {_described(wanted)}"
-        for name, wanted in expected.items()
-        if name in tensors and (tensors[name].shape, tensors[name].dtype) != (wanted.shape, wanted.dtype)
-    ]
+    differing = []
+    for name, wanted in expected.items():
+        want = (dtype or wanted.dtype, tuple(wanted.shape))
+        if name in tensors and (have := (tensors[name].dtype, tuple(tensors[name].shape))) != want:
+            differing.append(f"{name} is {_described(*have)} instead of {_described(*want)}")
     problems += _listed("wrong", differing)
     if problems:
         raise CheckpointError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
         )
-    model.load_state_dict(tensors)
 
 
-def _read_config(file: Path) -> PolicyConfig:
-    if not file.is_file():
-        raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {CONFIG_FILE}.")
-    try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise CheckpointError(f"{file} is no valid YAML: {error}") from error
-    if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
-        raise CheckpointError(f"{file} does not describe a {_KIND!r} policy.")
-    try:
-        return PolicyConfig.from_dict(values["config"])
-    except ConfigError as error:
-        raise CheckpointError(f"{file}: {error}") from error
+def _other_size(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
+    """Say in words of the config how the sizes of two networks differ, as far as their weights show it."""
+    given, wanted = _sizes(tensors), _sizes(expected)
+    differing = [
+        f"{what} {given[what]}, where the config says {wanted[what]}"
+        for what in wanted
+        if what in given and given[what] != wanted[what]
+    ]
+    return [f"it is of another size: {', '.join(differing)}"] if differing else []
+
+
+def _sizes(tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
+    layers = [name.split(".")[2] for name in tensors if name.startswith("trunk.self_blocks.")]
+    sizes = {"layers": 1 + max(int(layer) for layer in layers)} if layers else {}
+    for what, name, axis in (("width", "observation_out.weight", 0), ("words", "prompt.words.weight", 0)):
+        if name in tensors and tensors[name].ndim > axis:
+            sizes[what] = tensors[name].shape[axis]
+    return sizes
 
 
 def _read_weights(file: Path) -> dict[str, torch.Tensor]:
@@ -113,8 +242,22 @@ def _read_weights(file: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
     try:
         return load_file(file)
-    except SafetensorError as error:
+    except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{file} is damaged ({error}). Take another checkpoint of the run.") from error
+
+
+def _refuse_to_delete(folder: Path) -> None:
+    """Replacing a folder deletes what is in it; that must be a checkpoint and nothing else."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise CheckpointError(f"{folder} is a file; give the name of a folder.")
+    others = {path.name for path in folder.iterdir()} - {WEIGHTS_FILE, CONFIG_FILE, TOKENIZER_FOLDER}
+    if others:
+        raise CheckpointError(
+            f"{folder} holds other files than a checkpoint ({', '.join(sorted(others)[:_SHOWN])}), which "
+            "would be lost; give another folder."
+        )
 
 
 def _listed(what: str, names: list[str]) -> list[str]:
@@ -124,5 +267,6 @@ def _listed(what: str, names: list[str]) -> list[str]:
     return [f"{what}: {', '.join(names[:_SHOWN])}{more}"]
 
 
-def _described(tensor: torch.Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
+def _described(dtype: torch.dtype, shape: tuple[int, ...] | None = None) -> str:
+    name = str(dtype).removeprefix("torch.")
+    return name if shape is None else f"{name} {shape}"

@@ -25,6 +25,7 @@ from openvima.policies.layers.frame_encoder import FrameEncoder
 from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoder
 from openvima.policies.layers.trunk import TrunkState, build_trunk
+from openvima.policies.layers.uninitialised import Uninitialised
 from openvima.scene import END_EFFECTORS
 
 NUM_END_EFFECTORS = len(END_EFFECTORS)
@@ -265,7 +266,7 @@ def outline_network(config: PolicyConfig) -> PolicyNetwork:
     It takes no time and no memory, whatever the sizes. `network.load_state_dict(weights, assign=True)` makes
     a whole network of it.
     """
-    with torch.device("meta"):
+    with Uninitialised():
         return PolicyNetwork(config)
 
 

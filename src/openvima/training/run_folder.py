@@ -22,9 +22,10 @@ from safetensors.torch import load_file, save_file
 
 from openvima.errors import CheckpointError, ConfigError
 from openvima.files import write_whole
-from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
-from openvima.policies.checkpoint import WEIGHTS_FILE, load_weights, save_checkpoint
+from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE
+from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.tokenizer import Tokenizer
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -85,13 +86,26 @@ class RunFolder:
         return found[-1] if found else None
 
     def save(
-        self, name: str, model: PolicyNetwork, optimizer: torch.optim.Optimizer, progress: Progress
+        self,
+        name: str,
+        model: PolicyNetwork,
+        optimizer: torch.optim.Optimizer,
+        progress: Progress,
+        tokenizer: Tokenizer | None = None,
     ) -> None:
-        """Write a checkpoint and delete those that are neither the latest nor the best."""
+        """Write a checkpoint and delete those that are neither the latest nor the best.
+
+        Args:
+            name: Name of the checkpoint's folder; later ones sort behind earlier ones.
+            model: The network.
+            optimizer: Its optimizer.
+            progress: How far the run has come.
+            tokenizer: Stored beside the weights if the network reads prompts with that of T5.
+        """
         partial = self.checkpoints / f"{name}{_PARTIAL}"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        save_checkpoint(model, partial)
+        write_checkpoint(model, partial, tokenizer)
         save_file(_optimizer_tensors(optimizer), partial / OPTIMIZER_FILE)
         state = {field: getattr(progress, field) for field in Progress.__slots__}
         (partial / STATE_FILE).write_text(json.dumps(state), encoding="utf-8")

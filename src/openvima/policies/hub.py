@@ -1,0 +1,50 @@
+"""Policies on the Hugging Face Hub. Nothing is asked of it unless a name can only mean a repository there."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+from openvima.errors import CheckpointError, MissingExtraError
+
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+
+
+def is_hub_id(text: str) -> bool:
+    """Whether a text can only mean a repository on the Hub: "owner/name", and no folder here is that owner.
+
+    So "runs/frist" beside a folder "runs" is a mistyped path, and is not looked for on the Hub.
+    """
+    owner = text.partition("/")[0]
+    return _HUB_ID.fullmatch(text) is not None and not Path(text).exists() and not Path(owner).exists()
+
+
+def fetch_from_hub(hub_id: str, patterns: tuple[str, ...]) -> Path:
+    """Fetch the files of a repository that match the patterns; those fetched before are taken as they are.
+
+    Args:
+        hub_id: The repository, as "owner/name".
+        patterns: Names of files, with `*` for any part.
+
+    Returns:
+        The folder that holds them.
+
+    Raises:
+        MissingExtraError: `huggingface_hub` is not installed.
+        CheckpointError: There is no such repository, or it cannot be reached.
+    """
+    try:
+        hub = import_module("huggingface_hub")
+    except ImportError as error:
+        raise MissingExtraError(
+            f"there is no folder {hub_id!r} here; to fetch it from the Hugging Face Hub, install "
+            "huggingface_hub: pip install huggingface_hub"
+        ) from error
+    try:
+        return Path(hub.snapshot_download(hub_id, allow_patterns=list(patterns)))
+    except (
+        Exception
+    ) as error:  # the hub's client passes on those of its HTTP library, which has changed before
+        first_line = str(error).strip().partition("\n")[0] or type(error).__name__
+        raise CheckpointError(
+            f"there is no folder {hub_id!r} here, and the Hugging Face Hub did not give it: {first_line}"
+        ) from error
