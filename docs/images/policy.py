@@ -1,0 +1,354 @@
+"""Make policy.png beside this file: one prompt and two steps, token by token, as the policies read them.
+
+Words, crops, patches and bins are those that the networks get: the readers of openvima make them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any  # observations are nested mappings; the type of matplotlib's axes is not public
+
+import numpy as np
+import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch, Rectangle
+
+import openvima
+from openvima.policies import preset
+from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
+from openvima.policies.heads.bins import NUM_BINS, encode_bins
+from openvima.policies.inputs import WORD, Reader
+from openvima.policies.layers.trunk import PrefixConfig
+from openvima.policies.perception import ObjectViews, observe, whole_frames
+from openvima.policies.tokenizer import END_ID, word_ids
+from openvima.scene import PromptImage, RenderedPrompt
+
+SEED = 21  # a scene whose objects differ in colour; any other will do
+MISS_M = -0.2  # the first action places so far beside its goal, along y, so that there is a second one
+PATCH, PATCHES_IN_ROW, PATCHES = 32, 4, 8  # of a frame of 64 × 128 pixels
+
+WIDTH, HEIGHT = 11.0, 13.1  # of the figure in inches; all places below are inches from its upper left corner
+LEFT, SECOND = 0.95, 6.1  # where rows begin, and the second step
+GAP = 0.06  # between groups of small tokens
+INK, FAINT, PAPER, SUMMARY = "#1f2933", "#77818c", "#eef1f4", "#5b6773"
+FRONT, TOP, ACTION, READ, LAYERS = "#0072b2", "#d98200", "#00805c", "#9b2393", "#e9e4f1"
+VIEWS = (("front", FRONT), ("top", TOP))
+COMPONENTS = ("x", "y", "rotation x", "rotation y", "rotation z", "rotation w")
+BASELINES = {
+    "gato": ("VIMA-Gato", "16 tokens for a pair of frames, one a patch; the prompt begins the sequence"),
+    "flamingo": ("VIMA-Flamingo", "4 tokens sum up a pair of frames; cross-attention to the prompt"),
+    "gpt": ("VIMA-GPT", "1 token sums up a pair of frames; the prompt begins the sequence"),
+}
+STYLE = {"font.family": "DejaVu Sans", "font.size": 9, "text.color": INK}
+
+
+@dataclass(frozen=True)
+class Token:
+    """A word or an image (an empty text: features that sum up frames), its colour, and its name."""
+
+    content: str | np.ndarray
+    colour: str = FAINT
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Story:
+    """A prompt, two observations, and the bins of the actions that followed them."""
+
+    prompt: RenderedPrompt
+    observations: list[Mapping[str, Any]]
+    bins: list[np.ndarray]
+
+
+def play() -> Story:
+    """Play an episode whose first action misses."""
+    env = openvima.make("visual_manipulation", level="train").unwrapped
+    observation, info = env.reset(seed=SEED)
+    observations, bins = [], []
+    for miss_m in (MISS_M, 0.0):
+        action = env.oracle_decision().action
+        x, y = action.pose1_position
+        arrays = replace(action, pose1_position=(x, y + miss_m)).to_arrays()
+        values = np.concatenate([arrays[part] for part in ACTION_PARTS]).astype(np.float64)
+        observations.append(observation)
+        bins.append(encode_bins(to_unit_range(torch.from_numpy(values))).numpy())
+        observation, _, _, _, info = env.step(arrays)
+    assert info["success"]
+    return Story(env.prompt, observations, bins)
+
+
+# From what the readers give to what is drawn.
+
+
+def prompt_tokens(reader: Reader, prompt: RenderedPrompt) -> list[Token]:
+    """Return the tokens of a prompt."""
+    read = reader.read_prompt(prompt)
+    words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
+    return [
+        Token(words[int(word)]) if entry == WORD else image_token(reader, read.objects, entry, part)
+        for word, entry, part in zip(read.words, read.entries, read.parts, strict=True)
+    ]
+
+
+def step_tokens(reader: Reader, observation: Mapping[str, Any]) -> list[Token]:
+    """Return the tokens of an observation."""
+    objects = reader.begin_episode().read_step(observation).objects
+    if reader.layout == "frames":
+        return [image_token(reader, objects, 0, part) for part in range(reader.tokens_per_frame_pair)]
+    slots = [(k, view) for view in range(len(VIEWS)) for k in range(len(objects))]
+    return [replace(image_token(reader, objects, k, view), name=str(k + 1)) for k, view in slots]
+
+
+def image_token(reader: Reader, images: ObjectViews, entry: int, part: int) -> Token:
+    """Return one token of an image: a crop, a patch, or a blank where frames are summed up."""
+    if reader.layout == "views":
+        name, colour = VIEWS[part]
+        return Token(picture(images.crops[part, entry]), colour, f"{'ABC'[entry]} {name}")
+    if reader.tokens_per_frame_pair < 2 * PATCHES:
+        return Token("", SUMMARY)
+    view, place = divmod(part, PATCHES)
+    row, column = (PATCH * index for index in divmod(place, PATCHES_IN_ROW))
+    frame = images.crops[view, entry]
+    return Token(picture(frame[:, row : row + PATCH, column : column + PATCH]), VIEWS[view][1])
+
+
+def picture(image: np.ndarray) -> np.ndarray:
+    """Turn (3, height, width) into (height, width, 3)."""
+    return image.transpose(1, 2, 0)
+
+
+# Drawing.
+
+
+def draw_text(axes: Any, x: float, y: float, text: str, **style: Any) -> None:
+    """Write text, by default to the right of a point at half its height."""
+    axes.text(x, y, text, **{"va": "center"} | style)
+
+
+def draw_box(axes: Any, x: float, y: float, size: tuple[float, float], **style: Any) -> None:
+    """Draw a rounded box; x and y are its upper left corner."""
+    style = {"facecolor": PAPER, "edgecolor": FAINT, "linewidth": 0.8, "zorder": 2} | style
+    shape = f"round,pad=0,rounding_size={min(0.07, min(size) / 4)}"
+    axes.add_patch(FancyBboxPatch((x, y), *size, boxstyle=shape, **style))
+
+
+def draw_frame(axes: Any, x: float, y: float, size: tuple[float, float], **style: Any) -> None:
+    """Draw a rectangle that is not filled."""
+    axes.add_patch(Rectangle((x, y), *size, fill=False, **{"zorder": 3} | style))
+
+
+def draw_picture(axes: Any, image: np.ndarray, x: float, y: float, size: tuple[float, float]) -> None:
+    """Draw an image."""
+    extent = (x, x + size[0], y + size[1], y)
+    axes.imshow(image, extent=extent, interpolation="nearest", zorder=2)
+
+
+def draw_arrow(axes: Any, *points: tuple[float, float], colour: str = FAINT, width: float = 0.8) -> None:
+    """Draw a line through points, with a head at the last one."""
+    line = {"color": colour, "linewidth": width, "zorder": 4}
+    axes.plot(*zip(*points[:-1], strict=True), solid_joinstyle="miter", **line)
+    head = {"arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9, **line}
+    axes.annotate("", points[-1], points[-2], arrowprops=head, zorder=4)
+
+
+def draw_tokens(axes: Any, tokens: Sequence[Token], x: float, y: float, size: float) -> list[float]:
+    """Draw tokens from left to right, images as squares with their middle at y.
+
+    Returns:
+        The middle of each token, then the right end of the last one.
+    """
+    large = size > 0.3
+    gap = 0.06 if large else 0.025
+    middles = []
+    for token in tokens:
+        width, height = size, size
+        if isinstance(token.content, str):
+            if token.content:
+                width = max(0.2, 0.13 + 0.078 * max(map(len, token.content.split("\n"))))
+                height = max(size, 0.25)
+            fill = PAPER if token.content else token.colour
+            draw_box(axes, x, y - height / 2, (width, height), facecolor=fill, edgecolor=token.colour)
+            colour = ACTION if token.colour == ACTION else INK
+            draw_text(axes, x + width / 2, y, token.content, ha="center", fontsize=8.5, color=colour)
+        else:
+            draw_picture(axes, token.content, x, y - size / 2, (size, size))
+            style = {"edgecolor": token.colour, "linewidth": 1.8 if large else 0.7}
+            draw_frame(axes, x, y - size / 2, (size, size), **style)
+        style = {"ha": "center", "fontsize": 8, "color": token.colour}
+        draw_text(axes, x + width / 2, y - size / 2 - 0.1, token.name, **style)
+        middles.append(x + width / 2)
+        x += width + gap
+    return [*middles, x - gap]
+
+
+def draw_title(axes: Any, y: float, name: str, text: str) -> None:
+    """Write the name of a policy and what is particular to it."""
+    draw_text(axes, 0.2, y, name, fontsize=11, fontweight="bold")
+    draw_text(axes, 1.75, y, text)
+
+
+def draw_vima(axes: Any, story: Story) -> None:
+    """Draw the way of a prompt and two steps through VIMA."""
+    reader = Reader.of(preset("vima-nano").images)
+    draw_title(axes, 0.25, "VIMA", "one token for each object in each view; cross-attention to the prompt")
+    draw_prompt(axes, reader, story.prompt)
+    draw_text(axes, LEFT, 2.68, "history", fontweight="bold")
+    steps = zip((LEFT, SECOND), story.observations, story.bins, strict=True)
+    for number, (left, observation, bins) in enumerate(steps, 1):
+        draw_views(axes, observation, left, number)
+        note = "cut out of the views: 32 × 32 pixels and the box of each object"
+        draw_text(axes, left, 4.25, note, fontsize=8, color=FAINT)
+        *middles, end = draw_tokens(axes, step_tokens(reader, observation), left, 4.9, 0.58)
+        draw_text(axes, left, 5.3, "each with the end effector: suction cup", fontsize=8, color=FAINT)
+        for middle in middles:
+            draw_arrow(axes, (middle, 5.4), (middle, 5.6))
+        draw_answer(axes, bins, left, middles[-1], number)
+        if number == 1:
+            draw_past_action(axes, end)
+    draw_box(axes, LEFT, 5.6, (WIDTH - LEFT - 0.25, 0.46), facecolor=LAYERS)
+    draw_text(axes, LEFT + 0.15, 5.83, "decoder: n × (cross-attention to the prompt, self-attention)")
+    draw_text(axes, SECOND, 5.83, "causal: each token sees itself and what came before")
+
+
+def draw_prompt(axes: Any, reader: Reader, prompt: RenderedPrompt) -> None:
+    """Draw the prompt and its encoder."""
+    draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
+    draw_text(axes, SECOND + 0.3, 1.1, f"“{prompt.text}”", family="DejaVu Sans Mono", fontsize=8.5)
+    note = "A, B: the objects in the prompt’s two images,\nin the front view and in the top view."
+    draw_text(axes, SECOND + 0.3, 1.5, note, fontsize=8.5, linespacing=1.4)
+    *middles, end = draw_tokens(axes, prompt_tokens(reader, prompt), LEFT, 1.15, 0.58)
+    draw_box(axes, LEFT, 1.65, (end - LEFT, 0.38), facecolor=LAYERS)
+    draw_text(axes, (LEFT + end) / 2, 1.84, "text encoder (T5)", ha="center")
+    for middle in middles:
+        draw_arrow(axes, (middle, 1.45), (middle, 1.65))
+        draw_arrow(axes, (middle, 2.03), (middle, 2.2))
+        draw_box(axes, middle - 0.09, 2.2, (0.18, 0.18), facecolor=LAYERS)
+    draw_text(axes, end + 0.12, 2.29, "keys and values, computed once an episode", fontsize=8)
+    way = ((middles[0] - 0.12, 2.29), (0.55, 2.29), (0.55, 5.83), (LEFT, 5.83))
+    draw_arrow(axes, *way, colour=INK, width=1.2)
+    draw_text(axes, 0.42, 4.1, "cross-attention", rotation=90, ha="center", fontsize=8)
+
+
+def draw_views(axes: Any, observation: Mapping[str, Any], x: float, number: int) -> None:
+    """Draw both views of a step, with the boxes of the objects in them."""
+    objects = observe(observation)
+    width, top = 2.2, 3.0
+    for view, (name, colour) in enumerate(VIEWS):
+        left = x + view * (width + 0.1)
+        draw_text(axes, left, top - 0.12, f"step {number}, {name} view", fontsize=8, color=colour)
+        draw_picture(axes, picture(observation["rgb"][name]), left, top, (width, width / 2))
+        draw_frame(axes, left, top, (width, width / 2), edgecolor=colour)
+        for k in np.flatnonzero(objects.masks[view]):
+            centre_x, centre_y, box_height, box_width = objects.boxes[view, k] * width / 256
+            corner = (left + centre_x - box_width / 2, top + centre_y - box_height / 2)
+            draw_frame(axes, *corner, (box_width, box_height), edgecolor="white", linewidth=0.8)
+            ground = {"facecolor": INK, "edgecolor": "none", "pad": 1}
+            style = {"color": "white", "fontsize": 7.5, "zorder": 4, "bbox": ground}
+            draw_text(axes, corner[0] + 0.02, corner[1] - 0.09, str(k + 1), **style)
+
+
+def draw_answer(axes: Any, bins: np.ndarray, x: float, middle: float, number: int) -> None:
+    """Draw the output that is read, and the bins that it stands for."""
+    draw_arrow(axes, (middle, 6.06), (middle, 6.5), colour=READ, width=2)
+    note = "read here: 12 choices of a bin"
+    draw_text(axes, middle - 0.12, 6.28, note, ha="right", fontsize=8, color=READ)
+    draw_box(axes, x, 6.5, (4.6, 1.45), facecolor="white", edgecolor=READ)
+    for component, (count, chosen) in enumerate(zip(NUM_BINS, bins, strict=True)):
+        pose, row = divmod(component, len(COMPONENTS))
+        left, y, width = x + 0.12 + 2.3 * pose, 6.82 + 0.19 * row, 0.9
+        if row == 0:
+            title = f"action {number}, {('pick', 'place')[pose]}"
+            draw_text(axes, left, y - 0.18, title, fontsize=8, color=READ)
+        draw_text(axes, left, y, COMPONENTS[row], fontsize=7.5)
+        draw_box(axes, left + 0.68, y - 0.05, (width, 0.1), linewidth=0.4)
+        mark = left + 0.68 + (width - 0.04) * chosen / (count - 1)
+        axes.add_patch(Rectangle((mark, y - 0.07), 0.04, 0.14, color=READ, zorder=3))
+        draw_text(axes, left + 1.64, y, f"{chosen} / {count}", fontsize=7.5)
+
+
+def draw_past_action(axes: Any, end: float) -> None:
+    """Draw the token of the first action, and how it comes into the history."""
+    middle, end = draw_tokens(axes, [Token("action\n1", ACTION)], end + 0.06, 4.9, 0.58)
+    draw_arrow(axes, (middle, 5.4), (middle, 5.6))
+    way = ((LEFT + 4.6, 7.2), (end + 0.15, 7.2), (end + 0.15, 4.9), (end + 0.01, 4.9))
+    draw_arrow(axes, *way, colour=ACTION, width=1.5)
+
+
+def draw_baselines(axes: Any, story: Story) -> None:
+    """Draw what the baselines make of the same prompt and steps."""
+    heading = "The same episode as the baselines see it: whole frames, front and top, of 64 × 128 pixels"
+    axes.plot((0.2, WIDTH - 0.25), (8.2, 8.2), color=FAINT, linewidth=0.8)
+    draw_text(axes, 0.2, 8.4, heading, fontweight="bold")
+    for y, (family, (name, text)) in zip((8.82, 10.25, 11.65), BASELINES.items(), strict=True):
+        draw_title(axes, y, name, text)
+        draw_baseline(axes, story, family, y)
+
+
+def draw_baseline(axes: Any, story: Story, family: str, y: float) -> None:
+    """Draw the tokens of one baseline below its title: all in one sequence, or prompt and history apart."""
+    config = preset(f"{family}-nano")
+    reader = Reader.of(config.images)
+    images = [stacked(part.rgb) for part in story.prompt.sequence() if isinstance(part, PromptImage)]
+    is_patches = family == "gato"
+    x, y = LEFT, y + (0.32 if is_patches else 0.9)
+    for is_image, group in groupby(prompt_tokens(reader, story.prompt), lambda token: token.colour != FAINT):
+        x = draw_group(axes, list(group), x, y, images.pop(0) if is_image else None)[-1] + GAP
+    if is_patches:  # too long for one line
+        draw_text(axes, x, y, "…")
+        x, y = LEFT, y + 0.42
+        draw_text(axes, x - 0.15, y, "…", ha="right")
+    if isinstance(config.trunk, PrefixConfig):
+        x = draw_group(axes, [Token("separator")], x, y)[-1] + GAP
+    else:
+        draw_text(axes, x + 0.7, y - 0.13, "cross-attention", ha="center", fontsize=8)
+        draw_arrow(axes, (x + 0.02, y), (x + 1.38, y), colour=INK, width=1.2)
+        x += 1.45
+    for number, observation in enumerate(story.observations, 1):
+        *middles, end = draw_group(axes, step_tokens(reader, observation), x, y, stacked(observation["rgb"]))
+        draw_arrow(axes, (middles[-1], y + 0.12), (middles[-1], y + 0.36), colour=READ, width=1.5)
+        draw_text(axes, middles[-1] - 0.08, y + 0.25, f"action {number}", ha="right", fontsize=8, color=READ)
+        if number == 1:
+            *_, end = draw_group(axes, [Token("action 1", ACTION)], end + GAP, y)
+        x = end + GAP
+
+
+def draw_group(
+    axes: Any, tokens: Sequence[Token], x: float, y: float, frames: np.ndarray | None = None
+) -> list[float]:
+    """Draw words, patches, or a pair of frames above the tokens that sum them up; return as `draw_tokens`."""
+    is_summary = frames is not None and isinstance(tokens[0].content, str)
+    if not is_summary:
+        return draw_tokens(axes, tokens, x, y, 0.205)
+    side, size = 0.5, 0.16
+    width = (size + 0.025) * len(tokens) - 0.025
+    whole = max(side, width)
+    left = x + (whole - side) / 2
+    draw_picture(axes, frames, left, y - 0.13 - side, (side, side))
+    draw_frame(axes, left, y - 0.13 - side, (side, side), edgecolor=SUMMARY, linewidth=0.6)
+    *middles, _ = draw_tokens(axes, tokens, x + (whole - width) / 2, y, size)
+    return [*middles, x + whole]
+
+
+def stacked(rgb: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Put both frames, as the baselines see them, one above the other."""
+    return picture(np.concatenate(list(whole_frames(rgb).crops[:, 0]), axis=1))
+
+
+def draw() -> Figure:
+    """Draw all of it; `draw().savefig("policy.pdf")` gives it in a form for print."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, HEIGHT))
+        axes = figure.add_axes((0, 0, 1, 1))
+        story = play()
+        draw_vima(axes, story)
+        draw_baselines(axes, story)
+        axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
+        axes.axis("off")
+    return figure
+
+
+if __name__ == "__main__":
+    # without the version of matplotlib, so that the bytes change with the picture only
+    draw().savefig(Path(__file__).with_suffix(".png"), dpi=160, metadata={"Software": None})
