@@ -91,6 +91,10 @@ class PolicyError(OpenVimaError, ValueError):
     """A policy was given inputs that it cannot take."""
 
 
+class DetectionError(OpenVimaError, ValueError):
+    """What a detector found cannot be: a box outside the image, or a score that is no number."""
+
+
 class CheckpointError(OpenVimaError, ValueError):
     """A checkpoint is damaged or does not fit the model."""
 
