@@ -237,7 +237,7 @@ def _slots(object_ids: Sequence[int], steps: Sequence[StepInput]) -> np.ndarray:
     slots = np.full(len(steps), -1)
     for t, (object_id, step) in enumerate(zip(object_ids, steps, strict=True)):
         found = np.flatnonzero(step.objects.ids == object_id)
-        if len(found):
+        if object_id >= 0 and len(found):  # negative ids name nothing
             slots[t] = found[0]
     return slots
 
