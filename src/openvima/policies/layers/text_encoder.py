@@ -96,15 +96,20 @@ class TextBlock(nn.Module):
 
 
 class RmsNorm(nn.Module):
-    """Division by the root mean square, and a weight per channel; no mean is subtracted."""
+    """Division by the root mean square, and a weight per channel; no mean is subtracted.
+
+    Squares are taken in float32 at least: in half precision they overflow, or lose most of their digits.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.ones(width))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Normalise the last axis."""
-        return x * torch.rsqrt(x.square().mean(-1, keepdim=True) + 1e-6) * self.weight
+        """Normalise the last axis; the result has the precision of `x`."""
+        wide = x.to(torch.promote_types(x.dtype, torch.float32))
+        scale = torch.rsqrt(wide.square().mean(-1, keepdim=True) + 1e-6)
+        return (wide * scale).to(x.dtype) * self.weight
 
 
 def relative_bucket(offset: torch.Tensor) -> torch.Tensor:

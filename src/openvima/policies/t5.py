@@ -1,0 +1,233 @@
+"""T5 as the reader of prompts: its tokenizer, and its encoder's weights.
+
+Both come from a local folder, as `save_pretrained` of transformers writes it, or from the Hugging Face Hub.
+Nothing is fetched from there unless an id is given.
+"""
+
+import pickle
+import re
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import torch
+from safetensors import SafetensorError, safe_open
+
+from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
+from openvima.policies.hub import fetch_from_hub
+from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
+from openvima.policies.network import PolicyNetwork
+from openvima.policies.published.table import T5, to_theirs
+from openvima.policies.tokenizer import CLOSED_TOKENIZER, END_ID, PADDING_ID, Tokenizer
+
+if TYPE_CHECKING:
+    from transformers import PreTrainedTokenizerFast
+
+_UNKNOWN_ID = 2
+_WORD_START = "▁"  # T5 marks the beginning of a word with it
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")  # T5 may be named without its owner
+_FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
+_TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
+_SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
+_SHOWN = 6  # differences that a message lists
+
+
+class T5Tokenizer:
+    """The tokenizer of T5, read through transformers.
+
+    Every word is encoded on its own, with the marker of a word's beginning before it. So a full stop after a
+    placeholder is a word, "▁" and ".", and no marker is left over before a placeholder. That is how published
+    policies read; versions of transformers split whole texts in different ways, but not single words.
+
+    Args:
+        path_or_hub_id: A folder with `tokenizer.json` (or `spiece.model`, for which transformers needs the
+            packages sentencepiece and protobuf), or an id on the Hugging Face Hub such as "t5-base".
+
+    Raises:
+        CheckpointError: There is no such tokenizer, or it is not that of T5.
+        MissingExtraError: A package that reads it is not installed.
+    """
+
+    end_id = END_ID
+
+    def __init__(self, path_or_hub_id: str | Path) -> None:
+        self._tokenizer = _read_tokenizer(path_or_hub_id)
+        self._special_ids = frozenset(self._tokenizer.all_special_ids)
+        self._words: dict[str, list[int]] = {}  # prompts repeat a few hundred words over and over
+
+    def __len__(self) -> int:
+        """Number of ids."""
+        return len(self._tokenizer)
+
+    def encode(self, text: str) -> list[int]:
+        """Turn a piece of text without placeholders into ids, without the end mark.
+
+        Raises:
+            PromptError: T5 has no ids for a word.
+        """
+        words = text.split()
+        unknown = [word for word in words if not self._special_ids.isdisjoint(self._encode_word(word))]
+        if unknown:
+            shown = ", ".join(repr(word) for word in dict.fromkeys(unknown))
+            raise PromptError(
+                f"the prompt text {text!r} contains {shown}, which the vocabulary of T5 lacks. "
+                "Write it in other letters, without special tokens."
+            )
+        return [piece for word in words for piece in self._encode_word(word)]
+
+    def save(self, folder: str | Path) -> None:
+        """Write the tokenizer's files into a folder, from which `T5Tokenizer` reads it again."""
+        self._tokenizer.save_pretrained(str(folder))
+
+    def _encode_word(self, word: str) -> list[int]:
+        if word not in self._words:
+            backend = self._tokenizer.backend_tokenizer
+            self._words[word] = backend.encode(word, add_special_tokens=False).ids
+        return self._words[word]
+
+
+def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None) -> Tokenizer:
+    """Return the tokenizer that a prompt encoder reads with.
+
+    Args:
+        config: The prompt encoder.
+        source: Where T5's tokenizer is, for those that need it; see `T5Tokenizer`.
+
+    Raises:
+        PolicyError: It needs T5's tokenizer, and no source is given or the vocabularies differ.
+        CheckpointError: The source has no such tokenizer.
+        MissingExtraError: A package that reads it is not installed.
+    """
+    if config.tokenizer == "closed":
+        return CLOSED_TOKENIZER
+    if source is None:
+        raise PolicyError(
+            "this policy reads prompts with the tokenizer of T5; give it: a folder that holds its files, or "
+            "'t5-base' to fetch it from the Hugging Face Hub."
+        )
+    tokenizer = T5Tokenizer(source)
+    if len(tokenizer) > config.vocabulary_size:
+        raise PolicyError(
+            f"the tokenizer of {source} has {len(tokenizer)} ids, the policy {config.vocabulary_size}; take "
+            "the tokenizer that belongs to it."
+        )
+    return tokenizer
+
+
+def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
+    """Copy the word embedding and the encoder of T5 into the prompt encoder of a network.
+
+    Args:
+        network: Its text encoder must have the sizes of the file's; that of the published presets is t5-base.
+        path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (of which only tensors are
+            read, no code), or an id on the Hugging Face Hub such as "t5-base".
+
+    Raises:
+        CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.
+        MissingExtraError: An id is given and huggingface_hub is not installed.
+    """
+    file = _weights_file(path_or_hub_id)
+    tensors = _read_encoder(file)
+    expected = _expected(network)
+    problems = _differences(tensors, expected)
+    if problems:
+        more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        raise CheckpointError(
+            f"{file} does not fit the text encoder: {'; '.join(problems[:_SHOWN])}{more}. "
+            "The published presets take t5-base; others a T5 of version 1.0 of their sizes."
+        )
+    for name, tensor in expected.items():
+        tensor.copy_(tensors[name])
+
+
+def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
+    folder = _folder(path_or_hub_id, _TOKENIZER_FILES)
+    if not any((folder / name).is_file() for name in (_FAST_FILE, _SENTENCEPIECE_FILE)):
+        # Without this check transformers would make up a vocabulary of special tokens alone.
+        raise CheckpointError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
+    if not (folder / _FAST_FILE).is_file():
+        _require("sentencepiece", f"{folder / _SENTENCEPIECE_FILE}", "sentencepiece protobuf")
+    transformers = _require("transformers", "the tokenizer of T5", "'openvima[t5]'")
+    try:
+        tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
+    except Exception as error:  # tokenizers raises no narrower one for a damaged file
+        raise CheckpointError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
+    _check_is_t5(tokenizer, str(path_or_hub_id))
+    return tokenizer
+
+
+def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
+    ids = (tokenizer.pad_token_id, tokenizer.eos_token_id, tokenizer.unk_token_id)
+    pieces = tokenizer.backend_tokenizer.encode("Put", add_special_tokens=False).tokens
+    if ids != (PADDING_ID, END_ID, _UNKNOWN_ID) or not pieces[0].startswith(_WORD_START):
+        raise CheckpointError(
+            f"the tokenizer of {source} is not that of T5: padding, end and unknown are {ids} instead of "
+            f"{(PADDING_ID, END_ID, _UNKNOWN_ID)}, or words do not begin with {_WORD_START!r}."
+        )
+
+
+def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
+    """The weights to be copied into, by their names in files of T5; published policies use these as well."""
+    expected = {"shared.weight": network.prompt.words.weight.detach()}
+    for ours, tensor in network.state_dict().items():
+        named = to_theirs("vima", ours) if ours.startswith("prompt.text.") else None
+        if named:
+            expected["encoder" + named[0].removeprefix(T5)] = tensor
+    return expected
+
+
+def _differences(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
+    missing = [f"it lacks {name}" for name in expected if name not in tensors]
+    unknown = [f"it has {name}, for which there is no place" for name in tensors if name not in expected]
+    differing = [
+        f"{name} is {tuple(tensors[name].shape)} instead of {tuple(wanted.shape)}"
+        for name, wanted in expected.items()
+        if name in tensors and tensors[name].shape != wanted.shape
+    ]
+    return differing + missing + unknown
+
+
+def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
+    """Read word embedding and encoder; decoder and language model head are left out."""
+    try:
+        if file.name == _SAFE_FILE:
+            with safe_open(file, framework="pt") as weights:
+                tensors = {name: weights.get_tensor(name) for name in _of_encoder(weights.keys())}
+        else:
+            weights = torch.load(file, map_location="cpu", weights_only=True)
+            tensors = {name: weights[name] for name in _of_encoder(weights)}
+    except (OSError, RuntimeError, EOFError, SafetensorError, pickle.UnpicklingError) as error:
+        raise CheckpointError(f"{file} holds no weights that can be read ({error}).") from error
+    copy = tensors.pop("encoder.embed_tokens.weight", None)  # the same table under its other name
+    return tensors if copy is None else {"shared.weight": copy, **tensors}
+
+
+def _of_encoder(names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.startswith(("shared.", "encoder."))]
+
+
+def _weights_file(path_or_hub_id: str | Path) -> Path:
+    for name in (_SAFE_FILE, _PICKLE_FILE):
+        file = _folder(path_or_hub_id, (name,)) / name
+        if file.is_file():
+            return file
+    raise CheckpointError(f"{path_or_hub_id} holds neither {_SAFE_FILE} nor {_PICKLE_FILE}.")
+
+
+def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
+    """The folder itself; or, for an id, the folder into which these files are fetched."""
+    folder, name = Path(path_or_hub_id), str(path_or_hub_id)
+    if folder.is_dir():
+        return folder
+    if folder.exists() or not _HUB_ID.fullmatch(name):
+        raise CheckpointError(f"{name} is no folder, and no id on the Hugging Face Hub such as 't5-base'.")
+    return fetch_from_hub(name, files)
+
+
+def _require(module: str, what: str, packages: str) -> ModuleType:
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(f"{what} needs {module}; install it with: pip install {packages}") from error
