@@ -1,0 +1,323 @@
+"""Published weights: names both ways, sizes from shapes, and files that are read without executing them."""
+
+import os
+import pickle
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import CheckpointError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.families.common import Size  # noqa: E402
+from openvima.policies.families.flamingo import flamingo  # noqa: E402
+from openvima.policies.families.gato import gato  # noqa: E402
+from openvima.policies.families.gpt import gpt  # noqa: E402
+from openvima.policies.families.vima import vima  # noqa: E402
+from openvima.policies.layers.prompt_encoder import PromptEncoderConfig  # noqa: E402
+from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network, outline_network  # noqa: E402
+from openvima.policies.presets import FAMILIES, SIZE_NAMES  # noqa: E402
+from openvima.policies.published import (  # noqa: E402
+    config_from_published,
+    from_published,
+    load_published,
+    to_published,
+)
+
+MEMBERS = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+DECODER_NAMES = {
+    "vima": ("xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
+    "flamingo": ("dt_n_layers", "dt_n_heads", "xattn_n_heads"),
+}
+
+
+def small(family: str) -> PolicyConfig:
+    """A member of the published architecture with few and narrow layers; every width is another."""
+    text = TextEncoderConfig(width=40, num_layers=3, num_heads=2, head_width=6, hidden_width=20)
+    prompt = PromptEncoderConfig(
+        text, 28, vocabulary_size=30, tokenizer="t5", train_words=False, trained_layers=2
+    )
+    size = Size(32, 2, 4, prompt, image_width=48, image_layers=2, hidden_width=12, action_width=10)
+    config = MEMBERS[family](size)
+    if isinstance(config.trunk, DecoderConfig):
+        return replace(config, trunk=replace(config.trunk, num_cross_heads=2))
+    return config
+
+
+def cfg_of(config: PolicyConfig, family: str) -> dict[str, int]:
+    """What a published file says about a network beside its weights."""
+    trunk = config.trunk
+    if isinstance(trunk, PrefixConfig):
+        return {"embed_dim": trunk.width, "n_layer": trunk.num_layers, "n_head": trunk.num_heads}
+    numbers = (trunk.num_layers, trunk.num_self_heads, trunk.num_cross_heads)
+    return {"embed_dim": trunk.width, **dict(zip(DECODER_NAMES[family], numbers, strict=True))}
+
+
+def assert_same(actual: dict, expected: dict) -> None:
+    assert actual.keys() == expected.keys()
+    different = [name for name in expected if not torch.equal(actual[name], expected[name])]
+    assert different == []
+
+
+@pytest.fixture(params=FAMILIES)
+def family(request) -> str:
+    return request.param
+
+
+@pytest.fixture
+def network(family) -> PolicyNetwork:
+    """A fresh network, none of whose weights is like another; most would start at 0 or 1 or in symmetry."""
+    network = build_network(small(family), seed=5)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+def contents(network: PolicyNetwork, family: str, *, dead_entries: bool = True) -> dict:
+    weights = to_published(network, dead_entries=dead_entries)
+    return {
+        "state_dict": {f"policy.{name}": tensor for name, tensor in weights.items()},
+        "cfg": cfg_of(network.config, family),
+    }
+
+
+@pytest.fixture
+def vima_contents() -> dict:
+    return contents(build_network(small("vima"), seed=0), "vima")
+
+
+def saved(values: object, folder: Path) -> Path:
+    file = folder / "policy.ckpt"
+    torch.save(values, file)
+    return file
+
+
+def test_names_go_to_published_ones_and_back(network) -> None:
+    published = to_published(network, dead_entries=True)
+    assert_same(from_published(published), network.state_dict())
+
+
+def test_a_prefix_is_stripped_from_the_beginning_only(network) -> None:
+    published = {f"policy.{name}": tensor for name, tensor in to_published(network).items()}
+    published["policy.an.inner.policy.weight"] = torch.zeros(1)
+    renamed = from_published(published)
+    assert torch.equal(renamed.pop("an.inner.policy.weight"), torch.zeros(1))
+    assert_same(renamed, network.state_dict())
+
+
+def test_matrices_of_the_trunk_are_published_the_other_way_round(network, family) -> None:
+    trunk = "xattn_gpt" if family in DECODER_NAMES else "transformer.lm"
+    block, published = network.trunk.self_blocks[1], to_published(network)
+    for name, ours in (
+        ("attn.c_attn", block.query_key_value),
+        ("attn.c_proj", block.attention_out),
+        ("mlp.c_fc", block.widen),
+        ("mlp.c_proj", block.narrow),
+    ):
+        assert torch.equal(published[f"{trunk}.h.1.{name}.weight"], ours.weight.T)
+    assert torch.equal(published[f"{trunk}.h.1.mlp.gated_layer.weight"], block.gate.weight)
+    vit = network.images.crop_encoder if family == "vima" else network.images.frame_encoder
+    name = "obj_encoder.cropped_img_encoder.vit.projection"
+    assert torch.equal(published[name], vit.projection.weight.T)
+
+
+def test_weights_are_published_and_read_in_float32(network) -> None:
+    assert {tensor.dtype for tensor in to_published(network.bfloat16()).values()} == {torch.float32}
+    halves = {name: tensor.half() for name, tensor in to_published(network).items()}
+    assert {tensor.dtype for tensor in from_published(halves).values()} == {torch.float32}
+
+
+def test_a_network_with_parts_of_its_own_has_no_published_names() -> None:
+    with pytest.raises(
+        CheckpointError, match=r"no published policy has: query, .*images\.appearance\.weight"
+    ):
+        to_published(outline_network(preset("nano-bins")))
+
+
+def test_weights_of_something_else_are_refused() -> None:
+    with pytest.raises(CheckpointError, match="no weights of VIMA, VIMA-Gato"):
+        from_published({"layers.0.weight": torch.zeros(2)})
+
+
+@pytest.mark.parametrize(
+    ("family", "size"), [("vima", size) for size in SIZE_NAMES[1:]] + [(name, "9m") for name in FAMILIES[1:]]
+)
+def test_sizes_of_every_published_network_follow_from_its_weights(family, size) -> None:
+    config = preset(f"{family}-{size}")
+    weights = to_published(outline_network(config), dead_entries=True)
+    assert config_from_published(weights, cfg_of(config, family)) == config
+
+
+def test_sizes_of_small_networks_follow_from_their_weights(network, family) -> None:
+    config = network.config
+    assert config_from_published(to_published(network), cfg_of(config, family)) == config
+
+
+def test_heads_are_taken_from_cfg(vima_contents) -> None:
+    cfg = vima_contents["cfg"] | {"sattn_n_heads": 16, "xattn_n_heads": 8}
+    trunk = config_from_published(vima_contents["state_dict"], cfg).trunk
+    assert trunk == DecoderConfig(width=32, num_layers=2, num_self_heads=16, num_cross_heads=8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"embed_dim": 64}, "cfg says embed_dim 64, but the weights have 32"),
+        ({"embed_dim": 64, "xf_n_layers": 3}, "embed_dim 64, .* 32; xf_n_layers 3, but the weights have 2"),
+        ({"xattn_n_heads": None}, "cfg has xattn_n_heads None; it must hold embed_dim, xf_n_layers, "),
+        ({"sattn_n_heads": 4.0, "xattn_n_heads": True}, "cfg has sattn_n_heads 4.0, xattn_n_heads True;"),
+        ({"sattn_n_heads": 5}, "width 32 must be a multiple of its 5 heads"),
+    ],
+)
+def test_a_cfg_that_does_not_fit_is_refused(vima_contents, tmp_path, change, message) -> None:
+    vima_contents["cfg"] |= change
+    file = saved(vima_contents, tmp_path)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_published(file)
+    assert str(caught.value).startswith(str(file))
+
+
+@pytest.mark.parametrize("dead_entries", [True, False])
+def test_a_file_becomes_the_network_with_or_without_dead_entries(
+    network, family, tmp_path, dead_entries
+) -> None:
+    loaded = load_published(saved(contents(network, family, dead_entries=dead_entries), tmp_path))
+    assert loaded.config == network.config
+    assert not loaded.training
+    assert_same(loaded.state_dict(), network.state_dict())
+    assert_same(dict(loaded.named_buffers()), dict(network.named_buffers()))
+    trained = {name: parameter.requires_grad for name, parameter in network.named_parameters()}
+    assert {name: parameter.requires_grad for name, parameter in loaded.named_parameters()} == trained
+
+
+def test_masks_that_some_versions_store_may_be_there_in_every_family(network, family, tmp_path) -> None:
+    values = contents(network, family)
+    trunk = "xattn_gpt" if family in DECODER_NAMES else "transformer.lm"
+    values["state_dict"][f"policy.{trunk}.h.0.attn.bias"] = torch.ones(1, 1, 512, 512).tril()
+    assert_same(load_published(saved(values, tmp_path)).state_dict(), network.state_dict())
+
+
+def test_loading_draws_no_random_numbers(vima_contents, tmp_path) -> None:
+    file, before = saved(vima_contents, tmp_path), torch.get_rng_state()
+    load_published(file)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_all_that_is_missing_too_much_or_misshapen_is_told_at_once(vima_contents, tmp_path) -> None:
+    weights = vima_contents["state_dict"]
+    del weights["policy.end_effector_encoder.weight"], weights["policy.xattn_gpt.positions_embed.weight"]
+    weights["policy.surplus.weight"] = torch.zeros(1)
+    weights["policy.trunk.positions.weight"] = torch.zeros(512, 32)  # our name, not the published one
+    weights["policy.obs_fusion_layer.bias"] = torch.zeros(3)
+    weights["policy.obs_fusion_layer.weight"] = torch.zeros(32, 34, dtype=torch.int64)
+    with pytest.raises(CheckpointError) as caught:
+        load_published(saved(vima_contents, tmp_path))
+    message = str(caught.value)
+    for part in (
+        "missing: ",
+        "end_effector_encoder.weight",
+        "xattn_gpt.positions_embed.weight",
+        "unexpected: surplus.weight, trunk.positions.weight; ",
+        "wrong: ",
+        "obs_fusion_layer.bias is float32 (3,) instead of float32 (32,)",
+        "obs_fusion_layer.weight is int64 (32, 34) instead of float32 (32, 34)",
+    ):
+        assert part in message
+
+
+def test_missing_weights_that_tell_a_size_are_reported_as_missing(vima_contents, tmp_path) -> None:
+    weights = vima_contents["state_dict"]
+    stems = ("conv1", "t5.encoder.block.0.", "prompt_embedding", "mlps.0.0.", "pose0_position._layer.0.")
+    for name in [name for name in weights if any(stem in name for stem in stems)]:
+        del weights[name]
+    with pytest.raises(CheckpointError, match=r"missing: .*prompt_embedding\._embed_layer\.weight"):
+        load_published(saved(vima_contents, tmp_path))
+
+
+class Touch:
+    """Pickled, it makes whoever unpickles it carelessly create a file."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.file),)
+
+
+@pytest.mark.parametrize("entry", ["state_dict", "cfg", "more"])
+def test_code_in_a_file_is_refused_and_not_executed(vima_contents, tmp_path, entry) -> None:
+    trace = tmp_path / "executed"
+    file = saved({**vima_contents, entry: Touch(trace)}, tmp_path)
+    with pytest.raises(CheckpointError, match=r"wants posix\.mkdir to be loaded.*Nothing was executed"):
+        load_published(file)
+    assert not trace.exists()
+    torch.load(file, weights_only=False)  # the file would have done it
+    assert trace.exists()
+
+
+def test_a_bare_pickle_is_not_even_read(tmp_path) -> None:
+    trace, file = tmp_path / "executed", tmp_path / "policy.ckpt"
+    file.write_bytes(pickle.dumps(Touch(trace)))
+    with pytest.raises(CheckpointError, match="no published checkpoint, which would be a torch zip archive"):
+        load_published(file)
+    assert not trace.exists()
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path) -> None:
+    for path in (tmp_path / "2M.ckpt", tmp_path):
+        with pytest.raises(CheckpointError, match=r"is no file\. A published checkpoint is a single file"):
+            load_published(path)
+
+
+def test_an_empty_file_and_another_archive_are_refused(tmp_path) -> None:
+    file = tmp_path / "policy.ckpt"
+    file.touch()
+    with pytest.raises(CheckpointError, match="no published checkpoint"):
+        load_published(file)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("weights.npy", b"numbers")
+    with pytest.raises(CheckpointError, match="is a zip archive, but no torch checkpoint"):
+        load_published(file)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
+def test_a_file_that_was_cut_is_refused(vima_contents, tmp_path, share) -> None:
+    file = saved(vima_contents, tmp_path)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CheckpointError, match="ends too early"):
+        load_published(file)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.9])
+def test_a_file_with_a_flipped_bit_is_refused(vima_contents, tmp_path, share) -> None:
+    """Torch itself would take damaged weights for whole ones."""
+    file = saved(vima_contents, tmp_path)
+    data = bytearray(file.read_bytes())
+    data[int(share * len(data))] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(CheckpointError, match="is damaged"):
+        load_published(file)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([1, 2], "holds a list; a published checkpoint holds the mappings state_dict and cfg"),
+        ({"state_dict": {}}, "holds the keys: state_dict; a published checkpoint holds"),
+        ({"state_dict": {}, "cfg": [1]}, "holds the keys: state_dict, cfg; a published checkpoint holds"),
+        ({"state_dict": {"policy.a": 3}, "cfg": {}}, "state_dict holds more than weights: policy.a"),
+        ({"state_dict": {}, "cfg": {}}, "these are no weights of VIMA"),
+    ],
+)
+def test_a_file_of_something_else_is_refused(tmp_path, values, message) -> None:
+    with pytest.raises(CheckpointError, match=message):
+        load_published(saved(values, tmp_path))
