@@ -1,4 +1,4 @@
-"""With either head, the loss of real demonstrations moves every parameter that it is meant to move."""
+"""The loss of real demonstrations moves every parameter that it is meant to move, and no other."""
 
 from dataclasses import replace
 
@@ -6,48 +6,165 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.families.common import Size  # noqa: E402
+from openvima.policies.families.flamingo import flamingo  # noqa: E402
+from openvima.policies.families.gato import gato  # noqa: E402
+from openvima.policies.families.gpt import gpt  # noqa: E402
+from openvima.policies.families.vima import vima  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.layers.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
+from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 from openvima.training.dataset import make_batch, read_examples  # noqa: E402
 
+FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+NUM_LAYERS = 3  # of the text encoder
+IN_A_BLOCK = (
+    "norm_attention",
+    "query",
+    "key",
+    "value",
+    "attention_out",
+    "norm_feed_forward",
+    "widen",
+    "narrow",
+)
+# Parameters that do not learn, by the number of layers of the text encoder that do.
+FROZEN = {
+    None: {"prompt.words.weight"},
+    2: {
+        "prompt.words.weight",
+        "prompt.text.position_bias.weight",
+        *(f"prompt.text.blocks.0.{name}.weight" for name in IN_A_BLOCK),
+    },
+    0: {
+        "prompt.words.weight",
+        "prompt.text.position_bias.weight",
+        *(f"prompt.text.blocks.{layer}.{name}.weight" for layer in range(NUM_LAYERS) for name in IN_A_BLOCK),
+        "prompt.text.norm_after.weight",
+    },
+}
 
-def without_gradient(model: PolicyNetwork, demonstrations) -> set[str]:
-    """Names of the parameters that the loss of the demonstrations leaves alone; none has a bad gradient."""
+
+def prompt_sizes(trained_layers: int | None, *, train_words: bool = False) -> PromptEncoderConfig:
+    text = TextEncoderConfig(width=48, num_layers=NUM_LAYERS, num_heads=2, head_width=8, hidden_width=64)
+    return PromptEncoderConfig(
+        text, 48, vocabulary_size(), train_words=train_words, trained_layers=trained_layers
+    )
+
+
+def published_layout(family: str, prompt: PromptEncoderConfig) -> PolicyConfig:
+    """A policy laid out as the published ones, in small."""
+    sizes = {"image_width": 48, "image_layers": 2, "image_heads": 4, "hidden_width": 32, "action_width": 16}
+    return FAMILIES[family](Size(width=64, num_layers=2, num_heads=2, prompt=prompt, **sizes))
+
+
+def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str]]:
+    """A network after a backward pass, and the names of the parameters that have a gradient."""
+    model = build_network(sizes, seed=0).eval()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():  # layers that start at zero stop gradients on their first step
         for parameter in model.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    examples = read_examples(demonstrations, Reader.of(model.config.images), validation_share=0, seed=0)
-    batch = make_batch(examples.training)
-    features = model.encode_images(examples.images)
-    memory = model.encode_prompts(batch.prompts, features)
-    inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
-    model.head.loss(inputs, batch.targets)[0].backward()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
-    return {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()}
-
-
-def test_the_pointing_loss_reaches_every_parameter(demonstrations, small_sizes) -> None:
-    assert without_gradient(build_network(small_sizes, seed=0).eval(), demonstrations) == set()
-
-
-def test_the_bins_loss_reaches_every_parameter_but_the_appearance_that_pointing_needs(
-    demonstrations, small_sizes
-) -> None:
-    sizes = replace(small_sizes, head=BinsConfig(hidden_width=32))
-    untouched = without_gradient(build_network(sizes, seed=0).eval(), demonstrations)
-    assert untouched == {"images.appearance.weight", "images.appearance.bias"}
-
-
-def test_separate_views_without_appearance_are_reached_too(demonstrations, small_sizes) -> None:
-    objects = replace(small_sizes.images, fuse_views=False, appearance_width=0)
-    sizes = replace(small_sizes, images=objects, head=BinsConfig(32), query_token=False)
-    model = build_network(sizes, seed=0).eval()
     examples = read_examples(demonstrations, Reader.of(sizes.images), validation_share=0, seed=0)
     batch = make_batch(examples.training)
     features = model.encode_images(examples.images)
     memory = model.encode_prompts(batch.prompts, features)
     inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
     model.head.loss(inputs, batch.targets)[0].backward()
-    assert {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()} == set()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+    return model, {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
+
+
+def names(model: PolicyNetwork) -> set[str]:
+    return {name for name, _ in model.named_parameters()}
+
+
+def test_the_pointing_loss_reaches_every_parameter(demonstrations, small_sizes) -> None:
+    model, moved = reached(small_sizes, demonstrations)
+    assert names(model) - moved == set()
+
+
+def test_the_bins_loss_reaches_every_parameter_but_the_appearance_that_pointing_needs(
+    demonstrations, small_sizes
+) -> None:
+    model, moved = reached(replace(small_sizes, head=BinsConfig(hidden_width=32)), demonstrations)
+    assert names(model) - moved == {"images.appearance.weight", "images.appearance.bias"}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_loss_reaches_every_parameter_of_the_nano_presets(family, demonstrations) -> None:
+    model, moved = reached(preset(f"{family}-nano"), demonstrations)
+    assert names(model) - moved == set()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("trained_layers", FROZEN)
+def test_the_loss_reaches_every_parameter_that_is_not_frozen_and_no_frozen_one(
+    family, trained_layers, demonstrations
+) -> None:
+    model, moved = reached(published_layout(family, prompt_sizes(trained_layers)), demonstrations)
+    assert names(model) - moved == FROZEN[trained_layers]
+    assert {name for name, p in model.named_parameters() if p.grad is None} == FROZEN[trained_layers]
+    assert {name for name, p in model.named_parameters() if not p.requires_grad} == FROZEN[trained_layers]
+
+
+def test_words_can_be_trained_with_a_frozen_text_encoder(demonstrations) -> None:
+    model, moved = reached(published_layout("gpt", prompt_sizes(0, train_words=True)), demonstrations)
+    assert names(model) - moved == FROZEN[0] - {"prompt.words.weight"}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_published_presets_freeze_the_words_and_all_but_two_layers_of_t5(family) -> None:
+    prompt = preset(f"{family}-2m").prompt
+    assert (prompt.train_words, prompt.trained_layers, prompt.text.num_layers) == (False, 2, 12)
+
+
+def prompt_encoder(trained_layers: int | None) -> PromptEncoder:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return PromptEncoder(prompt_sizes(trained_layers), image_token_width=16, width=64)
+
+
+def encoded(encoder: PromptEncoder, images_IE):
+    words_BL = torch.arange(20).view(2, 10)
+    images_BL = torch.full_like(words_BL, -1)
+    images_BL[:, 3 : 3 + len(images_IE) // 2] = torch.arange(len(images_IE)).view(2, -1)
+    return encoder(words_BL, images_BL, torch.ones_like(words_BL, dtype=torch.bool), images_IE)
+
+
+def test_gradients_reach_images_through_a_frozen_text_encoder() -> None:
+    images_IE = torch.randn(4, 16, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    encoded(prompt_encoder(0), images_IE).square().sum().backward()
+    assert images_IE.grad is not None
+    assert images_IE.grad.any(dim=1).all()
+
+
+def test_a_prompt_of_words_alone_leaves_no_graph_in_a_frozen_text_encoder() -> None:
+    encoder = prompt_encoder(0)
+    encoder.out.requires_grad_(False)
+    assert not encoded(encoder, torch.zeros(0, 16)).requires_grad
+
+
+def kept_for_backward(trained_layers: int | None) -> int:
+    """How many numbers a forward pass keeps for the gradients."""
+    encoder, sizes = prompt_encoder(trained_layers), {}
+
+    def note(tensor):
+        sizes[tensor.untyped_storage().data_ptr()] = tensor.numel()
+        kept.append(tensor)  # else its memory would be used again, and counted once
+        return tensor
+
+    kept: list = []
+    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
+        encoded(encoder, torch.ones(4, 16))
+    own = {parameter.untyped_storage().data_ptr() for parameter in encoder.parameters()}
+    return sum(size for place, size in sizes.items() if place not in own)
+
+
+def test_frozen_layers_keep_less_for_the_backward_pass() -> None:
+    assert kept_for_backward(0) < 0.8 * kept_for_backward(2) < 0.8 * kept_for_backward(None)

@@ -4,7 +4,6 @@ Both come from a local folder, as `save_pretrained` of transformers writes it, o
 Nothing is fetched from there unless an id is given.
 """
 
-import pickle
 import re
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -13,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
 from openvima.policies.hub import fetch_from_hub
@@ -104,8 +103,9 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
         return CLOSED_TOKENIZER
     if source is None:
         raise PolicyError(
-            "this policy reads prompts with the tokenizer of T5; give it: a folder that holds its files, or "
-            "'t5-base' to fetch it from the Hugging Face Hub."
+            "this policy reads prompts with the tokenizer of T5, which is not stored with it. Give it as "
+            "tokenizer=T5Tokenizer(FOLDER), or store it: `openvima policies convert IN OUT --tokenizer FOLDER`. "
+            "'t5-base' instead of a folder fetches it from the Hugging Face Hub."
         )
     tokenizer = T5Tokenizer(source)
     if len(tokenizer) > config.vocabulary_size:
@@ -198,7 +198,7 @@ def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
         else:
             weights = torch.load(file, map_location="cpu", weights_only=True)
             tensors = {name: weights[name] for name in _of_encoder(weights)}
-    except (OSError, RuntimeError, EOFError, SafetensorError, pickle.UnpicklingError) as error:
+    except Exception as error:  # damage to a pickled file shows as an error of any kind
         raise CheckpointError(f"{file} holds no weights that can be read ({error}).") from error
     copy = tensors.pop("encoder.embed_tokens.weight", None)  # the same table under its other name
     return tensors if copy is None else {"shared.weight": copy, **tensors}

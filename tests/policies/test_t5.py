@@ -1,0 +1,387 @@
+"""T5: the tokenizer's ids for pieces of prompts, and hidden states equal to those of transformers."""
+
+import json
+import sys
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("transformers")
+
+from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.layers.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for  # noqa: E402
+from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
+from openvima.scene import PromptImage, RenderedPrompt  # noqa: E402
+
+MARKER, STOP = 3, 5  # "▁" and ".", as in t5-base
+PIECES = ("▁", "X", ".", "▁the", "▁Put", "▁into", "in", "to", "▁Rot", "ate", "s", "3", "0", "▁degree", ",")
+IDS = {piece: number for number, piece in enumerate(PIECES, start=3)}
+TEXT = TextEncoderConfig(width=24, num_layers=3, num_heads=2, head_width=4, hidden_width=32)
+
+
+def write_tokenizer(folder: Path, pre_tokenizer=None) -> Path:
+    """A small tokenizer in the format of t5-base; by default with the same steps."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
+
+    special = ["<pad>", "</s>", "<unk>"]
+    extra = [f"<extra_id_{number}>" for number in reversed(range(100))]
+    scored = [(piece, -2.0 - 0.1 * number) for number, piece in enumerate(PIECES)]
+    vocabulary = [(name, 0.0) for name in special] + scored + [(name, 0.0) for name in extra]
+    tokenizer = Tokenizer(models.Unigram(vocabulary, unk_id=2))
+    tokenizer.pre_tokenizer = pre_tokenizer or pre_tokenizers.Sequence(
+        [pre_tokenizers.WhitespaceSplit(), pre_tokenizers.Metaspace()]
+    )
+    tokenizer.decoder = decoders.Metaspace()
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    tokenizer.add_special_tokens(special + extra)
+    folder.mkdir(parents=True, exist_ok=True)
+    tokenizer.save(str(folder / "tokenizer.json"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tokenizer_folder(tmp_path_factory) -> Path:
+    return write_tokenizer(tmp_path_factory.mktemp("tokenizer"))
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tokenizer_folder) -> T5Tokenizer:
+    return T5Tokenizer(tokenizer_folder)
+
+
+def ids(*pieces: str) -> list[int]:
+    return [IDS[piece] for piece in pieces]
+
+
+def test_words_begin_with_the_marker(tokenizer) -> None:
+    assert tokenizer.encode("Put the") == ids("▁Put", "▁the")
+    assert tokenizer.encode("Rotates 30 degrees.") == ids(
+        "▁Rot", "ate", "s", "▁", "3", "0", "▁degree", "s", "."
+    )
+
+
+def test_no_piece_carries_special_ids_and_prompts_end_with_1(tokenizer) -> None:
+    assert tokenizer.end_id == 1
+    assert 1 not in tokenizer.encode("Put the.")
+
+
+def test_a_full_stop_after_a_placeholder_is_a_word_of_its_own(tokenizer) -> None:
+    assert tokenizer.encode(".") == [MARKER, STOP]
+    assert tokenizer.encode(". Put") == [MARKER, STOP, IDS["▁Put"]]
+
+
+def test_blanks_before_a_placeholder_leave_no_lone_marker(tokenizer) -> None:
+    assert tokenizer.encode(" into the  ") == ids("▁into", "▁the")
+    assert tokenizer.encode(" \n\t") == []
+
+
+@pytest.mark.parametrize("scheme", ["always", "first"])
+def test_other_conversions_of_the_same_vocabulary_give_the_same_ids(tokenizer, scheme, tmp_path) -> None:
+    """Some conversions leave out the split at blanks; transformers 4 takes that from the file as it is."""
+    from tokenizers import pre_tokenizers
+
+    steps = pre_tokenizers.Metaspace(prepend_scheme=scheme)
+    other = T5Tokenizer(write_tokenizer(tmp_path, steps))
+    other._tokenizer.backend_tokenizer.pre_tokenizer = steps  # which transformers 5 replaces
+    for text in ("Put the ", ".", " into the ", " , 30", "Rotates the."):
+        assert other.encode(text) == tokenizer.encode(text)
+
+
+def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(tokenizer) -> None:
+    import numpy as np
+
+    views = ("front", "top")
+    image = PromptImage(
+        "a",
+        "object",
+        {view: np.zeros((3, 128, 256), np.uint8) for view in views},
+        {view: np.zeros((128, 256), np.uint8) for view in views},
+        (),
+    )
+    prompt = RenderedPrompt("Put the {a} into the {a}.", {"a": image})
+    reader = Reader("frames", (64, 128), 1, tokenizer)
+    read = reader.read_prompt(prompt)
+    image_place = 0  # padding
+    assert read.words.tolist() == [
+        *ids("▁Put", "▁the"),
+        image_place,
+        *ids("▁into", "▁the"),
+        image_place,
+        MARKER,
+        STOP,
+        1,
+    ]
+    assert (read.entries >= 0).tolist() == [word == image_place for word in read.words]
+
+
+def test_words_without_ids_are_all_named(tokenizer) -> None:
+    with pytest.raises(PromptError, match=r"'quokka', '{the}', '</s>', '<extra_id_3>'") as caught:
+        tokenizer.encode("Put the quokka {the} quokka </s> <extra_id_3>")
+    assert "'Put'" not in str(caught.value)
+
+
+def test_a_saved_tokenizer_is_read_again(tokenizer, tmp_path) -> None:
+    tokenizer.save(tmp_path / "new" / "folder")
+    again = T5Tokenizer(tmp_path / "new" / "folder")
+    assert again.encode("Put 30 into.") == tokenizer.encode("Put 30 into.")
+    assert len(again) == len(tokenizer) == 3 + len(PIECES) + 100
+
+
+def test_saved_files_do_not_tell_where_they_came_from(tokenizer, tokenizer_folder, tmp_path) -> None:
+    tokenizer.save(tmp_path)
+    assert not any(str(tokenizer_folder) in file.read_text("utf-8") for file in tmp_path.iterdir())
+
+
+def test_a_folder_without_tokenizer_is_refused(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match=r"neither tokenizer\.json nor spiece\.model"):
+        T5Tokenizer(tmp_path)
+
+
+def test_a_damaged_tokenizer_is_refused(tmp_path) -> None:
+    (tmp_path / "tokenizer.json").write_text('{"model":', encoding="utf-8")
+    with pytest.raises(CheckpointError, match="no tokenizer that can be read"):
+        T5Tokenizer(tmp_path)
+
+
+def test_the_tokenizer_of_another_model_is_refused(tokenizer_folder, tmp_path) -> None:
+    values = json.loads((tokenizer_folder / "tokenizer.json").read_text("utf-8"))
+    vocabulary = values["model"]["vocab"]
+    values["model"]["vocab"] = [vocabulary[1], vocabulary[0], *vocabulary[2:]]  # end and padding swapped
+    values["added_tokens"] = []
+    (tmp_path / "tokenizer.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(CheckpointError, match=r"not that of T5.*\(1, 0, 2\)"):
+        T5Tokenizer(tmp_path)
+
+
+def test_sentencepiece_is_named_where_only_its_file_is_there(tmp_path, monkeypatch) -> None:
+    (tmp_path / "spiece.model").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "sentencepiece", None)
+    with pytest.raises(MissingExtraError, match="pip install sentencepiece"):
+        T5Tokenizer(tmp_path)
+
+
+def test_a_missing_transformers_is_named_with_its_extra(tokenizer_folder, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(MissingExtraError, match=r"openvima\[t5\]"):
+        T5Tokenizer(tokenizer_folder)
+
+
+@pytest.mark.parametrize("name", ["./nowhere", "no where", "/nowhere/t5", "a/b/c"])
+def test_what_can_be_no_id_is_not_looked_for_on_the_hub(name, monkeypatch) -> None:
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the Hub"))
+    with pytest.raises(CheckpointError, match="no folder"):
+        T5Tokenizer(name)
+
+
+@pytest.mark.parametrize("name", ["t5-base", "google-t5/t5-base"])
+def test_an_id_is_fetched_from_the_hub_without_anything_that_is_not_needed(
+    name, tokenizer_folder, monkeypatch
+) -> None:
+    asked = []
+
+    def download(repository: str, allow_patterns: list[str]) -> str:
+        asked.append((repository, allow_patterns))
+        return str(tokenizer_folder)
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    assert T5Tokenizer(name).encode("Put") == ids("▁Put")
+    ((repository, patterns),) = asked
+    assert repository == name
+    assert "tokenizer.json" in patterns
+    assert not any("model.safetensors" in pattern or "*" in pattern for pattern in patterns)
+
+
+def t5_sizes(sizes, **changes):
+    """The sizes of a network, with a small T5 as its text encoder."""
+    prompt = replace(sizes.prompt, text=TEXT, vocabulary_size=128, tokenizer="t5")
+    return replace(sizes, prompt=replace(prompt, **changes))
+
+
+def test_the_tokenizer_follows_from_the_config(small_sizes, tokenizer_folder) -> None:
+    assert tokenizer_for(small_sizes.prompt) is CLOSED_TOKENIZER
+    prompt = t5_sizes(small_sizes).prompt
+    assert tokenizer_for(prompt, tokenizer_folder).encode("Put") == ids("▁Put")
+    with pytest.raises(PolicyError, match="'t5-base'"):
+        tokenizer_for(prompt)
+    with pytest.raises(PolicyError, match="118 ids, the policy 100"):
+        tokenizer_for(replace(prompt, vocabulary_size=100), tokenizer_folder)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """A small T5 encoder of transformers."""
+    from transformers import T5Config, T5EncoderModel
+
+    sizes = T5Config(vocab_size=128, d_model=24, d_kv=4, d_ff=32, num_layers=3, num_heads=2)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = T5EncoderModel(sizes).eval()
+        for parameter in model.parameters():  # norms differ from 1, biases of positions from each other
+            parameter.data.add_(0.3 * torch.randn(parameter.shape))
+    return model
+
+
+@pytest.fixture(scope="module")
+def weights_folder(reference, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("weights")
+    reference.save_pretrained(folder)
+    return folder
+
+
+def loaded(sizes, folder: Path, **changes) -> PolicyNetwork:
+    network = build_network(t5_sizes(sizes, **changes), seed=0).eval()
+    load_t5(network, folder)
+    return network
+
+
+@torch.no_grad()
+def test_hidden_states_equal_those_of_transformers_with_masks_and_far_positions(
+    reference, weights_folder, small_sizes
+) -> None:
+    prompt = loaded(small_sizes, weights_folder).prompt
+    generator = torch.Generator().manual_seed(1)
+    words_BL = torch.randint(0, 128, (3, 150), generator=generator)  # distances beyond the last bucket
+    mask_BL = torch.rand(3, 150, generator=generator) < 0.7
+    expected = reference(input_ids=words_BL, attention_mask=mask_BL.long()).last_hidden_state
+    actual = prompt.text(prompt.words(words_BL), mask_BL)
+    torch.testing.assert_close(actual[mask_BL], expected[mask_BL], rtol=0, atol=1e-5)
+
+
+def test_weights_in_pickled_and_in_half_precision_files_are_read(
+    reference, weights_folder, small_sizes, tmp_path
+) -> None:
+    expected = loaded(small_sizes, weights_folder).state_dict()
+    torch.save(reference.state_dict(), tmp_path / "pytorch_model.bin")
+    pickled = loaded(small_sizes, tmp_path).state_dict()
+    deepcopy(reference).bfloat16().save_pretrained(tmp_path / "half")
+    half = loaded(small_sizes, tmp_path / "half").state_dict()
+    for name, tensor in expected.items():
+        torch.testing.assert_close(pickled[name], tensor, rtol=0, atol=0)
+        assert half[name].dtype == torch.float32
+        torch.testing.assert_close(half[name], tensor, rtol=1e-2, atol=1e-2)
+
+
+def test_decoders_in_the_file_are_passed_over(reference, small_sizes, tmp_path) -> None:
+    values = {**reference.state_dict(), "decoder.final_layer_norm.weight": torch.ones(24)}
+    torch.save(values, tmp_path / "pytorch_model.bin")
+    assert torch.equal(loaded(small_sizes, tmp_path).prompt.words.weight, reference.shared.weight)
+
+
+def test_frozen_weights_are_copied_and_stay_frozen(reference, weights_folder, small_sizes) -> None:
+    network = loaded(small_sizes, weights_folder, train_words=False, trained_layers=0)
+    assert torch.equal(network.prompt.words.weight, reference.shared.weight)
+    assert not any(
+        p.requires_grad for p in [*network.prompt.words.parameters(), *network.prompt.text.parameters()]
+    )
+
+
+def test_weights_of_other_sizes_are_refused_in_one_message_and_change_nothing(
+    weights_folder, small_sizes
+) -> None:
+    sizes = t5_sizes(small_sizes, vocabulary_size=130, text=replace(TEXT, num_layers=2))
+    network = build_network(sizes, seed=0)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    with pytest.raises(CheckpointError) as caught:
+        load_t5(network, weights_folder)
+    message = str(caught.value)
+    assert "shared.weight is (128, 24) instead of (130, 24)" in message
+    assert "encoder.block.2.layer.0.SelfAttention.k.weight" in message
+    assert "; and 3 more." in message
+    assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
+
+
+def test_gated_encoders_of_later_versions_are_refused(reference, small_sizes, tmp_path) -> None:
+    values = dict(reference.state_dict())
+    values["encoder.block.1.layer.1.DenseReluDense.wi_0.weight"] = values.pop(
+        "encoder.block.1.layer.1.DenseReluDense.wi.weight"
+    )
+    torch.save(values, tmp_path / "pytorch_model.bin")
+    with pytest.raises(CheckpointError, match=r"lacks .*wi\.weight; it has .*wi_0\.weight.* version 1\.0"):
+        loaded(small_sizes, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "pytorch_model.bin"])
+def test_damaged_weights_are_refused(name, small_sizes, tmp_path) -> None:
+    (tmp_path / name).write_bytes(b"these are no weights")
+    with pytest.raises(CheckpointError, match="no weights that can be read"):
+        loaded(small_sizes, tmp_path)
+
+
+class Malicious:
+    """Would write a file when unpickled."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self):
+        return (Path.touch, (self.file,))
+
+
+def test_code_in_pickled_weights_is_not_executed(small_sizes, tmp_path) -> None:
+    torch.save({"shared.weight": Malicious(tmp_path / "executed")}, tmp_path / "pytorch_model.bin")
+    with pytest.raises(CheckpointError):
+        loaded(small_sizes, tmp_path)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_folder_without_weights_is_refused(small_sizes, tmp_path) -> None:
+    with pytest.raises(CheckpointError, match=r"neither model\.safetensors nor pytorch_model\.bin"):
+        loaded(small_sizes, tmp_path)
+
+
+def test_weights_are_loaded_without_transformers(weights_folder, small_sizes, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    loaded(small_sizes, weights_folder)
+
+
+@pytest.mark.parametrize("kept", ["model.safetensors", "pytorch_model.bin"])
+def test_weights_are_fetched_from_the_hub_pickled_only_if_there_are_no_others(
+    kept, reference, weights_folder, small_sizes, monkeypatch, tmp_path
+) -> None:
+    asked = []
+    torch.save(reference.state_dict(), tmp_path / "pytorch_model.bin")
+
+    def fetch(name: str, files: tuple[str, ...]) -> Path:
+        asked.append((name, files))
+        return weights_folder if kept == "model.safetensors" else tmp_path
+
+    monkeypatch.setattr("openvima.policies.t5.fetch_from_hub", fetch)
+    loaded(small_sizes, Path("google-t5/t5-base"))
+    files = ("model.safetensors", "pytorch_model.bin")
+    assert asked == [("google-t5/t5-base", (file,)) for file in files[: files.index(kept) + 1]]
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_the_norm_of_large_values_in_half_precision_is_that_of_float32(dtype) -> None:
+    norm, x = RmsNorm(768), 300 * torch.randn(4, 768, generator=torch.Generator().manual_seed(0))
+    halved = norm.to(dtype)(x.to(dtype))
+    assert halved.dtype == dtype
+    expected = norm.float()(x.to(dtype).float()).to(dtype)
+    torch.testing.assert_close(halved, expected, rtol=0, atol=0)
+
+
+def test_the_norm_keeps_the_precision_of_float64() -> None:
+    x = torch.randn(4, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    expected = x / (x.square().mean(-1, keepdim=True) + 1e-6).sqrt()
+    torch.testing.assert_close(RmsNorm(8).double()(x), expected, rtol=0, atol=1e-15)
+
+
+@torch.no_grad()
+def test_bfloat16_gives_finite_states_near_those_of_float32(weights_folder, small_sizes) -> None:
+    prompt = loaded(small_sizes, weights_folder).prompt
+    words_BL = torch.arange(40).view(1, -1)
+    mask_BL = torch.ones_like(words_BL, dtype=torch.bool)
+    mask_BL[:, ::5] = False
+    exact = prompt.text(prompt.words(words_BL), mask_BL)
+    prompt = prompt.bfloat16()
+    halved = prompt.text(prompt.words(words_BL), mask_BL)
+    assert halved.dtype == torch.bfloat16
+    assert halved.isfinite().all()
+    error = (halved.float() - exact)[mask_BL].square().mean().sqrt() / exact[mask_BL].square().mean().sqrt()
+    assert error < 0.03
