@@ -1,0 +1,288 @@
+"""Golden recordings of the published networks: their files, their inputs, and what ours makes of them.
+
+A recording is a file of arrays by name: inputs (`in.…`) and what the published code computed from them, with
+two prompts and three steps of two environments. Everything about sizes is read from the files.
+
+Shape suffixes: B batch, T steps, L places, Q slots of a step, D width, C components of an action.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
+from openvima.policies.heads.bins import BinsHead, decode_bins
+from openvima.policies.inputs import (
+    WORD,
+    HistoryBatch,
+    ImageStack,
+    PromptInput,
+    Reader,
+    StepInput,
+    batch_histories,
+    batch_prompts,
+)
+from openvima.policies.network import Memory, PolicyNetwork, outline_network
+from openvima.policies.perception import ObjectViews, see_nothing
+from openvima.policies.published import config_from_published, from_published
+from openvima.policies.tokenizer import PADDING_ID
+from openvima.render.camera import VIEWS
+
+FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
+TOLERANCE = 1e-4  # absolute, in float32; two runs of the published code differ by up to 2e-5
+_WORD_TYPE, _IMAGE_TYPE = 0, 1  # of a prompt's pieces; rows are filled up with -1
+
+Arrays = dict[str, np.ndarray]
+
+
+def needs(name: str) -> pytest.MarkDecorator:
+    """Skip a test where the folder has no recording of that name."""
+    return pytest.mark.skipif(not _file(name).is_file(), reason=f"no {name}.npz in {FOLDER}")
+
+
+def recording(name: str) -> Arrays:
+    """Return the arrays of a recording by name."""
+    with np.load(_file(name)) as arrays:
+        return dict(arrays)
+
+
+def recorded_names(name: str) -> list[str]:
+    """Return the names of all that was computed, so that a test can ask for each; none without the file."""
+    if not _file(name).is_file():
+        return []
+    with np.load(_file(name)) as arrays:
+        return [key for key in arrays.files if not key.startswith("in.")]
+
+
+@cache
+def described() -> dict:
+    """Return what the folder says about its recordings."""
+    return json.loads((FOLDER / "meta.json").read_text())
+
+
+def tiny_network(name: str) -> PolicyNetwork:
+    """Build a network from its weights in the folder; baselines take what they share from VIMA's."""
+    about = described()[name]
+    weights = load_file(FOLDER / f"{name}.safetensors")
+    if shared := about.get("keys_shared_with_vima_tiny"):
+        vima = load_file(FOLDER / "vima_tiny.safetensors")
+        weights |= {key: vima[key] for key in shared}
+    return network_of(weights, about["cfg"])
+
+
+def network_of(weights: Mapping[str, torch.Tensor], cfg: Mapping[str, int]) -> PolicyNetwork:
+    """Build a network from weights by their published names, in float32."""
+    network = outline_network(config_from_published(weights, cfg))
+    network.load_state_dict(from_published(weights), assign=True)
+    return network.eval()
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """A recording's inputs, as this package takes them.
+
+    Args:
+        prompts: One for each environment.
+        histories: Their steps.
+        actions_BTC: The actions taken, metres and quaternions; the last step's is made up, as none is known.
+    """
+
+    prompts: list[PromptInput]
+    histories: list[list[StepInput]]
+    actions_BTC: torch.Tensor
+
+
+def inputs_of(network: PolicyNetwork, recorded: Arrays) -> Inputs:
+    """Read the inputs of a recording."""
+    steps, batch = recorded["in.ee"].shape
+    histories = [
+        [step_of(recorded, "obs", (t, b), int(recorded["in.ee"][t, b])) for t in range(steps)]
+        for b in range(batch)
+    ]
+    bins = np.concatenate([recorded[f"in.action_bins.{key}"] for key in ACTION_PARTS], axis=-1)
+    unit_BTC = decode_bins(torch.from_numpy(bins).transpose(0, 1), torch.float64)
+    unit_BTC = torch.cat([unit_BTC, torch.full_like(unit_BTC[:, :1], 0.5)], dim=1)
+    return Inputs(_prompts(network, recorded), histories, from_unit_range(unit_BTC))
+
+
+def step_of(recorded: Arrays, kind: str, index: tuple[int, ...], end_effector: int) -> StepInput:
+    """Read one observation."""
+    objects, _ = _images(recorded, kind, index)
+    nowhere = np.zeros((len(objects), 2))
+    return StepInput(objects, nowhere, nowhere, end_effector)
+
+
+def encode_prompts(network: PolicyNetwork, prompts: Sequence[PromptInput]) -> Memory:
+    """Encode prompts as a policy does."""
+    stack = _stack(network)
+    numbers = [stack.add(prompt.objects.crops) for prompt in prompts]
+    return network.encode_prompts(batch_prompts(prompts, numbers), _features(network, stack))
+
+
+def read_histories(
+    network: PolicyNetwork, histories: Sequence[Sequence[StepInput]]
+) -> tuple[HistoryBatch, torch.Tensor]:
+    """Batch histories, and encode their images."""
+    stack = _stack(network)
+    numbers = [[stack.add(step.objects.crops) for step in history] for history in histories]
+    return batch_histories(histories, numbers), _features(network, stack)
+
+
+def decide_step_by_step(network: PolicyNetwork, memory: Memory, inputs: Inputs) -> torch.Tensor:
+    """Read one step at a time, keys and values kept; return the predictions, (B, T, D)."""
+    state, queries = network.begin(memory), []
+    for t in range(len(inputs.histories[0])):
+        history, features = read_histories(network, [steps[t : t + 1] for steps in inputs.histories])
+        previous_B1C = inputs.actions_BTC[:, max(t - 1, 0), None]
+        has_previous_B1 = torch.full(previous_B1C.shape[:2], t > 0)
+        read, state = network.extend(memory, state, history, features, previous_B1C, has_previous_B1)
+        queries.append(read.query_BTD)
+    return torch.cat(queries, dim=1)
+
+
+def predictions(network: PolicyNetwork, read: HeadInputs) -> Arrays:
+    """Return `pred_tokens`, and scores, bins and decoded values of each part, time first."""
+    head = network.head
+    assert isinstance(head, BinsHead)
+    logits = head.logits(read.query_BTD)
+    bins_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
+    unit_BTC = to_unit_range(head.decide(read).double())
+    result = {"pred_tokens": time_first(read.query_BTD)}
+    for key, part in ACTION_PARTS.items():
+        result[f"logits.{key}"] = time_first(torch.cat(logits[part], dim=-1))
+        result[f"bins.{key}"] = time_first(bins_BTC[..., part])
+        result[f"decoded.{key}"] = time_first(unit_BTC[..., part].float())
+    return result
+
+
+def time_first(tensor: torch.Tensor) -> np.ndarray:
+    """Swap the first two axes, as recordings have it."""
+    return tensor.transpose(0, 1).numpy()
+
+
+def only(values: np.ndarray, where: torch.Tensor) -> np.ma.MaskedArray:
+    """Mark the places where values mean something; `where` has the leading axes of the values."""
+    hidden = ~where.numpy().reshape(*where.shape, *[1] * (values.ndim - where.ndim))
+    return np.ma.array(values, mask=np.broadcast_to(hidden, values.shape))
+
+
+def assert_agrees(actual: np.ndarray, expected: np.ndarray, *, tolerance: float = TOLERANCE) -> None:
+    """Compare shapes, dtypes and values, integers and booleans exactly."""
+    assert actual.shape == expected.shape
+    assert actual.dtype == expected.dtype
+    if isinstance(actual, np.ma.MaskedArray):
+        actual, expected = actual.compressed(), expected[~np.ma.getmaskarray(actual)]
+    assert actual.size
+    if expected.dtype.kind == "f":
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance)
+    else:
+        np.testing.assert_array_equal(actual, expected)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """First argument and first result of every call of every module, by the module's name."""
+
+    inputs: dict[str, list[torch.Tensor]] = field(default_factory=dict)
+    outputs: dict[str, list[torch.Tensor]] = field(default_factory=dict)
+
+    def input(self, name: str) -> torch.Tensor:
+        """Return what a module was given; several calls one after the other along the second axis."""
+        return torch.cat(self.inputs[name], dim=1)
+
+    def output(self, name: str) -> torch.Tensor:
+        """Return what a module gave; several calls one after the other along the second axis."""
+        return torch.cat(self.outputs[name], dim=1)
+
+
+@contextmanager
+def watched(network: nn.Module) -> Iterator[Seen]:
+    """Note what the modules of a network take and give."""
+    seen = Seen()
+
+    def note(name: str, _: nn.Module, arguments: tuple, result: torch.Tensor | tuple) -> None:
+        seen.inputs.setdefault(name, []).append(arguments[0])
+        seen.outputs.setdefault(name, []).append(result[0] if isinstance(result, tuple) else result)
+
+    hooks = [module.register_forward_hook(partial(note, name)) for name, module in network.named_modules()]
+    try:
+        yield seen
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def _file(name: str) -> Path:
+    return FOLDER / f"{name}.npz"
+
+
+def _stack(network: PolicyNetwork) -> ImageStack:
+    return ImageStack(Reader.of(network.config.images).image_size)
+
+
+def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:
+    return network.encode_images(torch.from_numpy(stack.stacked()))
+
+
+def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:
+    """Words and images of all prompts follow each other in reading order."""
+    all_words, number, prompts = iter(recorded["in.words"]), 0, []
+    for types in recorded["in.prompt_types"]:
+        images: list[ObjectViews] = []
+        places: list[tuple[int, int, int, bool]] = []  # word, entry, part, counts
+        for piece in types[types >= 0]:
+            if piece == _WORD_TYPE:
+                places.append((int(next(all_words)), WORD, 0, True))
+                continue
+            first = sum(len(image) for image in images)
+            objects, counts = _images(recorded, "prompt", (number,))
+            images.append(objects)
+            number += 1
+            places += [
+                (PADDING_ID, first + slot, part, valid)
+                for slot, part, valid in _places(network, objects, counts)
+            ]
+        words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
+        prompts.append(PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images)))
+    return prompts
+
+
+def _places(
+    network: PolicyNetwork, objects: ObjectViews, counts: Sequence[int]
+) -> list[tuple[int, int, bool]]:
+    """Slot, part and validity of the tokens of one image."""
+    reader = Reader.of(network.config.images)
+    if reader.layout == "frames":
+        return [(0, part, True) for part in range(reader.tokens_per_frame_pair)]
+    return [
+        (k, view, bool(objects.masks[view, k])) for view, count in enumerate(counts) for k in range(count)
+    ]
+
+
+def _images(recorded: Arrays, kind: str, index: tuple[int, ...]) -> tuple[ObjectViews, list[int]]:
+    """Return the objects, or the frames, at an index, and how many slots each view has.
+
+    Views may have different numbers of slots; the shorter one is filled up, as both are equal here.
+    """
+    if f"in.{kind}.rgb.{VIEWS[0]}" in recorded:
+        frames = np.stack([recorded[f"in.{kind}.rgb.{view}"][index] for view in VIEWS])[:, None]
+        whole = see_nothing(1)
+        return ObjectViews(whole.ids, frames, whole.boxes, ~whole.masks, whole.grasps), [1, 1]
+    masks = [recorded[f"in.{kind}.mask.{view}"][index] for view in VIEWS]
+    objects = see_nothing(max(len(mask) for mask in masks))
+    for view, name in enumerate(VIEWS):
+        count = len(masks[view])
+        objects.crops[view, :count] = recorded[f"in.{kind}.cropped_img.{name}"][index]
+        objects.boxes[view, :count] = recorded[f"in.{kind}.bbox.{name}"][index]
+        objects.masks[view, :count] = masks[view]
+    return objects, [len(mask) for mask in masks]

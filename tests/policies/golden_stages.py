@@ -1,0 +1,240 @@
+"""Every stage of a network, under the names and in the order of axes in which recordings have it.
+
+Shape suffixes: B batch, T steps, L places, Q slots of a step, N slots of a view, V views, D width, C
+components of an action.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.policies.golden import (
+    Arrays,
+    Inputs,
+    Seen,
+    encode_prompts,
+    inputs_of,
+    only,
+    predictions,
+    read_histories,
+    step_of,
+    time_first,
+    watched,
+)
+
+from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, to_unit_range
+from openvima.policies.inputs import WORD, HistoryBatch, Reader, StepInput
+from openvima.policies.layers.trunk import Decoder, PrefixTrunk
+from openvima.policies.network import Memory, PolicyNetwork
+from openvima.render.camera import VIEWS
+
+
+@torch.inference_mode()
+def stages(network: PolicyNetwork, recorded: Arrays) -> Arrays:
+    """Compute what a recording has of its batch of two environments, from the first image to the actions."""
+    inputs = inputs_of(network, recorded)
+    with watched(network) as seen:
+        memory = encode_prompts(network, inputs.prompts)
+    result = _prompt_stages(network, seen, memory, inputs)
+    result |= _prompt_image_stages(network, recorded, seen)
+
+    history, features = read_histories(network, inputs.histories)
+    with watched(network) as seen:
+        slots_BTQD, mask_BTQ, _ = network.observe(history, features[history.crops_BTVN])
+        unit_BTC = network.head.as_history(to_unit_range(inputs.actions_BTC[:, :-1])).float()
+        actions_BTD = network.actions(unit_BTC)
+    result |= _step_image_stages(network, recorded, seen)
+    result["obs.tokens"] = _without_token_axis(time_first(slots_BTQD))
+    result["obs.mask"] = time_first(mask_BTQ)
+    result["action.concat"] = time_first(seen.inputs["actions.out"][0])
+    result["action.tokens"] = time_first(actions_BTD)
+
+    tokens_BLD = _interleaved(slots_BTQD, actions_BTD)
+    mask_BL = _interleaved(mask_BTQ, torch.ones_like(mask_BTQ[:, 1:, 0]))
+    result |= _sequence_stages(network, memory, tokens_BLD, mask_BL, inputs)
+    read = network(memory, history, features, inputs.actions_BTC)
+    return result | {f"out.{name}": value for name, value in predictions(network, read).items()}
+
+
+@torch.inference_mode()
+def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
+    """Play the first environment with the network's own actions, keys and values kept between steps.
+
+    The published code fills steps of fewer objects up with zero vectors, also when it has read them already,
+    and acts from the last. So its second reading of the first step, which has no effect, acts from a zero
+    vector, and the third step does. The `pred_tokens` of a step hold such repeated readings of all before it.
+    """
+    memory = encode_prompts(network, inputs_of(network, recorded).prompts[:1])
+    result = {"roll.prompt.tokens": time_first(memory.tokens_BLD), "roll.prompt.mask": memory.mask_BL.numpy()}
+    state = network.begin(memory)
+    steps: list[StepInput] = []
+    actions_B1C = [torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.float64)]  # none before the first step
+    for t, end_effector in enumerate(recorded["in.ee"][:, 0]):
+        steps.append(step_of(recorded, f"roll.step{t}", (), int(end_effector)))
+        history, features = read_histories(network, [steps[-1:]])
+        seen = network.observe(history, features[history.crops_BTVN])[0]
+
+        filled, counts = _filled(steps)
+        with _zero_vectors_beyond(network, counts[-1:]):
+            batch = read_histories(network, [filled[-1:]])
+            read, state = network.extend(memory, state, *batch, actions_B1C[-1], torch.tensor([[t > 0]]))
+        action_B1C = network.head.decide(read).double()
+        actions_B1C.append(action_B1C)
+        token = network.actions(network.head.as_history(to_unit_range(action_B1C)).float())
+        with _zero_vectors_beyond(network, counts):
+            batch = read_histories(network, [filled])
+            all_read = network(memory, *batch, torch.cat(actions_B1C[1:], dim=1))
+
+        step = predictions(network, read)
+        step |= {"obs_tokens": seen[0, 0].numpy(), "action_token": token[0, 0].numpy()}
+        step["pred_tokens"] = all_read.query_BTD[0].numpy()
+        step["pred_token"] = read.query_BTD[0, 0].numpy()
+        for key, part in ACTION_PARTS.items():
+            step[f"env_action.{key}"] = action_B1C[0, 0, part].float().numpy()
+        result |= {f"roll.step{t}.{name}": value for name, value in step.items()}
+    return result
+
+
+def _prompt_stages(network: PolicyNetwork, seen: Seen, memory: Memory, inputs: Inputs) -> Arrays:
+    within_BL = _within_prompts(memory, inputs)
+    rows = zip(seen.outputs["prompt.words"][0], inputs.prompts, strict=True)
+    words = [row[: len(prompt.words)][torch.from_numpy(prompt.entries == WORD)] for row, prompt in rows]
+    result = {
+        "prompt.word_emb": torch.cat(words).numpy(),
+        "prompt.assembled": only(seen.inputs["prompt.text"][0].numpy(), within_BL),
+        "prompt.t5_out": only(time_first(seen.outputs["prompt.text"][0]), within_BL.T),
+        "prompt.tokens": only(time_first(memory.tokens_BLD), within_BL.T),
+        "prompt.mask": memory.mask_BL.numpy(),
+    }
+    for block in range(len(network.prompt.text.blocks)):
+        tokens_BLW = seen.outputs[f"prompt.text.blocks.{block}"][0]
+        result[f"prompt.t5_block{block}"] = only(tokens_BLW.numpy(), within_BL)
+    return result
+
+
+def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -> Arrays:
+    """Features of the images of prompts, and the tokens made of them; one row for each image."""
+    frames, images = _images(recorded, "prompt")
+    result = {}
+    for name, view in zip(VIEWS, images, strict=True):
+        result[f"prompt.vit.{name}"] = network.encode_images(torch.from_numpy(view)).numpy()
+    entries = len(images[0])
+    num_parts = Reader.of(network.config.images).tokens_per_frame_pair if frames else len(VIEWS)
+    counts = [1] * num_parts if frames else [view.shape[1] for view in images]
+
+    def by_image(tokens_ID: torch.Tensor) -> np.ndarray:
+        """Put the tokens of each image into one row: the slots of its first part, then of its second."""
+        parts = tokens_ID.unflatten(0, (num_parts, entries, -1))
+        rows = [part_END[:, :count] for part_END, count in zip(parts, counts, strict=True)]
+        return _without_token_axis(torch.cat(rows, dim=1).numpy())
+
+    result[f"prompt.{'img' if frames else 'obj'}_feat"] = by_image(seen.outputs["images"][0])
+    result["prompt.obj_tokens"] = by_image(seen.outputs["prompt.images"][0])
+    if not frames:
+        for view, name in enumerate(VIEWS):
+            boxes_END = seen.outputs[f"images.box_encoders.{view}"][0].unflatten(0, (entries, -1))
+            result[f"prompt.bbox_feat.{name}"] = boxes_END[:, : counts[view]].numpy()
+    return result
+
+
+def _step_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -> Arrays:
+    """The same of observations; one row for each step of each environment."""
+    frames, images = _images(recorded, "obs")
+    tokens_TBQD = time_first(seen.outputs["images"][0])
+    result = {f"obs.{'img' if frames else 'obj'}_feat": _without_token_axis(_rows(tokens_TBQD))}
+    for view, name in enumerate(VIEWS):
+        result[f"obs.vit.{name}"] = _rows(network.encode_images(torch.from_numpy(images[view])).numpy())
+        if not frames:
+            boxes_BTND = seen.outputs[f"images.box_encoders.{view}"][0]
+            result[f"obs.bbox_feat.{name}"] = _rows(time_first(boxes_BTND))
+    return result
+
+
+def _sequence_stages(
+    network: PolicyNetwork, memory: Memory, tokens_BLD: torch.Tensor, mask_BL: torch.Tensor, inputs: Inputs
+) -> Arrays:
+    """Read the whole sequence with its masked places, which the network itself leaves out."""
+    trunk = network.trunk
+    with watched(network) as seen:
+        _, state = trunk.extend(network.begin(memory), tokens_BLD, mask_BL)
+    known_BL, mask = torch.ones_like(mask_BL), state.mask_BS.numpy()
+    if isinstance(trunk, PrefixTrunk):
+        separator_B1D = trunk.separator.expand(len(tokens_BLD), 1, -1)
+        tokens_BLD = torch.cat([memory.tokens_BLD, separator_B1D, tokens_BLD], dim=1)
+        known_BL = torch.cat([_within_prompts(memory, inputs), known_BL[:, :1], known_BL], dim=1)
+        mask = mask[:, None]
+    result = {
+        "seq.tokens": only(time_first(tokens_BLD), known_BL.T),
+        "seq.mask": mask,
+        "seq.position_ids": seen.input("trunk.positions").numpy(),
+    }
+    for layer in range(len(trunk.self_blocks)):
+        outputs_BLD = seen.output(f"trunk.self_blocks.{layer}").numpy()
+        result[f"seq.block{layer}_out"] = only(outputs_BLD, known_BL)
+    if isinstance(trunk, Decoder):
+        result["seq.prompt_position_ids"] = seen.input("trunk.prompt_positions").numpy()
+        for layer in range(len(trunk.cross_blocks)):
+            result[f"seq.xattn{layer}_out"] = seen.output(f"trunk.cross_blocks.{layer}").numpy()
+    return result
+
+
+def _interleaved(slots: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+    """Put each action behind the slots of its step, tokens or masks; no action follows the last step."""
+    pieces = [slots[:, 0]]
+    for t in range(1, slots.shape[1]):
+        pieces += [actions[:, t - 1, None], slots[:, t]]
+    return torch.cat(pieces, dim=1)
+
+
+def _within_prompts(memory: Memory, inputs: Inputs) -> torch.Tensor:
+    """Which places lie within their prompt, (B, L); what padding behind a prompt holds means nothing."""
+    lengths = torch.tensor([len(prompt.words) for prompt in inputs.prompts])
+    return torch.arange(memory.mask_BL.shape[1]) < lengths[:, None]
+
+
+def _images(recorded: Arrays, kind: str) -> tuple[bool, list[np.ndarray]]:
+    """Return whether images are whole frames, and those of each view."""
+    frames = f"in.{kind}.rgb.{VIEWS[0]}" in recorded
+    return frames, [recorded[f"in.{kind}.{'rgb' if frames else 'cropped_img'}.{view}"] for view in VIEWS]
+
+
+def _rows(values: np.ndarray) -> np.ndarray:
+    """Join the axes of time and environments."""
+    return values.reshape(-1, *values.shape[2:])
+
+
+def _without_token_axis(values: np.ndarray) -> np.ndarray:
+    """Drop the axis of tokens where an image has only one, as recordings have it."""
+    return values.squeeze(-2) if values.shape[-2] == 1 else values
+
+
+def _filled(steps: Sequence[StepInput]) -> tuple[list[StepInput], list[int]]:
+    """Give all steps as many slots as the longest has; return also how many were their own."""
+    counts = [len(step.objects) for step in steps]
+    nowhere = np.zeros((max(counts), 2))
+    filled = [
+        replace(step, objects=step.objects.padded(max(counts)), positions=nowhere, grasps=nowhere)
+        for step in steps
+    ]
+    return filled, counts
+
+
+@contextmanager
+def _zero_vectors_beyond(network: PolicyNetwork, counts: Sequence[int]) -> Iterator[None]:
+    """Let the slots beyond each step's own be zero vectors, where the network encodes black crops."""
+    observe = network.observe
+
+    def observe_and_clear(
+        history: HistoryBatch, features_BTVNF: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        slots_BTQD, mask_BTQ, read_BT = observe(history, features_BTVNF)
+        own_TN = torch.arange(history.masks_BTVN.shape[-1]) < torch.tensor(counts)[:, None]
+        own_TQ = own_TN.repeat(1, len(VIEWS))
+        return slots_BTQD * own_TQ[..., None], mask_BTQ, read_BT
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, "observe", observe_and_clear)
+        yield

@@ -1,0 +1,33 @@
+"""VIMA-GPT with the tiny golden weights, stage by stage."""
+
+import pytest
+
+pytest.importorskip("torch")
+
+from tests.policies.golden import (
+    Arrays,
+    assert_agrees,
+    needs,
+    recorded_names,
+    recording,
+    tiny_network,
+)
+from tests.policies.golden_stages import stages
+
+NAME = "gpt_tiny"
+pytestmark = needs(NAME)
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Arrays:
+    return recording(NAME)
+
+
+@pytest.fixture(scope="module")
+def computed(recorded: Arrays) -> Arrays:
+    return stages(tiny_network(NAME), recorded)
+
+
+@pytest.mark.parametrize("name", recorded_names(NAME))
+def test_golden_gpt_agrees_in(name: str, computed: Arrays, recorded: Arrays):
+    assert_agrees(computed[name], recorded[name])

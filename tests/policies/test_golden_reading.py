@@ -1,0 +1,104 @@
+"""However a network is made to read a recording's steps, it gives the recorded predictions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+from tests.policies.golden import (
+    Arrays,
+    Inputs,
+    assert_agrees,
+    decide_step_by_step,
+    encode_prompts,
+    inputs_of,
+    needs,
+    read_histories,
+    recording,
+    time_first,
+    tiny_network,
+)
+
+from openvima.policies.inputs import PromptInput, StepInput
+from openvima.policies.network import PolicyNetwork
+from openvima.policies.perception import ObjectViews
+
+NAMES = ("vima_tiny", "gato_tiny", "flamingo_tiny", "gpt_tiny")
+
+
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=needs(name)) for name in NAMES])
+def recorded(request: pytest.FixtureRequest) -> Arrays:
+    return recording(request.param) | {"name": np.array(request.param)}
+
+
+@pytest.fixture(scope="module")
+def network(recorded: Arrays) -> PolicyNetwork:
+    return tiny_network(str(recorded["name"]))
+
+
+@pytest.fixture(scope="module")
+def inputs(network: PolicyNetwork, recorded: Arrays) -> Inputs:
+    return inputs_of(network, recorded)
+
+
+@torch.inference_mode()
+def read_at_once(network: PolicyNetwork, inputs: Inputs) -> torch.Tensor:
+    """Predictions, (B, T, D)."""
+    memory = encode_prompts(network, inputs.prompts)
+    return network(memory, *read_histories(network, inputs.histories), inputs.actions_BTC).query_BTD
+
+
+def longer_companion(inputs: Inputs) -> Inputs:
+    """Put an episode between the two that is longer in prompt and history and sees more objects."""
+    first, second = inputs.prompts
+    prompt = PromptInput(
+        np.concatenate([first.words, second.words]),
+        np.concatenate(
+            [first.entries, np.where(second.entries < 0, -1, second.entries + len(first.objects))]
+        ),
+        np.concatenate([first.parts, second.parts]),
+        np.concatenate([first.mask, second.mask]),
+        ObjectViews.concatenated([first.objects, second.objects]),
+    )
+    history = [*inputs.histories[0], *inputs.histories[1][:2]]
+    if len(history[0].objects) > 1:  # whole frames are always one
+        history = [with_objects_twice(step) for step in history]
+    actions = torch.cat([inputs.actions_BTC, inputs.actions_BTC[:, :2]], dim=1)
+    return Inputs(
+        [first, prompt, second],
+        [inputs.histories[0], history, inputs.histories[1]],
+        actions[[0, 0, 1]],
+    )
+
+
+def with_objects_twice(step: StepInput) -> StepInput:
+    objects = ObjectViews.concatenated([step.objects, step.objects])
+    nowhere = np.zeros((len(objects), 2))
+    return replace(step, objects=objects, positions=nowhere, grasps=nowhere)
+
+
+def test_golden_steps_read_one_by_one_give_the_recorded_predictions(network, inputs, recorded):
+    with torch.inference_mode():
+        queries = decide_step_by_step(network, encode_prompts(network, inputs.prompts), inputs)
+    assert_agrees(time_first(queries), recorded["out.pred_tokens"])
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_golden_episodes_read_alone_give_the_recorded_predictions(network, inputs, recorded, row):
+    only = slice(row, row + 1)
+    alone = Inputs(inputs.prompts[only], inputs.histories[only], inputs.actions_BTC[only])
+    assert_agrees(read_at_once(network, alone)[0].numpy(), recorded["out.pred_tokens"][:, row])
+
+
+def test_golden_padding_for_a_longer_episode_keeps_the_recorded_predictions(network, inputs, recorded):
+    steps = len(recorded["in.ee"])
+    queries = read_at_once(network, longer_companion(inputs))[[0, 2], :steps]
+    assert_agrees(time_first(queries), recorded["out.pred_tokens"])
+
+
+def test_golden_predictions_do_not_depend_on_the_order_of_episodes(network, inputs, recorded):
+    reverse = Inputs(inputs.prompts[::-1], inputs.histories[::-1], inputs.actions_BTC.flip(0))
+    assert_agrees(time_first(read_at_once(network, reverse).flip(0)), recorded["out.pred_tokens"])
