@@ -16,10 +16,13 @@ VERBS = {
     "generate": "write demonstrations with the oracle",
     "data": "look into a folder of demonstrations",
     "assets": "show all objects and textures, or import those of the original benchmark",
+    "policies": "list the named networks and their sizes, or convert published files",
     "train": "train a policy on demonstrations",
     "evaluate": "score policies on levels L1 to L4",
     "report": "make the HTML report of evaluation results",
 }
+
+_HELP = ("-h", "--help")
 
 OVERVIEW = """openvima {version}: multimodal-prompt robot manipulation
 
@@ -41,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 1 the work failed, 2 wrong usage or input, 130 interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or words[0] in ("-h", "--help", "help"):
+    if not words or words[0] in (*_HELP, "help"):
         verbs = "\n".join(f"  {verb:<11} {summary}" for verb, summary in VERBS.items())
         print(OVERVIEW.format(version=__version__, verbs=verbs), end="")
         return 0 if words else 2
@@ -60,6 +63,9 @@ def _run(verb: str, rest: list[str]) -> int:
     commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
     try:
         if commands is not None:
+            names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
+            if names_none and hasattr(module, "DEFAULT"):
+                rest = [module.DEFAULT, *rest]
             return tyro.extras.subcommand_cli_from_dict(
                 commands, prog=f"openvima {verb}", description=module.__doc__, args=rest
             )

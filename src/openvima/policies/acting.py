@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from openvima.policies.inputs import (
 from openvima.policies.layers.trunk import TrunkState
 from openvima.policies.network import Memory, PolicyNetwork
 from openvima.policies.perception import GROUND_TRUTH, ObjectFinder
+from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 
@@ -36,7 +38,7 @@ class NetworkPolicy(Policy):
 
     Args:
         network: The network; it is moved to the device and precision, and set to evaluation.
-        tokenizer: Splits the text of prompts; the closed vocabulary by default.
+        tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
         finder: Finds the objects in images; by default by the simulator's segmentation.
         device: Where to compute, such as "cpu" or "cuda".
         dtype: Precision; by default float64 on a processor and float32 elsewhere.
@@ -45,7 +47,8 @@ class NetworkPolicy(Policy):
             depend on the other episodes; the generator itself is left as it is.
 
     Raises:
-        PolicyError: The temperature is negative, or above 0 without a generator.
+        PolicyError: The temperature is negative, or above 0 without a generator; or no tokenizer is given to
+            a network that reads prompts with that of T5.
     """
 
     def __init__(
@@ -63,10 +66,11 @@ class NetworkPolicy(Policy):
             raise PolicyError(
                 f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to draw with."
             )
+        tokenizer = tokenizer or tokenizer_for(network.config.prompt)
+        self.reader = Reader.of(network.config.images, tokenizer, finder)
         self.device = torch.device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
-        self.reader = Reader.of(network.config.images, tokenizer, finder)
         self._temperature = temperature
         self._seed = generator.initial_seed() if generator else 0
         self._memory: Memory | None = None
@@ -135,17 +139,25 @@ class NetworkPolicy(Policy):
         return actions
 
     @staticmethod
-    def from_pretrained(path_or_hub_id: str | Path, **options: object) -> "NetworkPolicy":
+    def from_pretrained(
+        path_or_hub_id: str | Path,
+        **options: Any,  # Any: of several kinds
+    ) -> "NetworkPolicy":
         """Load a policy from a folder or from the Hugging Face Hub; see `load_pretrained`."""
         from openvima.policies.checkpoint import load_pretrained
 
         return load_pretrained(path_or_hub_id, **options)
 
-    def save_pretrained(self, folder: str | Path) -> None:
-        """Write the policy into a folder; see `openvima.policies.checkpoint.save_pretrained`."""
+    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
+        """Write the policy into a folder; see `openvima.policies.checkpoint.save_checkpoint`.
+
+        Args:
+            folder: Where to; a checkpoint that is there is replaced.
+            dtype: Precision of the stored weights, whatever the policy computes in.
+        """
         from openvima.policies.checkpoint import save_pretrained
 
-        save_pretrained(self, folder)
+        save_pretrained(self, folder, dtype=dtype)
 
     def _see(self, row: int, observation: Mapping | None) -> StepInput:
         assert observation is not None

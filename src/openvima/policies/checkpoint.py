@@ -27,6 +27,7 @@ from openvima.policies.base import (
 )
 from openvima.policies.config import PolicyConfig
 from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 
@@ -168,22 +169,30 @@ def load_pretrained(
         CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
         PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given.
     """
-    found = find_checkpoint(path_or_hub_id)
-    if found.is_file():
-        from openvima.policies.published import load_published
-
-        network, stored = load_published(found), None
-    else:
-        network = load_checkpoint(found)
-        stored = found / TOKENIZER_FOLDER
-    if tokenizer is None:
-        tokenizer = tokenizer_for(network.config.prompt, stored if stored and stored.is_dir() else None)
+    network, stored = load_network(path_or_hub_id)
+    tokenizer = tokenizer or tokenizer_for(network.config.prompt, stored)
     return NetworkPolicy(network, tokenizer=tokenizer, **options)
 
 
-def save_pretrained(policy: NetworkPolicy, folder: str | Path) -> None:
-    """Write a policy into a folder, which `load_pretrained` reads; in float32, whatever it computes in."""
-    save_checkpoint(policy.network, folder, policy.reader.tokenizer)
+def save_pretrained(policy: NetworkPolicy, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
+    """Write a policy into a folder, which `load_pretrained` reads; see `save_checkpoint`."""
+    save_checkpoint(policy.network, folder, policy.reader.tokenizer, dtype=dtype)
+
+
+def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None]:
+    """Read a network from anything that `load_pretrained` takes.
+
+    Returns:
+        The network, and the folder of the tokenizer that is stored with it, if there is one.
+
+    Raises:
+        CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
+    """
+    found = find_checkpoint(path_or_hub_id)
+    if found.is_file():
+        return load_published(found), None
+    tokenizer = found / TOKENIZER_FOLDER
+    return load_checkpoint(found), tokenizer if tokenizer.is_dir() else None
 
 
 def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:

@@ -104,8 +104,8 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
     if source is None:
         raise PolicyError(
             "this policy reads prompts with the tokenizer of T5, which is not stored with it. Give it as "
-            "tokenizer=T5Tokenizer(FOLDER), or store it: `openvima policies convert IN OUT --tokenizer FOLDER`. "
-            "'t5-base' instead of a folder fetches it from the Hugging Face Hub."
+            "tokenizer=T5Tokenizer(FOLDER), or store it: `openvima policies convert IN OUT --tokenizer "
+            "FOLDER`; 't5-base' instead of a folder fetches it from the Hugging Face Hub."
         )
     tokenizer = T5Tokenizer(source)
     if len(tokenizer) > config.vocabulary_size:

@@ -1,0 +1,214 @@
+"""`openvima policies`: list the named networks, look at one, and convert published files."""
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from openvima.policies.config import PolicyConfig
+    from openvima.policies.sizes import PolicySize
+
+Json = Annotated[bool, tyro.conf.arg(name="json")]
+FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
+_NOTES = (
+    "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
+    "positions: position tables and learned tokens; images: with the layer that joins tool and image",
+    "The sizes are named after the trunk. `openvima policies show NAME` tells more of one.",
+)
+DEFAULT = "list"  # what `openvima policies` does without a further word
+
+
+def list_(*, as_json: Json = False) -> int:
+    """List the named networks with their parameters, part by part.
+
+    Example: openvima policies
+
+    Args:
+        as_json: Print JSON instead of a table.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.policies.base import require_torch
+    from openvima.policies.presets import PRESETS, preset
+
+    require_torch("counting parameters")
+    from openvima.policies.sizes import policy_size
+
+    sizes = {name: policy_size(preset(name)) for name in PRESETS}
+    if as_json:
+        print(json.dumps([{"name": name, **_record(size)} for name, size in sizes.items()], indent=1))
+    else:
+        _print_table(sizes)
+    return 0
+
+
+def show(
+    policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")], *, as_json: Json = False
+) -> int:
+    """Show one policy: its parameters, part by part, and all of its sizes.
+
+    Example: openvima policies show vima-200m
+
+    Args:
+        policy: Name of a preset, a run folder or checkpoint folder, a published file, or an id on the Hugging
+            Face Hub.
+        as_json: Print JSON.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.policies.base import require_torch
+
+    require_torch("counting parameters")
+    from openvima.policies.sizes import policy_size
+
+    config = _config(policy)
+    size = policy_size(config)
+    if as_json:
+        print(json.dumps({"name": policy, **_record(size), "config": config.to_dict()}, indent=1))
+        return 0
+    import yaml
+
+    print(f"{policy}: {_summary(size)}\n")
+    print(f"{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
+    for part, count in {**size.parts, "total": size.whole}.items():
+        print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
+    print(f"\n{yaml.safe_dump(config.to_dict(), sort_keys=False)}", end="")
+    return 0
+
+
+def convert(
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
+    *,
+    tokenizer: str | None = None,
+    force: bool = False,
+) -> int:
+    """Convert a published .ckpt file into a checkpoint folder; nothing in the file is executed.
+
+    With a folder instead of a file, add a tokenizer to a checkpoint.
+
+    Example: openvima policies convert 200M.ckpt vima-200m --tokenizer t5-base
+
+    Args:
+        source: Published file, such as 200M.ckpt, or a checkpoint folder.
+        out: Folder to write to; every `--policy` takes it.
+        tokenizer: Folder of the tokenizer of T5, or its id on the Hugging Face Hub; stored with the policy.
+        force: Replace a checkpoint that is there.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.errors import ConfigError
+    from openvima.policies.base import require_torch
+
+    if out.exists() and not force:
+        raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
+    require_torch("reading a policy")
+    from openvima.policies.checkpoint import load_network, save_checkpoint
+    from openvima.policies.sizes import policy_size
+    from openvima.policies.t5 import tokenizer_for
+
+    network, stored = load_network(source)
+    found = tokenizer or stored
+    reader = tokenizer_for(network.config.prompt, found) if found else None
+    save_checkpoint(network, out, reader)
+    print(f"{source}: {_summary(policy_size(network.config))}")
+    print(out)
+    if network.config.prompt.tokenizer == "t5" and not found:
+        hint = (
+            "Stored without a tokenizer: convert again with --tokenizer, or give one whenever it is loaded."
+        )
+        print(hint, file=sys.stderr)
+    return 0
+
+
+def _config(policy: str) -> "PolicyConfig":
+    from openvima.policies.presets import PRESETS, preset
+
+    if policy in PRESETS:
+        return preset(policy)
+    from openvima.errors import UnknownPolicyError, unknown_name
+    from openvima.policies.base import find_checkpoint
+    from openvima.policies.checkpoint import load_network, read_info
+    from openvima.policies.hub import is_hub_id
+
+    if not (Path(policy).exists() or is_hub_id(policy)):
+        hint = "`openvima policies` lists all of them; folders of training runs can be shown, too."
+        raise UnknownPolicyError(unknown_name("policy", policy, PRESETS, hint))
+    found = find_checkpoint(policy)
+    return read_info(found).config if found.is_dir() else load_network(found)[0].config
+
+
+def _summary(size: "PolicySize") -> str:
+    layers = "1 layer" if size.num_layers == 1 else f"{size.num_layers} layers"
+    whole = size.whole
+    return (
+        f"{size.family}, width {size.width}, {layers}, {size.num_heads} heads; "
+        f"{_millions(whole.total)} M parameters, of which {_millions(whole.trainable)} M are trained"
+    )
+
+
+def _record(size: "PolicySize") -> dict[str, object]:
+    return {
+        "family": size.family,
+        "width": size.width,
+        "layers": size.num_layers,
+        "heads": size.num_heads,
+        "parameters": {
+            part: {"trainable": count.trainable, "frozen": count.frozen}
+            for part, count in {**size.parts, "total": size.whole}.items()
+        },
+    }
+
+
+def _print_table(sizes: dict[str, "PolicySize"]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:  # a file or a pipe takes long lines
+        console = Console(width=FULL_WIDTH)
+    rows = {name: _cells(name, size) for name, size in sizes.items()}
+    columns = list(next(iter(rows.values())))
+    if console.width < FULL_WIDTH:
+        columns = [name for name in columns if name not in ("heads", "actions", "positions", "frozen")]
+    table = Table(title="parameters in millions", box=SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
+    for name in columns:
+        style = "bold" if name in ("preset", "total") else ""
+        table.add_column(name, justify="left" if name == "preset" else "right", no_wrap=True, style=style)
+    family = next(iter(sizes.values())).family
+    for name, cells in rows.items():
+        if sizes[name].family != family:
+            table.add_section()
+            family = sizes[name].family
+        table.add_row(*(cells[column] for column in columns))
+    console.print(table)
+    for note in _NOTES:
+        console.print(note, highlight=False)
+
+
+def _cells(name: str, size: "PolicySize") -> dict[str, str]:
+    whole = size.whole
+    return {
+        "preset": name,
+        "width": str(size.width),
+        "layers": str(size.num_layers),
+        "heads": str(size.num_heads),
+        **{part: _millions(count.total) for part, count in size.parts.items()},
+        "total": _millions(whole.total),
+        "trained": _millions(whole.trainable),
+        "frozen": _millions(whole.frozen),
+    }
+
+
+def _millions(count: int) -> str:
+    return f"{count / 1e6:.2f}"
+
+
+COMMANDS = {"list": list_, "show": show, "convert": convert}
