@@ -39,8 +39,8 @@ def main(
     Example: openvima evaluate --policy mine=runs/first,oracle,random --levels L1,L2 --workers 2
 
     Args:
-        policy: One or more of oracle, random, untrained, or folders of training runs, with commas in between;
-            NAME=FOLDER gives a folder another name in the results.
+        policy: One or more of oracle, random, untrained, presets, folders of training runs, published files
+            and ids on the Hugging Face Hub, with commas in between; NAME=FOLDER gives a folder another name.
         tasks: Names of tasks with commas in between, or all. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level.

@@ -14,7 +14,8 @@ from pathlib import Path
 from openvima.catalog.partitions import LEVELS
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
-from openvima.policies.base import checkpoint_folder
+from openvima.policies.base import find_checkpoint
+from openvima.policies.hub import is_hub_id
 from openvima.policies.presets import PRESETS
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -30,8 +31,9 @@ class EvaluationConfig:
     """What to evaluate, and how.
 
     Args:
-        policies: Each "oracle", "random", "untrained" or a run folder; a folder can be given a name as
-            "name=path", by default it has that of the folder.
+        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: a preset, a run
+            folder, a published file, an id on the Hugging Face Hub. A folder can be given a name as
+            "name=path", by default it has its own.
         tasks: Names of tasks, or ("all",) for every task that the level holds.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
@@ -100,7 +102,7 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset, or the path of a run folder.
+        source: "oracle", "random", "untrained", the name of a preset, or what else `load_policy` takes.
     """
 
     name: str
@@ -108,7 +110,7 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset's name) or "run"."""
+        """What it is: "oracle", "random", "untrained" (also for a preset's name) or "run" (all else)."""
         if self.source in PRESETS:
             return "untrained"
         return self.source if self.source in NAMED_POLICIES else "run"
@@ -121,7 +123,7 @@ class PolicySource:
             CheckpointError: The run folder holds no weights.
         """
         if self.kind == "run":
-            return {"kind": "run", "sha256": weights_hash(Path(self.source))}
+            return {"kind": "run", "sha256": weights_hash(self.source)}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
 
@@ -146,20 +148,22 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     return tuple(sources)
 
 
-def weights_hash(folder: Path) -> str:
-    """SHA-256 over the weights that a run folder or checkpoint folder stands for, as hexadecimal text.
+def weights_hash(source: str | Path) -> str:
+    """SHA-256 over the weights that a folder, file or id on the Hub stands for, as hexadecimal text.
 
     Raises:
-        UnknownPolicyError: There is no such folder.
-        CheckpointError: It holds no weights.
+        UnknownPolicyError: There is no such folder or file, and it is not like an id on the Hub.
+        CheckpointError: It holds no weights, or the Hub does not give it.
     """
-    if not folder.is_dir():
+    if not (Path(source).exists() or is_hub_id(str(source))):
         known = (*NAMED_POLICIES, *PRESETS)
-        hint = f"Give the folder of a training run or one of {', '.join(known)}."
-        raise UnknownPolicyError(unknown_name("policy", str(folder), known, hint))
-    files = sorted(file for file in checkpoint_folder(folder).iterdir() if file.suffix in _WEIGHTS)
+        hint = "Give the folder of a training run, a published .ckpt file or a name of `openvima policies`."
+        raise UnknownPolicyError(unknown_name("policy", str(source), known, hint))
+    found = find_checkpoint(source)
+    files = [found] if found.is_file() else sorted(found.iterdir())
+    files = [file for file in files if file.suffix in _WEIGHTS]
     if not files:
-        raise CheckpointError(f"{folder} holds no weights; give the folder of a training run.")
+        raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
     digest = hashlib.sha256()
     for file in files:
         with open(file, "rb") as stream:
