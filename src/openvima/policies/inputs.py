@@ -186,20 +186,23 @@ class Reader:
             ShapeError: An image has another shape or dtype.
         """
         places: list[tuple[int, int, int, bool]] = []  # word, entry, part, counts
-        images: list[ObjectViews] = []
-        count = 0
         sequence = prompt.sequence()
         if not sequence:
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
+        images = [self._see_prompt_image(piece) for piece in sequence if isinstance(piece, PromptImage)]
+        slots = _widest(images)
+        if self.layout == "views":
+            images = [image.padded(max(slots)) for image in images]
+        count, unread = 0, iter(images)
         for piece in sequence:
             if isinstance(piece, str):
                 places += [(word, WORD, 0, True) for word in self.tokenizer.encode(piece)]
                 continue
-            images.append(self._see_prompt_image(piece))
+            image = next(unread)
             places += [
-                (PADDING_ID, count + entry, part, valid) for entry, part, valid in self._places(images[-1])
+                (PADDING_ID, count + entry, part, valid) for entry, part, valid in self._places(image, slots)
             ]
-            count += len(images[-1])
+            count += len(image)
         places.append((self.tokenizer.end_id, WORD, 0, True))
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images))
@@ -214,14 +217,17 @@ class Reader:
         objects = self.finder.in_prompt_image(image)
         return objects if self.layout == "objects" else objects.compacted()
 
-    def _places(self, objects: ObjectViews) -> list[tuple[int, int, bool]]:
-        """Entry, part and validity of the tokens of one image, in the order of the prompt."""
-        count = len(objects)
+    def _places(self, objects: ObjectViews, slots: Sequence[int]) -> list[tuple[int, int, bool]]:
+        """Entry, part and validity of the tokens of one image, in the order of the prompt.
+
+        With a token for each view, every image takes as many slots as the prompt's fullest one, as in the
+        published evaluation: T5 counts them, and so tells how far words and images are apart.
+        """
         if self.layout == "objects":
             return [(k, 0, bool(visible)) for k, visible in enumerate(objects.visible())]
         if self.layout == "frames":
             return [(0, part, True) for part in range(self.tokens_per_frame_pair)]
-        return [(k, view, bool(objects.masks[view, k])) for view in range(len(VIEWS)) for k in range(count)]
+        return [(k, v, bool(objects.masks[v, k])) for v, count in enumerate(slots) for k in range(count)]
 
 
 class EpisodeReader:
@@ -257,6 +263,11 @@ class EpisodeReader:
             self._num_slots = max(self._num_slots, len(objects))
             objects = objects.compacted().padded(self._num_slots)
         return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
+
+
+def _widest(images: Sequence[ObjectViews]) -> list[int]:
+    """The largest number of visible objects in each view of a prompt's images."""
+    return [max((int(image.masks[view].sum()) for image in images), default=0) for view in range(len(VIEWS))]
 
 
 def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -> PromptBatch:
