@@ -72,7 +72,7 @@ def family(request) -> str:
 
 @pytest.fixture
 def network(family) -> PolicyNetwork:
-    """A fresh network, none of whose weights is like another; most would start at 0 or 1 or in symmetry."""
+    """A network of random numbers, so that no weight is like another; fresh norms and biases all are."""
     network = build_network(small(family), seed=5)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -103,6 +103,60 @@ def saved(values: object, folder: Path) -> Path:
 def test_names_go_to_published_ones_and_back(network) -> None:
     published = to_published(network, dead_entries=True)
     assert_same(from_published(published), network.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("family", "published", "ours"),
+    [
+        ("vima", "xattn_gpt.h.1.ln_1.bias", "trunk.self_blocks.1.norm_attention.bias"),
+        ("gato", "transformer.lm.h.1.ln_2.bias", "trunk.self_blocks.1.norm_feed_forward.bias"),
+        ("vima", "xattn_gpt.xattns.1.layernorm.weight", "trunk.cross_blocks.1.norm_attention.weight"),
+        ("vima", "xattn_gpt.xattns.1.ln.weight", "trunk.cross_blocks.1.norm_feed_forward.weight"),
+        ("vima", "xattn_gpt.xattns.1.linear1.weight", "trunk.cross_blocks.1.widen.weight"),
+        ("flamingo", "xattn_gpt.xattns.0.gated_layer.weight", "trunk.cross_blocks.0.gate.weight"),
+        ("vima", "xattn_gpt.xattns.0.attention_out.weight", "trunk.cross_blocks.0.attention_out.weight"),
+        ("vima", "obj_encoder.bbox_mlp.top.3.weight", "images.box_encoders.1.2.weight"),
+        ("vima", "obj_encoder.pre_transformer_layer.front.bias", "images.fusion.0.bias"),
+        (
+            "vima",
+            "obj_encoder.cropped_img_encoder.vit.blocks.1.ln_2.weight",
+            "images.crop_encoder.blocks.1.norm_mlp.weight",
+        ),
+        ("gpt", "obj_encoder.cropped_img_encoder.vit.ln_pre.bias", "images.frame_encoder.norm_before.bias"),
+        (
+            "flamingo",
+            "obj_encoder.peceiver.model.encoder.self_attends.3.attention.self.value.bias",
+            "images.resampler.self_layers.3.value.bias",
+        ),
+        (
+            "flamingo",
+            "obj_encoder.peceiver.model.encoder.cross_attention.attention.self.layernorm2.weight",
+            "images.resampler.cross_layer.norm_source.weight",
+        ),
+        (
+            "flamingo",
+            "obj_encoder.peceiver.model.encoder.cross_attention.mlp.dense1.weight",
+            "images.resampler.cross_layer.hidden.weight",
+        ),
+        (
+            "vima",
+            "t5_prompt_encoder.t5.encoder.block.2.layer.0.SelfAttention.k.weight",
+            "prompt.text.blocks.2.key.weight",
+        ),
+        (
+            "vima",
+            "t5_prompt_encoder.t5.encoder.block.2.layer.1.layer_norm.weight",
+            "prompt.text.blocks.2.norm_feed_forward.weight",
+        ),
+        ("vima", "prompt_obj_post_layer.6.bias", "prompt.images.4.bias"),
+        ("vima", "action_encoder._embed_dict.pose1_position._layer.3.bias", "actions.parts.2.2.bias"),
+        ("vima", "action_decoder._decoders.pose0_rotation.mlps.3.6.bias", "head.classifiers.5.4.bias"),
+        ("vima", "action_decoder._decoders.pose1_position.mlps.1.0.bias", "head.classifiers.7.0.bias"),
+    ],
+)
+def test_weights_of_equal_shapes_are_told_apart(network, family, published, ours) -> None:
+    weight = to_published(network)[published]
+    assert torch.equal(weight, network.state_dict()[ours])
 
 
 def test_a_prefix_is_stripped_from_the_beginning_only(network) -> None:

@@ -31,8 +31,8 @@ def load_published(file: str | Path) -> PolicyNetwork:
 
     Raises:
         CheckpointError: The file is missing, damaged or something else, it wants code to be executed, or
-            its weights do not fit its `cfg`. All names that are missing or too many and all wrong shapes are
-            in one message.
+            its weights do not fit its `cfg`. One message tells the names that are missing or too many and
+            the wrong shapes, up to 20 of each.
     """
     file = Path(file)
     weights, cfg = _contents(file, _unpickled(file))
@@ -49,6 +49,8 @@ def _unpickled(file: Path) -> Any:  # Any: whatever the file holds
     _check_archive(file)
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
     except Exception as error:  # a file made to do harm can fail in any way
         raise CheckpointError(f"{file} {_refusal(error)}") from error
 
