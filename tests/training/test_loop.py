@@ -201,6 +201,19 @@ def test_settings_out_of_range_are_named(settings, change, message):
         TrainingConfig(**{**settings, **change})
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"preset": "vima-2m"}, "'vima-2m' reads prompts with T5.* take nano"),
+        ({"preset": "gato-nano", "pretraining_steps": 5}, "'gato-nano' has no appearance embedding"),
+    ],
+)
+def test_a_preset_that_cannot_be_trained_so_leaves_no_run_folder(settings, change, message):
+    with pytest.raises(ConfigError, match=message):
+        train(TrainingConfig(**{**settings, **change}))
+    assert not settings["out"].exists()
+
+
 def test_an_unknown_asset_pack_leaves_no_run_folder(settings):
     with pytest.raises(AssetError, match="nosuch"):
         train(TrainingConfig(**settings, assets="nosuch"))

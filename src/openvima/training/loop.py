@@ -51,6 +51,11 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
         CheckpointError: The last checkpoint is damaged.
     """
     sizes = preset(config.preset)
+    if sizes.prompt.tokenizer == "t5":
+        raise ConfigError(
+            f"preset {config.preset!r} reads prompts with T5, which is not trained here; take nano, "
+            "nano-bins or a member of the family at size nano."
+        )
     images = sizes.images
     has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
     if config.pretraining_steps and not has_appearance:
