@@ -32,7 +32,7 @@ def main(
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder for checkpoints, settings and metrics; `openvima evaluate --policy` takes it.
-        preset: Network sizes: nano (2.5 M parameters, points at objects) or nano-bins (the published bins).
+        preset: Network sizes: nano (2.2 M parameters, points at objects) or nano-bins (the published bins).
         steps: Steps of behaviour cloning; by default what the preset needs.
         batch: Demonstrations a step.
         learning_rate: Highest learning rate of cloning.

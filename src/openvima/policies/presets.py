@@ -16,7 +16,7 @@ SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
 
 def nano() -> "PolicyConfig":
-    """2.5 M parameters: small enough to train on two cores within minutes. It points."""
+    """2.2 M parameters: small enough to train on two cores within minutes. It points."""
     from openvima.policies.config import PolicyConfig
     from openvima.policies.heads.pointing import PointingConfig
     from openvima.policies.layers.conv_encoder import ConvConfig
