@@ -1,5 +1,7 @@
 """Checkpoints: equal weights come back, damage is told in one message, and folders are found."""
 
+from dataclasses import replace
+
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -8,6 +10,7 @@ import yaml  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from openvima.errors import CheckpointError  # noqa: E402
+from openvima.policies import checkpoint, preset  # noqa: E402
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_folder, load_policy  # noqa: E402
 from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
@@ -16,14 +19,13 @@ from openvima.policies.checkpoint import (  # noqa: E402
     load_weights,
     save_checkpoint,
 )
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.network import build_network, outline_network  # noqa: E402
 
 
 @pytest.fixture
 def saved(small_sizes, tmp_path):
     """A checkpoint folder of a small network."""
     folder = tmp_path / "checkpoint"
-    folder.mkdir()
     save_checkpoint(build_network(small_sizes, seed=3), folder)
     return folder
 
@@ -37,9 +39,145 @@ def test_weights_and_sizes_come_back_bit_for_bit(saved, small_sizes) -> None:
     assert all(torch.equal(tensor, expected[name]) for name, tensor in loaded.state_dict().items())
 
 
+@pytest.mark.parametrize("name", ["nano", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano"])
+def test_a_loaded_network_is_complete_constants_and_frozen_weights_included(name: str, tmp_path) -> None:
+    sizes = preset(name)
+    sizes = replace(sizes, prompt=replace(sizes.prompt, train_words=False, trained_layers=1))
+    model = build_network(sizes, seed=1)
+    save_checkpoint(model, tmp_path / "checkpoint")
+    loaded = load_checkpoint(tmp_path / "checkpoint")
+    buffers = dict(loaded.named_buffers())
+    assert buffers.keys() == dict(model.named_buffers()).keys()
+    assert all(torch.equal(buffers[name], buffer) for name, buffer in model.named_buffers())
+    kinds = [
+        {name: (p.shape, p.dtype, p.device, p.requires_grad) for name, p in network.named_parameters()}
+        for network in (loaded, model)
+    ]
+    assert kinds[0] == kinds[1]
+
+
+def test_loading_draws_no_weights(saved, monkeypatch) -> None:
+    def refuse(*arguments, **options):
+        raise AssertionError("weights were drawn")
+
+    before = torch.random.get_rng_state()
+    monkeypatch.setattr(torch.Tensor, "uniform_", refuse)
+    monkeypatch.setattr(torch.Tensor, "normal_", refuse)
+    load_checkpoint(saved)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_a_network_without_weights_takes_no_memory_but_has_its_constants(small_sizes) -> None:
+    network = outline_network(small_sizes)
+    assert all(parameter.is_meta for parameter in network.parameters())
+    assert not any(buffer.is_meta for buffer in network.buffers())
+
+
+def test_a_loaded_network_can_be_trained_and_leaves_its_file_alone(saved) -> None:
+    before = (saved / WEIGHTS_FILE).read_bytes()
+    loaded = load_checkpoint(saved)
+    with torch.no_grad():
+        for parameter in loaded.parameters():
+            parameter.add_(1)
+    assert (saved / WEIGHTS_FILE).read_bytes() == before
+
+
+def test_a_loaded_network_keeps_its_weights_when_its_checkpoint_is_replaced(saved, small_sizes) -> None:
+    loaded = load_checkpoint(saved)
+    save_checkpoint(build_network(small_sizes, seed=4), saved)
+    expected = build_network(small_sizes, seed=3).state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in loaded.state_dict().items())
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_weights_are_stored_in_float32_unless_asked(dtype, small_sizes, tmp_path) -> None:
+    model = build_network(small_sizes, seed=0).to(dtype)
+    save_checkpoint(model, tmp_path / "float32")
+    save_checkpoint(model, tmp_path / "asked", dtype=dtype)
+    plain, asked = load_checkpoint(tmp_path / "float32"), load_checkpoint(tmp_path / "asked")
+    assert {tensor.dtype for tensor in plain.state_dict().values()} == {torch.float32}
+    assert {tensor.dtype for tensor in [*asked.parameters(), *asked.buffers()]} == {dtype}
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(asked.state_dict()[name], tensor)
+        assert torch.equal(plain.state_dict()[name], tensor.float())
+
+
+def test_a_precision_that_is_not_read_is_not_written(small_sizes, tmp_path) -> None:
+    with pytest.raises(CheckpointError, match="in float16; allowed: float32, bfloat16, float64"):
+        save_checkpoint(build_network(small_sizes, seed=0), tmp_path / "checkpoint", dtype=torch.float16)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_precision_that_no_file_has_is_refused(saved) -> None:
+    text = (saved / CONFIG_FILE).read_text().replace("float32", "float8")
+    (saved / CONFIG_FILE).write_text(text)
+    with pytest.raises(CheckpointError, match="precision is 'float8'; allowed: float32"):
+        load_checkpoint(saved)
+
+
+def test_checkpoints_that_do_not_name_a_precision_hold_float32(saved) -> None:
+    text = (saved / CONFIG_FILE).read_text().replace("precision: float32\n", "")
+    assert "precision" not in text
+    (saved / CONFIG_FILE).write_text(text)
+    assert load_checkpoint(saved).query.dtype == torch.float32
+
+
+def test_a_checkpoint_is_replaced_as_a_whole_or_not_at_all(saved, small_sizes, tmp_path, monkeypatch) -> None:
+    before = {file.name: file.read_bytes() for file in saved.iterdir()}
+
+    def fail(*arguments, **options):
+        raise OSError("disk is full")
+
+    monkeypatch.setattr(checkpoint.yaml, "safe_dump", fail)  # the weights have been written by then
+    with pytest.raises(OSError, match="disk is full"):
+        save_checkpoint(build_network(small_sizes, seed=4), saved)
+    assert {file.name: file.read_bytes() for file in saved.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == [saved.name]
+
+
+def test_a_checkpoint_whose_replacement_never_came_is_found(saved) -> None:
+    saved.rename(saved.with_name(f".{saved.name}.old"))
+    load_checkpoint(saved)
+    assert saved.is_dir()
+
+
+def test_a_folder_with_other_files_is_not_replaced(saved, small_sizes) -> None:
+    (saved / "optimizer.safetensors").touch()
+    with pytest.raises(CheckpointError, match=r"other files than a checkpoint \(optimizer\.safetensors\)"):
+        save_checkpoint(build_network(small_sizes, seed=4), saved)
+    load_checkpoint(saved)
+
+
+def test_a_file_is_no_folder_to_save_in(small_sizes, tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="is a file; give the name of a folder"):
+        save_checkpoint(build_network(small_sizes, seed=4), tmp_path / "file")
+
+
+def test_weights_of_another_size_are_named_as_such(saved, small_sizes) -> None:
+    trunk = replace(small_sizes.trunk, width=128, num_layers=2)
+    larger = replace(small_sizes, trunk=trunk, images=replace(small_sizes.images, width=128))
+    values = yaml.safe_load((saved / CONFIG_FILE).read_text())
+    values["config"] = larger.to_dict()
+    (saved / CONFIG_FILE).write_text(yaml.safe_dump(values))
+    size = "it is of another size: layers 1, where the config says 2, width 64, where the config says 128;"
+    with pytest.raises(CheckpointError, match=size) as caught:
+        load_checkpoint(saved)
+    assert "missing: trunk.self_blocks.1" in str(caught.value)
+
+
+def test_weights_of_another_member_of_the_family_are_refused(tmp_path) -> None:
+    for name in ("vima", "gato"):
+        save_checkpoint(build_network(preset(f"{name}-nano"), seed=0), tmp_path / name)
+    (tmp_path / "gato" / CONFIG_FILE).replace(tmp_path / "vima" / CONFIG_FILE)
+    with pytest.raises(
+        CheckpointError, match=r"missing: images\.frame_encoder.*unexpected: images\.box_encoders"
+    ):
+        load_checkpoint(tmp_path / "vima")
+
+
 def test_saving_again_gives_the_same_bytes(saved, small_sizes, tmp_path) -> None:
     again = tmp_path / "again"
-    again.mkdir()
     save_checkpoint(load_checkpoint(saved), again)
     for name in (WEIGHTS_FILE, CONFIG_FILE):
         assert (again / name).read_bytes() == (saved / name).read_bytes()

@@ -11,10 +11,12 @@ import yaml  # noqa: E402
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
 from openvima.policies import PRESETS, preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.families.common import SIZES  # noqa: E402
 from openvima.policies.heads.bins import NUM_BINS  # noqa: E402
 from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.layers.vit import VitConfig  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.presets import FAMILIES, SIZE_NAMES  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 
 
@@ -40,6 +42,18 @@ def test_either_crop_encoder_survives_its_file(crop) -> None:
     sizes = replace(sizes, images=replace(sizes.images, crop=crop))
     text = yaml.safe_dump(sizes.to_dict())
     assert PolicyConfig.from_dict(yaml.safe_load(text)) == sizes
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_survives_its_file(name: str) -> None:
+    text = yaml.safe_dump(preset(name).to_dict())
+    assert PolicyConfig.from_dict(yaml.safe_load(text)) == preset(name)
+
+
+def test_every_size_of_every_family_is_a_preset() -> None:
+    assert tuple(SIZES) == SIZE_NAMES
+    members = {f"{family}-{size}" for family in FAMILIES for size in SIZES}
+    assert set(PRESETS) == {"nano", "nano-bins"} | members
 
 
 def test_an_unknown_preset_gets_a_suggestion() -> None:

@@ -1,0 +1,132 @@
+"""The verb `policies`: the list, one policy, and published files made into folders."""
+
+import json
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.policies import PRESETS, load_policy, preset  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.sizes import policy_size  # noqa: E402
+from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
+
+
+@pytest.fixture
+def published(tmp_path):
+    """A small published file."""
+    return write_published(build_network(small_vima(), seed=2), tmp_path / "2M.ckpt")
+
+
+def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys) -> None:
+    assert main(["policies"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines) <= 100
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
+    assert rows.keys() >= PRESETS.keys()
+    size = policy_size(preset("vima-20m"))
+    counts = [*(count.total for count in size.parts.values()), size.whole.total, size.whole.trainable]
+    numbers = [f"{count / 1e6:.2f}" for count in [*counts, size.whole.frozen]]
+    assert rows["vima-20m"] == ["384", "4", "12", *numbers]
+    assert rows["preset"][3:] == [*size.parts, "total", "trained", "frozen"]
+
+
+def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(capsys, monkeypatch) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich then takes the output for a terminal
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["policies", "list"]) == 0
+    shown = capsys.readouterr().out
+    assert max(len(line) for line in shown.splitlines()) <= 80
+    assert "207.76" in shown and "363.90" in shown and "…" not in shown
+
+
+def test_the_list_can_be_read_by_machines(capsys) -> None:
+    assert main(["policies", "--json"]) == 0
+    records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}
+    assert list(records) == list(PRESETS)
+    record = records["gato-200m"]
+    assert (record["family"], record["width"], record["layers"], record["heads"]) == ("gato", 768, 22, 24)
+    total = record["parameters"].pop("total")
+    for kind in ("trainable", "frozen"):
+        assert sum(count[kind] for count in record["parameters"].values()) == total[kind] > 0
+
+
+def test_a_preset_is_shown_with_all_of_its_sizes(capsys) -> None:
+    assert main(["policies", "show", "gpt-nano"]) == 0
+    shown = capsys.readouterr().out
+    assert "gpt, width 128, 4 layers, 4 heads; 3.50 M parameters, of which 3.50 M are trained" in shown
+    assert "3,497,792" in shown and "readout: class" in shown
+
+
+def test_a_checkpoint_and_a_published_file_are_shown_by_their_path(published, tmp_path, capsys) -> None:
+    save_checkpoint(build_network(small_vima(), seed=0), tmp_path / "saved")
+    for path in (tmp_path / "saved", published):
+        assert main(["policies", "show", str(path), "--json"]) == 0
+        record = json.loads(capsys.readouterr().out)
+        assert (record["width"], record["config"]["trunk"]["num_layers"]) == (32, 1)
+
+
+def test_a_published_file_becomes_a_policy(published, tmp_path, capsys) -> None:
+    pytest.importorskip("transformers")
+    tokenizer = write_tokenizer(tmp_path / "t5")
+    out = tmp_path / "out"
+    assert main(["policies", "convert", str(published), str(out), "--tokenizer", str(tokenizer)]) == 0
+    printed = capsys.readouterr()
+    assert f"{published}: vima, width 32, 1 layer, 2 heads" in printed.out
+    assert printed.out.splitlines()[-1] == str(out)
+    assert not printed.err
+    expected = build_network(small_vima(), seed=2).state_dict()
+    for name, tensor in load_policy(str(out)).network.state_dict().items():
+        assert torch.equal(tensor.float(), expected[name])
+
+
+def test_without_a_tokenizer_it_says_so_and_one_can_be_added(published, tmp_path, capsys) -> None:
+    pytest.importorskip("transformers")
+    tokenizer = write_tokenizer(tmp_path / "t5")
+    first, second, third = (str(tmp_path / name) for name in ("first", "second", "third"))
+    assert main(["policies", "convert", str(published), first]) == 0
+    assert "--tokenizer" in capsys.readouterr().err
+    assert main(["policies", "convert", first, second, "--tokenizer", str(tokenizer)]) == 0
+    assert main(["policies", "convert", second, third]) == 0  # with what is stored there
+    assert not capsys.readouterr().err
+    load_policy(third)
+
+
+def test_a_conversion_overwrites_only_when_forced(published, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    save_checkpoint(build_network(small_vima(), seed=0), out)
+    assert main(["policies", "convert", str(published), str(out)]) == 2
+    assert "--force" in capsys.readouterr().err
+    weights = "prompt.images.0.weight"
+    assert torch.equal(
+        load_checkpoint(out).state_dict()[weights], build_network(small_vima(), seed=0).state_dict()[weights]
+    )
+    assert main(["policies", "convert", str(published), str(out), "--force"]) == 0
+    assert torch.equal(
+        load_checkpoint(out).state_dict()[weights], build_network(small_vima(), seed=2).state_dict()[weights]
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["show", "vima-20"], "Did you mean 'vima-20m'?"),
+        (["show", "."], "no checkpoint"),
+        (["convert", "nowhere.ckpt", "out"], "there is no checkpoint at nowhere.ckpt"),
+        (["convert", "damaged.ckpt", "out"], "damaged.ckpt"),
+        (["convert", "2M.ckpt", "out", "--tokenizer", "./nowhere"], "./nowhere"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(
+    words: list[str], message: str, published, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "damaged.ckpt").write_bytes(published.read_bytes()[:1000])
+    assert main(["policies", *words]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert message in shown
+    assert "\n" not in shown
+    assert {path.name for path in tmp_path.iterdir()} == {"2M.ckpt", "damaged.ckpt"}

@@ -1,0 +1,190 @@
+"""Policies from elsewhere: folders, published files, the Hub; and the tokenizer that some of them need."""
+
+import sys
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import CheckpointError, MissingExtraError, PolicyError, UnknownPolicyError  # noqa: E402
+from openvima.evaluation.protocol import weights_hash  # noqa: E402
+from openvima.policies import Policy, RandomPolicy, load_policy  # noqa: E402
+from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.base import TOKENIZER_FOLDER  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, load_network, load_pretrained  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.t5 import T5Tokenizer  # noqa: E402
+from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
+from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
+
+HUB_ID = "owner/some.policy-1"
+
+
+@pytest.fixture
+def policy(small_sizes) -> NetworkPolicy:
+    """A small policy that computes in float64."""
+    return NetworkPolicy(build_network(small_sizes, seed=3))
+
+
+@pytest.fixture
+def published(tmp_path):
+    """A small published file."""
+    return write_published(build_network(small_vima(), seed=2), tmp_path / "2M.ckpt")
+
+
+@pytest.fixture
+def tokenizer(tmp_path) -> T5Tokenizer:
+    """A small tokenizer of T5."""
+    pytest.importorskip("transformers")
+    return T5Tokenizer(write_tokenizer(tmp_path / "t5"))
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    """A Hub without repositories, which notes what it is asked for."""
+    client = ModuleType("huggingface_hub")
+    asked = []
+
+    def snapshot_download(hub_id, *, allow_patterns):
+        asked.append((hub_id, allow_patterns))
+        if client.folder is None:
+            raise ConnectionError("cannot reach huggingface.co\nThe rest is of no use.")
+        return str(client.folder)
+
+    client.folder, client.asked, client.snapshot_download = None, asked, snapshot_download
+    monkeypatch.setitem(sys.modules, "huggingface_hub", client)
+    return client
+
+
+def first_action(policy, demonstrations) -> dict[str, np.ndarray]:
+    demo = demonstrations[0]
+    policy.reset([demo.prompt])
+    return policy.act([demo.observation(0)])[0]
+
+
+def assert_same_actions(first, second, demonstrations) -> None:
+    mine, theirs = first_action(first, demonstrations), first_action(second, demonstrations)
+    assert all(np.array_equal(mine[key], theirs[key]) for key in mine)
+
+
+def test_a_saved_policy_comes_back_in_every_way_of_loading(policy, demonstrations, tmp_path) -> None:
+    policy.save_pretrained(tmp_path / "saved")
+    assert not (tmp_path / "saved" / TOKENIZER_FOLDER).exists()
+    for load in (NetworkPolicy.from_pretrained, Policy.from_pretrained, load_policy, load_pretrained):
+        assert_same_actions(load(str(tmp_path / "saved")), policy, demonstrations)
+
+
+def test_a_policy_is_stored_in_float32_unless_asked(policy, tmp_path) -> None:
+    policy.save_pretrained(tmp_path / "saved")
+    assert load_checkpoint(tmp_path / "saved").query.dtype == torch.float32
+    policy.save_pretrained(tmp_path / "saved", dtype=torch.bfloat16)
+    assert load_checkpoint(tmp_path / "saved").query.dtype == torch.bfloat16
+
+
+def test_options_reach_the_policy(policy, tmp_path) -> None:
+    policy.save_pretrained(tmp_path / "saved")
+    loaded = load_policy(str(tmp_path / "saved"), dtype=torch.bfloat16)
+    assert {tensor.dtype for tensor in loaded.network.parameters()} == {torch.bfloat16}
+    assert load_policy("untrained", dtype=torch.float32).dtype == torch.float32
+    with pytest.raises(PolicyError, match="temperature is -1"):
+        load_policy(str(tmp_path / "saved"), temperature=-1.0)
+    assert isinstance(load_policy("random", dtype=torch.float32), RandomPolicy)
+
+
+def test_a_published_file_is_a_policy_once_it_has_a_tokenizer(published, tokenizer, demonstrations) -> None:
+    policy = load_policy(str(published), tokenizer=tokenizer)
+    assert policy.network.config == replace(small_vima(), prompt=policy.network.config.prompt)
+    assert policy.reader.tokenizer is tokenizer
+    assert first_action(policy, demonstrations)["pose0_position"].shape == (2,)
+
+
+def test_a_tokenizer_is_stored_with_the_policy_and_read_again(
+    published, tokenizer, demonstrations, tmp_path
+) -> None:
+    policy = load_policy(str(published), tokenizer=tokenizer)
+    policy.save_pretrained(tmp_path / "saved")
+    loaded = load_policy(str(tmp_path / "saved"))
+    assert loaded.reader.tokenizer.encode("Put the z.") == tokenizer.encode("Put the z.")
+    assert_same_actions(loaded, policy, demonstrations)
+
+
+def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
+    network, stored = load_network(published)
+    assert stored is None
+    for make in (
+        lambda: load_policy(str(published)),
+        lambda: load_policy("vima-2m"),
+        lambda: NetworkPolicy(network),
+    ):
+        with pytest.raises(PolicyError, match=r"tokenizer=T5Tokenizer.*policies convert IN OUT --tokenizer"):
+            make()
+
+
+def test_the_closed_vocabulary_is_for_networks_that_were_made_for_it(policy) -> None:
+    assert policy.reader.tokenizer is CLOSED_TOKENIZER
+
+
+def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(CheckpointError, match=r"notes\.txt is no published checkpoint"):
+        load_policy(str(tmp_path / "notes.txt"))
+
+
+def test_a_path_that_is_not_there_is_refused(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match="there is no checkpoint at"):
+        NetworkPolicy.from_pretrained(tmp_path / "nowhere")
+    with pytest.raises(UnknownPolicyError, match="there is no policy"):
+        load_policy(str(tmp_path / "nowhere"))
+
+
+def test_a_policy_on_the_hub_is_fetched_and_no_more_than_it(hub, policy, demonstrations, tmp_path) -> None:
+    policy.save_pretrained(tmp_path / "snapshot")
+    hub.folder = tmp_path / "snapshot"
+    assert_same_actions(load_policy(HUB_ID), policy, demonstrations)
+    assert hub.asked == [(HUB_ID, ["model.safetensors", "config.yaml", "tokenizer/*"])]
+
+
+def test_a_policy_on_the_hub_has_the_hash_of_its_weights(hub, policy, tmp_path) -> None:
+    policy.save_pretrained(tmp_path / "snapshot")
+    hub.folder = tmp_path / "snapshot"
+    assert weights_hash(HUB_ID) == weights_hash(tmp_path / "snapshot")
+
+
+def test_a_published_file_has_a_hash_of_its_own(published, tmp_path) -> None:
+    other = write_published(build_network(small_vima(), seed=3), tmp_path / "other.ckpt")
+    assert weights_hash(published) != weights_hash(other)
+
+
+def test_without_a_connection_the_error_names_both_places_in_one_line(hub) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        load_policy(HUB_ID)
+    message = str(caught.value)
+    assert f"no folder '{HUB_ID}' here" in message
+    assert message.endswith("did not give it: cannot reach huggingface.co")
+
+
+def test_without_the_client_of_the_hub_its_package_is_named(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(MissingExtraError, match="pip install huggingface_hub"):
+        load_policy(HUB_ID)
+
+
+@pytest.mark.parametrize(
+    "name", ["runs/frist", "./frist", "a/b/c", "/frist/run", "owner/", "ow ner/run", "x"]
+)
+def test_the_hub_is_not_asked_for_what_can_be_a_path_only(hub, name, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(UnknownPolicyError):
+        load_policy(name)
+    assert not hub.asked
+
+
+def test_the_hub_is_not_asked_for_a_folder_that_is_here(hub, policy, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    policy.save_pretrained(HUB_ID)
+    load_policy(HUB_ID)
+    assert not hub.asked
