@@ -92,7 +92,7 @@ def convert(
 
     With a folder instead of a file, add a tokenizer to a checkpoint.
 
-    Example: openvima policies convert 200M.ckpt vima-200m --tokenizer t5-base
+    Example: openvima policies convert 200M.ckpt published-200m --tokenizer t5-base
 
     Args:
         source: Published file, such as 200M.ckpt, or a checkpoint folder.
