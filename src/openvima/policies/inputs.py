@@ -14,11 +14,18 @@ from typing import Literal, Self
 import numpy as np
 import torch
 
-from openvima.errors import PolicyError, PromptError
+from openvima.errors import PolicyError, PromptError, ShapeError
 from openvima.policies.kernels import CROP_SIZE
 from openvima.policies.layers.frame_encoder import FrameEncoderConfig
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.perception import GROUND_TRUTH, ObjectFinder, ObjectViews, whole_frames
+from openvima.policies.perception import (
+    GROUND_TRUTH,
+    ObjectFinder,
+    ObjectViews,
+    end_effector_of,
+    part_of,
+    whole_frames,
+)
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
@@ -183,6 +190,7 @@ class Reader:
 
         Raises:
             PromptError: It is empty, a word is unknown, or placeholders and images do not match.
+            PolicyError: An image lacks a view.
             ShapeError: An image has another shape or dtype.
         """
         places: list[tuple[int, int, int, bool]] = []  # word, entry, part, counts
@@ -211,9 +219,24 @@ class Reader:
         """Return the reader of one episode's observations."""
         return EpisodeReader(self)
 
+    def see_frames(self, rgb: Mapping[str, np.ndarray]) -> ObjectViews:
+        """Take both frames whole, at the size that the network takes.
+
+        Raises:
+            PolicyError: A view is missing.
+            ShapeError: A frame has another shape or dtype.
+        """
+        frames = whole_frames(rgb)
+        if frames.crops.shape[-2:] != self.image_size:
+            height, width = (2 * length for length in self.image_size)
+            raise ShapeError(
+                f"the frames are {rgb[VIEWS[0]].shape}; this policy takes those of (3, {height}, {width})."
+            )
+        return frames
+
     def _see_prompt_image(self, image: PromptImage) -> ObjectViews:
         if self.layout == "frames":
-            return whole_frames(image.rgb)
+            return self.see_frames(image.rgb)
         objects = self.finder.in_prompt_image(image)
         return objects if self.layout == "objects" else objects.compacted()
 
@@ -246,19 +269,24 @@ class EpisodeReader:
 
         Args:
             observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
+                `segm` only where objects are found by it.
 
         Raises:
+            PolicyError: A part or a view is missing, there is no such end effector, or no object is in view.
+                With a token for each view the last is allowed after the first step.
             ShapeError: An image has another shape or dtype.
-            PolicyError: No object is in view.
         """
-        layout, end_effector = self._reader.layout, int(observation["ee"])
+        layout, end_effector = self._reader.layout, end_effector_of(observation)
         if layout == "frames":
-            frames = whole_frames(observation["rgb"])
+            frames = self._reader.see_frames(part_of(observation, "rgb"))
             centre = frames.positions()
             return StepInput(frames, centre, centre, end_effector)
         objects = self._reader.finder.in_observation(observation)
-        if not len(objects):
-            raise PolicyError("the observation shows no object; there is nothing to act on.")
+        if not len(objects) and not self._num_slots:
+            raise PolicyError(
+                "the observation shows no object; there is nothing to act on. Look at its segmentation, "
+                "or at what the detector finds and at min_score."
+            )
         if layout == "views":
             self._num_slots = max(self._num_slots, len(objects))
             objects = objects.compacted().padded(self._num_slots)

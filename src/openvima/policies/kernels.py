@@ -11,24 +11,28 @@ _FAR = np.int32(1 << 20)
 
 
 @njit(cache=True)
-def object_extents(segm, slot_of_id, extents, num_pixels):
-    """Fill `extents` (N, 4) int64 with xmin, xmax, ymin, ymax and `num_pixels` (N,) from one image."""
+def object_extents(segm, extents, num_pixels):
+    """Fill `extents` (256, 4) int64 with xmin, xmax, ymin, ymax of every id and `num_pixels` (256,)."""
     for k in range(num_pixels.shape[0]):
         num_pixels[k] = 0
         extents[k, 0] = segm.shape[1]
         extents[k, 1] = -1
         extents[k, 2] = segm.shape[0]
         extents[k, 3] = -1
+    width = segm.shape[1]
     for row in range(segm.shape[0]):
-        for column in range(segm.shape[1]):
-            k = slot_of_id[segm[row, column]]
-            if k < 0:
-                continue
-            num_pixels[k] += 1
-            extents[k, 0] = min(extents[k, 0], column)
-            extents[k, 1] = max(extents[k, 1], column)
+        start = 0
+        while start < width:  # a run of equal ids at a time: most pixels repeat the one before
+            k = segm[row, start]
+            end = start + 1
+            while end < width and segm[row, end] == k:
+                end += 1
+            num_pixels[k] += end - start
+            extents[k, 0] = min(extents[k, 0], start)
+            extents[k, 1] = max(extents[k, 1], end - 1)
             extents[k, 2] = min(extents[k, 2], row)
-            extents[k, 3] = max(extents[k, 3], row)
+            extents[k, 3] = row
+            start = end
 
 
 @njit(cache=True)
@@ -46,6 +50,19 @@ def square_crop(rgb, xmin, xmax, ymin, ymax, square):
 
 
 @njit(cache=True)
+def halve_frame(frame, half):
+    """Average 2 × 2 pixels of `frame` (3, 2 H, 2 W) into `half` (3, H, W), halves rounded up."""
+    for channel in range(half.shape[0]):
+        for row in range(half.shape[1]):
+            for column in range(half.shape[2]):
+                total = np.int64(2)
+                for i in range(2):
+                    for j in range(2):
+                        total += frame[channel, 2 * row + i, 2 * column + j]
+                half[channel, row, column] = total >> 2
+
+
+@njit(cache=True)
 def resize_square(square, size, scratch, crop):
     """Resize `square[:, :size, :size]` to `crop` (3, 32, 32) uint8 as OpenCV's area interpolation does.
 
@@ -57,24 +74,11 @@ def resize_square(square, size, scratch, crop):
                 for column in range(CROP_SIZE):
                     crop[channel, row, column] = square[channel, row, column]
     elif size == 2 * CROP_SIZE:
-        _halve(square, crop)
+        halve_frame(square, crop)
     elif size > CROP_SIZE:
         _shrink(square, size, scratch, crop)
     else:
         _enlarge(square, size, crop)
-
-
-@njit(cache=True)
-def _halve(square, crop):
-    """Average 2 × 2 pixels in integers, halves rounded up."""
-    for channel in range(3):
-        for row in range(CROP_SIZE):
-            for column in range(CROP_SIZE):
-                total = np.int64(2)
-                for i in range(2):
-                    for j in range(2):
-                        total += square[channel, 2 * row + i, 2 * column + j]
-                crop[channel, row, column] = total >> 2
 
 
 @njit(cache=True)
@@ -86,16 +90,19 @@ def _shrink(square, size, scratch, crop):
             low = row * scale
             high = low + scale
             for column in range(size):
+                scratch[row, column] = 0.0
+            for i in range(int(low), min(int(np.ceil(high)), size)):
+                shared = min(i + 1.0, high) - max(np.float64(i), low)
+                for column in range(size):
+                    scratch[row, column] += shared * square[channel, i, column]
+        for column in range(CROP_SIZE):
+            low = column * scale
+            high = low + scale
+            first = int(low)
+            last = min(int(np.ceil(high)), size)
+            for row in range(CROP_SIZE):
                 total = 0.0
-                for i in range(int(low), min(int(np.ceil(high)), size)):
-                    total += (min(i + 1.0, high) - max(np.float64(i), low)) * square[channel, i, column]
-                scratch[row, column] = total
-        for row in range(CROP_SIZE):
-            for column in range(CROP_SIZE):
-                low = column * scale
-                high = low + scale
-                total = 0.0
-                for j in range(int(low), min(int(np.ceil(high)), size)):
+                for j in range(first, last):
                     total += (min(j + 1.0, high) - max(np.float64(j), low)) * scratch[row, j]
                 crop[channel, row, column] = np.uint8(np.rint(total / (scale * scale)))
 

@@ -11,9 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from openvima.errors import ShapeError
+from openvima.errors import PolicyError, ShapeError
 from openvima.policies.kernels import (
     CROP_SIZE,
+    halve_frame,
     most_interior_pixel,
     object_extents,
     resize_square,
@@ -24,6 +25,7 @@ from openvima.scene import BACKGROUND_ID, END_EFFECTORS, FIRST_OBJECT_ID, Prompt
 
 MIN_PIXELS = 2  # an object that shows fewer pixels in a view counts as hidden there
 FRONT, TOP = VIEWS.index("front"), VIEWS.index("top")
+_NUM_IDS = 256  # of a segmentation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +106,15 @@ class ObjectViews:
         """Whether each object shows in some view, shape (N,), bool."""
         return np.asarray(self.masks.any(axis=0))
 
+    def left_to_right(self) -> "ObjectViews":
+        """Return the visible objects as they lie on the table, the leftmost in the images first.
+
+        Of objects in one place the one with the smaller boxes comes first, such as what lies in a container.
+        """
+        seen = self.select(self.visible())
+        points, sizes = seen.positions(), seen.boxes[..., 2:].sum(axis=(0, 2))
+        return seen.select(np.lexsort((sizes, points[:, 0], points[:, 1])))
+
     def positions(self) -> np.ndarray:
         """Points on the table under the centres of the boxes, shape (N, 2), float64, metres.
 
@@ -133,12 +144,20 @@ class ObjectFinder(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """Finds the objects by the simulator's segmentation, as the published policies do."""
+    """Finds the objects by the simulator's segmentation, as the published policies do.
+
+    Args:
+        left_to_right: Order the objects of an observation by where they lie. False keeps the order of their
+            ids, as the published evaluation does.
+    """
+
+    left_to_right: bool = True
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Find the objects of an observation; see `observe`."""
-        return observe(observation)
+        return observe(observation, left_to_right=self.left_to_right)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Find the objects that a prompt's image shows; see `observe_prompt_image`."""
@@ -166,28 +185,28 @@ def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
     The frames are halved in both directions by averages over 2 × 2 pixels, rounded half up.
 
     Args:
-        rgb: View name to image, shape (3, H, W), uint8; height and width even.
+        rgb: View name to image, shape (3, H, W), uint8; both of equal size, height and width even.
 
     Returns:
         One slot, its crops of shape (2, 1, 3, H / 2, W / 2).
 
     Raises:
+        PolicyError: A view is missing.
         ShapeError: An image has another shape or dtype.
     """
-    for view in VIEWS:
-        _check_rgb(view, rgb[view])
-    frames = np.stack([rgb[view] for view in VIEWS])[:, None]
-    height, width = frames.shape[-2:]
-    blocks = frames.reshape(*frames.shape[:-2], height // 2, 2, width // 2, 2)
-    sums = blocks.sum(axis=(-3, -1), dtype=np.uint16)
+    front, top = (_checked_rgb(view, frame) for view, frame in by_view(rgb, "rgb").items())
+    height, width = front.shape[1:]
+    if top.shape != front.shape or height % 2 or width % 2 or not front.size:
+        raise ShapeError(
+            f"the frames are {front.shape} and {top.shape}; both must have the same even height and width."
+        )
+    halves = np.empty((len(VIEWS), 1, 3, height // 2, width // 2), np.uint8)
+    for view, frame in enumerate((front, top)):
+        halve_frame(frame, halves[view, 0])
     centre = np.array([(width - 1) // 2, (height - 1) // 2])
     boxes = np.tile(np.array([*centre, height - 1, width - 1]), (len(VIEWS), 1, 1))
     return ObjectViews(
-        np.full(1, -1),
-        ((sums + 2) >> 2).astype(np.uint8),
-        boxes,
-        np.ones((len(VIEWS), 1), np.bool_),
-        np.tile(centre, (len(VIEWS), 1, 1)),
+        np.full(1, -1), halves, boxes, np.ones((len(VIEWS), 1), np.bool_), np.tile(centre, (len(VIEWS), 1, 1))
     )
 
 
@@ -205,48 +224,115 @@ def see_objects(
         One slot for each id, in both views, hidden or not.
 
     Raises:
+        PolicyError: A view is missing, or an id is not one of 0 to 255.
         ShapeError: An image has another shape or dtype.
     """
     ids = np.asarray(object_ids, dtype=np.int64)
-    views = replace(see_nothing(len(ids)), ids=ids)
-    for view, name in enumerate(VIEWS):
-        _check_images(name, rgb[name], segm[name])
-        _cut_view(rgb[name], segm[name], views, view)
-    return views
+    if not np.isin(ids, np.arange(_NUM_IDS)).all():
+        raise PolicyError(f"object ids are {ids.tolist()}; they must lie in 0 … 255, as segmentations do.")
+    return _cut_out(_measure(rgb, segm), ids)
 
 
-def observe(observation: Mapping) -> ObjectViews:
-    """Find the objects of an observation, from left to right.
+def observe(observation: Mapping, *, left_to_right: bool = True) -> ObjectViews:
+    """Find the objects of an observation by its segmentation.
 
-    Objects are all segmentation values from the end effector's first object id up to 254. Their order is that
-    of the images, not of the ids, which could give away the order in which the task spawned them.
+    Objects are all segmentation values from the end effector's first object id up to 254. By default their
+    order is that of the images, not of the ids, which could give away how the task laid the table.
 
     Args:
-        observation: `rgb` and `segm`, each view name to array, and `ee`, the index of the end effector.
+        observation: `rgb` and `segm`, each view name to array of 128 × 256 pixels, and `ee`, the index of the
+            end effector.
+        left_to_right: Order them by where they lie; False keeps the order of their ids.
 
     Returns:
         The objects that show at least two pixels in some view.
+
+    Raises:
+        PolicyError: A part or a view is missing, or there is no such end effector.
+        ShapeError: An image has another shape or dtype.
     """
-    segm = observation["segm"]
-    first = FIRST_OBJECT_ID[END_EFFECTORS[int(observation["ee"])]]
-    present = np.unique(np.concatenate([np.unique(segm[view]) for view in VIEWS]))
-    ids = present[(present >= first) & (present < BACKGROUND_ID)]
-    return _left_to_right(see_objects(observation["rgb"], segm, ids))
+    first = FIRST_OBJECT_ID[END_EFFECTORS[end_effector_of(observation)]]
+    frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
+    views = _measure(frames, part_of(observation, "segm"))
+    shown = np.max([view.num_pixels for view in views], axis=0) >= MIN_PIXELS
+    objects = _cut_out(views, first + np.flatnonzero(shown[first:BACKGROUND_ID]))
+    return objects.left_to_right() if left_to_right else objects
 
 
 def observe_prompt_image(image: PromptImage) -> ObjectViews:
-    """Find the objects that a prompt's image shows, in the order of its records, hidden ones left out."""
-    objects = see_objects(image.rgb, image.segm, [record.object_id for record in image.objects])
+    """Find the objects that a prompt's image shows, in the order of its records, hidden ones left out.
+
+    Raises:
+        PolicyError: A view is missing.
+        ShapeError: An image has another shape or dtype.
+    """
+    frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
+    objects = see_objects(frames, image.segm, [record.object_id for record in image.objects])
     return objects.select(objects.visible())
 
 
-def _left_to_right(objects: ObjectViews) -> ObjectViews:
-    objects = objects.select(objects.visible())
-    points = objects.positions()
-    return objects.select(np.lexsort((points[:, 0], points[:, 1])))
+def part_of(observation: Mapping, name: str) -> Mapping:
+    """Return `rgb` or another part of an observation.
+
+    Raises:
+        PolicyError: It is not there.
+    """
+    if name not in observation:
+        raise PolicyError(
+            f"the observation holds {sorted(observation)} but no {name!r}; it must hold 'rgb' and 'ee', and "
+            "'segm' where objects are found by segmentation."
+        )
+    return observation[name]
 
 
-def crop_box(rgb: np.ndarray, extent: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def end_effector_of(observation: Mapping) -> int:
+    """Return the index of an observation's end effector.
+
+    Raises:
+        PolicyError: It is missing or none of those that exist.
+    """
+    index = np.asarray(part_of(observation, "ee"))
+    if index.shape or index.dtype.kind not in "iu" or not 0 <= index < len(END_EFFECTORS):
+        names = " or ".join(f"{number} ({name})" for number, name in enumerate(END_EFFECTORS))
+        raise PolicyError(f"ee is {observation['ee']!r}; it must be {names}.")
+    return int(index)
+
+
+def camera_frames(rgb: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
+    """Return the frames of both cameras, front before top.
+
+    Args:
+        rgb: View name to image, shape (3, 128, 256), uint8.
+        what: How messages call it.
+
+    Raises:
+        PolicyError: A view is missing.
+        ShapeError: An image has another shape or dtype.
+    """
+    frames = by_view(rgb, what)
+    for view in VIEWS:
+        shape = _checked_rgb(view, frames[view]).shape
+        expected = (3, CAMERAS[view].height, CAMERAS[view].width)
+        if shape != expected:
+            raise ShapeError(f"rgb {view!r} has shape {shape}; it must be {expected}, to measure boxes in.")
+    return frames
+
+
+def by_view(images: Mapping[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
+    """Return one array for each view, front before top.
+
+    Raises:
+        PolicyError: A view is missing.
+    """
+    missing = [view for view in VIEWS if not isinstance(images, Mapping) or view not in images]
+    if missing:
+        raise PolicyError(
+            f"{what} lacks the view {' and '.join(missing)}; it must hold an image of {' and '.join(VIEWS)}."
+        )
+    return {view: np.ascontiguousarray(images[view]) for view in VIEWS}
+
+
+def crop_box(rgb: np.ndarray, extent: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Cut an arbitrary rectangle out of an image, as if an object filled it.
 
     Args:
@@ -257,35 +343,73 @@ def crop_box(rgb: np.ndarray, extent: tuple[int, int, int, int]) -> tuple[np.nda
         The crop, shape (3, 32, 32), uint8, and the box, shape (4,), int64.
     """
     xmin, xmax, ymin, ymax = extent
-    square = np.zeros((3, max(rgb.shape[1:]), max(rgb.shape[1:])), np.uint8)
-    scratch = np.empty((CROP_SIZE, square.shape[2]))
+    size = max(xmax - xmin, ymax - ymin) + 1
+    square = np.zeros((3, size, size), np.uint8)
+    scratch = np.empty((CROP_SIZE, size))
     crop = np.empty((3, CROP_SIZE, CROP_SIZE), np.uint8)
     square_crop(rgb, xmin, xmax, ymin, ymax, square)
-    resize_square(square, max(xmax - xmin, ymax - ymin) + 1, scratch, crop)
+    resize_square(square, size, scratch, crop)
     return crop, np.array([(xmin + xmax) // 2, (ymin + ymax) // 2, ymax - ymin, xmax - xmin])
 
 
-def _cut_view(rgb: np.ndarray, segm: np.ndarray, views: ObjectViews, view: int) -> None:
-    count = len(views)
-    rgb, segm = np.ascontiguousarray(rgb), np.ascontiguousarray(segm)
-    slot_of_id = np.full(256, -1, np.int64)
-    slot_of_id[views.ids] = np.arange(count)
-    extents, num_pixels = np.empty((count, 4), np.int64), np.empty(count, np.int64)
-    object_extents(segm, slot_of_id, extents, num_pixels)
-    distance = np.empty((segm.shape[0] + 2, segm.shape[1] + 2), np.int32)
-    for slot in np.flatnonzero(num_pixels >= MIN_PIXELS):
-        xmin, xmax, ymin, ymax = (int(value) for value in extents[slot])
-        views.crops[view, slot], views.boxes[view, slot] = crop_box(rgb, (xmin, xmax, ymin, ymax))
-        views.masks[view, slot] = True
-        most_interior_pixel(segm, views.ids[slot], extents[slot], distance, views.grasps[view, slot])
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """One view and what its segmentation says: extents (256, 4) and numbers of pixels (256,) of all ids."""
+
+    rgb: np.ndarray
+    segm: np.ndarray
+    extents: np.ndarray
+    num_pixels: np.ndarray
 
 
-def _check_images(view: str, rgb: np.ndarray, segm: np.ndarray) -> None:
-    _check_rgb(view, rgb)
-    if segm.dtype != np.uint8 or segm.shape != rgb.shape[1:]:
-        raise ShapeError(f"segm {view!r} is {segm.dtype} {segm.shape}; it must be uint8 {rgb.shape[1:]}.")
+def _measure(rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> list[_Measured]:
+    views = []
+    frames, segmentations = by_view(rgb, "rgb"), by_view(segm, "segm")
+    for view in VIEWS:
+        frame = _checked_rgb(view, frames[view])
+        ids = _checked_segm(view, segmentations[view], frame.shape[1:])
+        extents, num_pixels = np.empty((_NUM_IDS, 4), np.int64), np.empty(_NUM_IDS, np.int64)
+        object_extents(ids, extents, num_pixels)
+        views.append(_Measured(frame, ids, extents, num_pixels))
+    return views
 
 
-def _check_rgb(view: str, rgb: np.ndarray) -> None:
+def _cut_out(views: Sequence[_Measured], ids: np.ndarray) -> ObjectViews:
+    objects = replace(see_nothing(len(ids)), ids=ids)
+    for v, view in enumerate(views):
+        objects.masks[v] = view.num_pixels[ids] >= MIN_PIXELS
+        for slot in np.flatnonzero(objects.masks[v]):
+            object_id = ids[slot]
+            extent = view.extents[object_id]
+            objects.crops[v, slot], objects.boxes[v, slot] = crop_box(view.rgb, extent.tolist())
+            objects.grasps[v, slot] = interior_pixel(view.segm, extent, value=object_id)
+    return objects
+
+
+def interior_pixel(segm: np.ndarray, extent: np.ndarray, *, value: int) -> np.ndarray:
+    """Find the pixel of an object that is farthest from its outline.
+
+    Args:
+        segm: Which object each pixel shows, shape (H, W), uint8.
+        extent: First and last column, first and last row in which to look, inclusive, shape (4,), int64.
+        value: The object; at least one pixel of it lies there.
+
+    Returns:
+        Column and row, shape (2,), int64.
+    """
+    distance = np.empty((extent[3] - extent[2] + 3, extent[1] - extent[0] + 3), np.int32)
+    pixel = np.empty(2, np.int64)
+    most_interior_pixel(segm, value, extent, distance, pixel)
+    return pixel
+
+
+def _checked_rgb(view: str, rgb: np.ndarray) -> np.ndarray:
     if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3:
         raise ShapeError(f"rgb {view!r} is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")
+    return rgb
+
+
+def _checked_segm(view: str, segm: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if segm.dtype != np.uint8 or segm.shape != shape:
+        raise ShapeError(f"segm {view!r} is {segm.dtype} {segm.shape}; it must be uint8 {shape}.")
+    return segm

@@ -1,0 +1,297 @@
+"""Objects from a detector that sees nothing but pixels, in place of the simulator's segmentation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from openvima.errors import DetectionError, PolicyError, ShapeError
+from openvima.policies.perception import (
+    FRONT,
+    MIN_PIXELS,
+    TOP,
+    ObjectFinder,
+    ObjectViews,
+    camera_frames,
+    crop_box,
+    interior_pixel,
+    part_of,
+    see_nothing,
+)
+from openvima.render.camera import CAMERAS, VIEWS, View, unproject
+from openvima.scene import PromptImage
+
+# How the boxes of one object differ between the views, measured on 2,260 observations of all tasks and levels
+# with the boxes of the segmentation: half of the pairs by less than 3 mm, the worst by 99 mm. With these
+# numbers 0.8 % of the observations get a wrong pair if masks are given, 3.1 % from boxes alone; nearly all
+# are stacks, of which the view from above shows but the rim of what lies below.
+MAX_DISTANCE_M = 0.1
+DEPTH_WEIGHT = 0.5  # the front camera looks down at 45 degrees and takes height for distance
+COLOUR_WEIGHT_M = 0.5  # metres that black against full red is worth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """What a detector finds in one image of H × W pixels.
+
+    Args:
+        boxes: First column, first row, last column, last row of each object, shape (N, 4), integers. The last
+            ones still belong to the object. See `from_edges` for boxes in real numbers.
+        masks: Which pixels show the object, shape (N, H, W), bool. None where only boxes are known.
+        scores: How sure the detector is, shape (N,), numbers. None counts all as sure.
+
+    Raises:
+        ShapeError: An array has another shape or dtype.
+        DetectionError: A box ends before it begins, or a score is not a finite number.
+    """
+
+    boxes: np.ndarray
+    masks: np.ndarray | None = None
+    scores: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        boxes, masks, scores = self.boxes, self.masks, self.scores
+        for name, array in (("boxes", boxes), ("masks", masks), ("scores", scores)):
+            if not isinstance(array, np.ndarray) and not (array is None and name != "boxes"):
+                raise ShapeError(f"{name} are a {type(array).__name__}; they must be a numpy array.")
+        if boxes.dtype.kind not in "iu" or boxes.ndim != 2 or boxes.shape[1] != 4:
+            raise ShapeError(
+                f"boxes are {boxes.dtype} {boxes.shape}; they must be integers of shape (N, 4): first "
+                "column, first row, last column, last row. Detections.from_edges takes real numbers."
+            )
+        count = len(boxes)
+        if masks is not None and (masks.dtype != np.bool_ or masks.ndim != 3 or len(masks) != count):
+            raise ShapeError(f"masks are {masks.dtype} {masks.shape}; they must be bool ({count}, H, W).")
+        if scores is not None and (scores.dtype.kind not in "iuf" or scores.shape != (count,)):
+            raise ShapeError(f"scores are {scores.dtype} {scores.shape}; they must be numbers ({count},).")
+        if scores is not None and not np.isfinite(scores).all():
+            raise DetectionError(f"scores are {scores.tolist()}; they must be finite.")
+        wrong = np.flatnonzero((boxes[:, 2:] < boxes[:, :2]).any(axis=1))
+        if len(wrong):
+            raise DetectionError(
+                f"box {wrong[0]} is {boxes[wrong[0]].tolist()}; its last column and row must not come before "
+                "its first."
+            )
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def select(self, rows: np.ndarray) -> "Detections":
+        """Return some of the detections (indices or booleans), in that order."""
+        masks = None if self.masks is None else self.masks[rows]
+        scores = None if self.scores is None else self.scores[rows]
+        return Detections(self.boxes[rows], masks, scores)
+
+    @staticmethod
+    def from_edges(
+        edges: np.ndarray,
+        masks: np.ndarray | None = None,
+        scores: np.ndarray | None = None,
+        *,
+        height: int = 128,
+        width: int = 256,
+    ) -> "Detections":
+        """Take boxes in real numbers, as most detectors give them.
+
+        Args:
+            edges: Left, upper, right and lower edge of each box, shape (N, 4), in pixels; pixel 0 reaches
+                from 0 to 1. A box takes in every pixel that it touches and is cut off at the image's border.
+            masks: As in `Detections`.
+            scores: As in `Detections`.
+            height: Pixels of the image.
+            width: Pixels of the image.
+
+        Raises:
+            ShapeError: `edges` is not of shape (N, 4).
+            DetectionError: An edge is not a finite number, or a box lies outside the image.
+        """
+        edges = np.asarray(edges, np.float64)
+        if edges.ndim != 2 or edges.shape[1] != 4:
+            raise ShapeError(f"edges have shape {edges.shape}; it must be (N, 4): left, upper, right, lower.")
+        limit = np.array([width, height], np.float64)
+        inside = (edges[:, :2] < limit).all(axis=1) & (edges[:, 2:] > 0).all(axis=1)
+        wrong = ~(inside & np.isfinite(edges).all(axis=1))
+        if wrong.any():
+            raise DetectionError(
+                f"box {edges[wrong][0].tolist()} lies outside the image of {width} × {height} pixels."
+            )
+        first = np.maximum(np.floor(edges[:, :2]), 0)
+        last = np.maximum(np.minimum(np.ceil(edges[:, 2:]), limit) - 1, first)
+        return Detections(np.concatenate([first, last], axis=1).astype(np.int64), masks, scores)
+
+    @staticmethod
+    def from_masks(masks: np.ndarray, scores: np.ndarray | None = None) -> "Detections":
+        """Take masks alone and draw the boxes around them; masks of less than two pixels are left out.
+
+        Args:
+            masks: Which pixels show the object, shape (N, H, W), bool.
+            scores: As in `Detections`.
+
+        Raises:
+            ShapeError: An array has another shape or dtype.
+        """
+        found = Detections(np.zeros((len(masks), 4), np.int64), masks, scores)
+        large = np.count_nonzero(masks, axis=(1, 2)) >= MIN_PIXELS
+        for number in np.flatnonzero(large):
+            rows, columns = np.nonzero(masks[number])
+            found.boxes[number] = columns.min(), rows.min(), columns.max(), rows.max()
+        return found.select(large)
+
+
+class Detector(Protocol):
+    """Finds objects in one image. Arm, tool and table are none."""
+
+    def detect(self, rgb: np.ndarray, view: str) -> Detections:
+        """Find the objects in an image of shape (3, 128, 256), uint8, of the view "front" or "top"."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedObjects:
+    """Finds objects by a detector; an `ObjectFinder` that never looks at a segmentation.
+
+    Each view is looked at alone. Then boxes of the two views are paired that stand on the same place of the
+    table and have the same colour; what stays without a partner is an object hidden in the other view. All
+    ids are -1.
+
+    Args:
+        detector: Finds the objects of one image.
+        min_score: Detections below it are left out. Those without scores all count.
+        prompt_finder: Finds the objects of prompt images instead, which look unlike the table of most
+            detectors' training images; `GROUND_TRUTH`, for example.
+    """
+
+    detector: Detector
+    min_score: float = field(default=0.5, kw_only=True)
+    prompt_finder: ObjectFinder | None = field(default=None, kw_only=True)
+
+    def in_observation(self, observation: Mapping) -> ObjectViews:
+        """Find the objects of an observation, from left to right.
+
+        Raises:
+            PolicyError: A view is missing.
+            ShapeError: An image or a detection has another shape or dtype.
+            DetectionError: A detection lies outside the image.
+        """
+        frames = camera_frames(part_of(observation, "rgb"), "the observation's rgb")
+        front, top = (self._look(frames[view], view) for view in VIEWS)
+        return _joined(front, top, _pairs(front, top)).left_to_right()
+
+    def in_prompt_image(self, image: PromptImage) -> ObjectViews:
+        """Find the objects that a prompt's image shows, from left to right.
+
+        Of an image of a single object only the detection of the highest score counts in each view (without
+        scores the first), be it below `min_score`.
+
+        Raises:
+            PolicyError: A view is missing.
+            ShapeError: An image or a detection has another shape or dtype.
+            DetectionError: A detection lies outside the image.
+        """
+        if self.prompt_finder is not None:
+            return self.prompt_finder.in_prompt_image(image)
+        single = image.kind == "object"
+        frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
+        front, top = (self._look(frames[view], view, single=single) for view in VIEWS)
+        both = [(0, 0)] if len(front.boxes) and len(top.boxes) else []
+        return _joined(front, top, both if single else _pairs(front, top)).left_to_right()
+
+    def _look(self, rgb: np.ndarray, view: View, *, single: bool = False) -> "_Sight":
+        found = self.detector.detect(rgb, view)
+        _check_within(found, rgb.shape[1:], view)
+        if single and len(found):
+            found = found.select(np.array([0 if found.scores is None else found.scores.argmax()]))
+        elif found.scores is not None:
+            found = found.select(found.scores >= self.min_score)
+        return _cut_out(rgb, found, view)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sight:
+    """The detections of one view.
+
+    Args:
+        crops: Shape (N, 3, 32, 32), uint8.
+        boxes: Centre x, centre y, height, width in pixels, shape (N, 4), int64.
+        grasps: Column and row, shape (N, 2), int64.
+        corners: Table points under the lower left and the lower right corner of the box, shape (N, 2, 2),
+            metres. Upper corners would not do: how far up an object reaches depends on its height in front.
+        colours: Mean colour inside the mask or box, shape (N, 3), 0 to 1.
+    """
+
+    crops: np.ndarray
+    boxes: np.ndarray
+    grasps: np.ndarray
+    corners: np.ndarray
+    colours: np.ndarray
+
+
+def _cut_out(rgb: np.ndarray, found: Detections, view: View) -> _Sight:
+    blank = see_nothing(len(found))
+    crops, boxes, grasps = blank.crops[0], blank.boxes[0], blank.grasps[0]
+    colours = np.zeros((len(found), 3))
+    for k, (left, upper, right, lower) in enumerate(found.boxes.tolist()):
+        crops[k], boxes[k] = crop_box(rgb, (left, right, upper, lower))
+        inside = rgb[:, upper : lower + 1, left : right + 1]
+        mask = None if found.masks is None else found.masks[k, upper : lower + 1, left : right + 1]
+        if mask is None or not mask.any():
+            grasps[k], colours[k] = boxes[k, :2], inside.mean(axis=(1, 2)) / 255
+            continue
+        extent = np.array([0, right - left, 0, lower - upper])
+        grasps[k] = interior_pixel(np.ascontiguousarray(mask).view(np.uint8), extent, value=1)
+        grasps[k] += left, upper
+        colours[k] = inside[:, mask].mean(axis=1) / 255
+    corners = found.boxes[:, [[0, 3], [2, 3]]]
+    return _Sight(crops, boxes, grasps, unproject(corners, CAMERAS[view]), colours)
+
+
+def _pairs(front: _Sight, top: _Sight) -> list[tuple[int, int]]:
+    """Rows of front and top that show the same object: always the likest two that are left."""
+    apart = np.abs(front.corners[:, None] - top.corners).max(axis=2)  # (front, top, x and y)
+    distances = apart[..., 1] + DEPTH_WEIGHT * apart[..., 0]
+    colours = np.linalg.norm(front.colours[:, None] - top.colours, axis=-1)
+    costs = np.where(distances <= MAX_DISTANCE_M, distances + COLOUR_WEIGHT_M * colours, np.inf)
+    pairs = []
+    while np.isfinite(costs).any():
+        row, column = (int(index) for index in np.unravel_index(costs.argmin(), costs.shape))
+        pairs.append((row, column))
+        costs[row], costs[:, column] = np.inf, np.inf
+    return pairs
+
+
+def _joined(front: _Sight, top: _Sight, pairs: list[tuple[int, int]]) -> ObjectViews:
+    """Give each pair a slot, then each object that only one view shows."""
+    only_front = sorted(set(range(len(front.boxes))) - {row for row, _ in pairs})
+    only_top = sorted(set(range(len(top.boxes))) - {row for _, row in pairs})
+    hidden = -1
+    slots = [*pairs, *((row, hidden) for row in only_front), *((hidden, row) for row in only_top)]
+    rows = np.array(slots, np.int64).reshape(-1, 2)
+    objects = see_nothing(len(rows))
+    for view, sight in ((FRONT, front), (TOP, top)):
+        shown = rows[:, view] != hidden
+        chosen = rows[shown, view]
+        objects.masks[view] = shown
+        objects.crops[view, shown] = sight.crops[chosen]
+        objects.boxes[view, shown] = sight.boxes[chosen]
+        objects.grasps[view, shown] = sight.grasps[chosen]
+    return objects
+
+
+def _check_within(found: Detections, shape: tuple[int, ...], view: View) -> None:
+    if not isinstance(found, Detections):
+        raise PolicyError(
+            f"the detector gave a {type(found).__name__} for view {view!r}; it must give Detections."
+        )
+    height, width = shape
+    if found.masks is not None and found.masks.shape[1:] != (height, width):
+        raise ShapeError(
+            f"masks of view {view!r} have shape {found.masks.shape}; not (N, {height}, {width})."
+        )
+    outside = (found.boxes < 0) | (found.boxes >= [width, height, width, height])
+    if outside.any():
+        number = int(np.flatnonzero(outside.any(axis=1))[0])
+        raise DetectionError(
+            f"box {number} of view {view!r} is {found.boxes[number].tolist()}; columns must lie in "
+            f"0 … {width - 1} and rows in 0 … {height - 1}."
+        )
