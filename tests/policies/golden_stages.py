@@ -75,7 +75,7 @@ def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
     for t, end_effector in enumerate(recorded["in.ee"][:, 0]):
         steps.append(step_of(recorded, f"roll.step{t}", (), int(end_effector)))
         history, features = read_histories(network, [steps[-1:]])
-        seen = network.observe(history, features[history.crops_BTVN])[0]
+        slots_BTQD, _, _ = network.observe(history, features[history.crops_BTVN])
 
         filled, counts = _filled(steps)
         with _zero_vectors_beyond(network, counts[-1:]):
@@ -89,7 +89,7 @@ def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
             all_read = network(memory, *batch, torch.cat(actions_B1C[1:], dim=1))
 
         step = predictions(network, read)
-        step |= {"obs_tokens": seen[0, 0].numpy(), "action_token": token[0, 0].numpy()}
+        step |= {"obs_tokens": slots_BTQD[0, 0].numpy(), "action_token": token[0, 0].numpy()}
         step["pred_tokens"] = all_read.query_BTD[0].numpy()
         step["pred_token"] = read.query_BTD[0, 0].numpy()
         for key, part in ACTION_PARTS.items():

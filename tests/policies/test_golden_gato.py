@@ -6,6 +6,7 @@ pytest.importorskip("torch")
 
 from tests.policies.golden import (
     Arrays,
+    Recording,
     assert_agrees,
     needs,
     recorded_names,
@@ -19,15 +20,20 @@ pytestmark = needs(NAME)
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Arrays:
+def recorded() -> Recording:
     return recording(NAME)
 
 
 @pytest.fixture(scope="module")
-def computed(recorded: Arrays) -> Arrays:
+def computed(recorded: Recording) -> Arrays:
     return stages(tiny_network(NAME), recorded)
 
 
 @pytest.mark.parametrize("name", recorded_names(NAME))
-def test_golden_gato_agrees_in(name: str, computed: Arrays, recorded: Arrays):
+def test_golden_gato_agrees_in(name: str, computed: Arrays, recorded: Recording):
     assert_agrees(computed[name], recorded[name])
+
+
+@pytest.mark.usefixtures("computed")
+def test_golden_gato_is_fed_every_input(recorded: Recording):
+    assert recorded.unused_inputs() == []

@@ -8,6 +8,7 @@ pytest.importorskip("torch")
 import torch
 from tests.policies.golden import (
     Arrays,
+    Recording,
     assert_agrees,
     needs,
     recorded_names,
@@ -24,12 +25,12 @@ pytestmark = needs(NAME)
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Arrays:
+def recorded() -> Recording:
     return recording(NAME)
 
 
 @pytest.fixture(scope="module")
-def computed(recorded: Arrays) -> Arrays:
+def computed(recorded: Recording) -> Arrays:
     network = tiny_network(NAME)
     return stages(network, recorded) | closed_loop(network, recorded) | tables(recorded)
 
@@ -55,8 +56,13 @@ def within_table(name: str, bins: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", recorded_names(NAME))
-def test_golden_vima_agrees_in(name: str, computed: Arrays, recorded: Arrays):
+def test_golden_vima_agrees_in(name: str, computed: Arrays, recorded: Recording):
     assert_agrees(computed[name], within_table(name, recorded[name]))
+
+
+@pytest.mark.usefixtures("computed")
+def test_golden_vima_is_fed_every_input(recorded: Recording):
+    assert recorded.unused_inputs() == []
 
 
 def test_golden_closed_loop_acts_alike_with_and_without_kept_keys(computed: Arrays, recorded: Arrays):
