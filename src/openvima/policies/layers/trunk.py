@@ -131,8 +131,9 @@ class Trunk(nn.Module):
             mask_BL: Which of these places may be looked at, bool. Masked places still get an output.
 
         Returns:
-            Outputs, shape (B, L, D), and the state after them. A place sees itself and the valid places
-            before it. Reading in pieces gives the outputs of reading at once, but for rounding.
+            Outputs, shape (B, L, D), and the state after them. A place sees the valid places before
+            it, and itself if it is valid. Reading in pieces gives the outputs of reading at once, but for
+            rounding.
 
         Raises:
             PolicyError: The history has more places than the position table.
