@@ -18,6 +18,7 @@ def main(
     checkpoint_every: int | None = None,
     seed: int = 0,
     threads: int = 1,
+    t5: str | None = None,
     assets: str = "procedural",
     force: bool = False,
 ) -> int:
@@ -40,6 +41,8 @@ def main(
         checkpoint_every: Steps between checkpoints.
         seed: Decides weights, order of the data and augmentation.
         threads: Threads to compute with; equal numbers give equal weights.
+        t5: Where the published sizes (vima-2m …) take T5 from: a folder with weights and tokenizer, or
+            t5-base to fetch it from the Hugging Face Hub.
         assets: Pack of the demonstrations: procedural, original, or a checkout of the original benchmark.
         force: Throw away a run with other settings that is in the run folder.
     """
@@ -58,6 +61,7 @@ def main(
         preset=preset,
         seed=seed,
         threads=threads,
+        t5=t5,
         assets=assets,
         force=force,
         **{name: value for name, value in given.items() if value is not None},

@@ -56,9 +56,10 @@ class T5Tokenizer:
         self._special_ids = frozenset(self._tokenizer.all_special_ids)
         self._words: dict[str, list[int]] = {}  # prompts repeat a few hundred words over and over
 
-    def __len__(self) -> int:
-        """Number of ids."""
-        return len(self._tokenizer)
+    @property
+    def vocabulary_size(self) -> int:
+        """Number of ids that `encode` may give."""
+        return self._tokenizer.backend_tokenizer.get_vocab_size(with_added_tokens=False)
 
     def encode(self, text: str) -> list[int]:
         """Turn a piece of text without placeholders into ids, without the end mark.
@@ -108,10 +109,10 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
             "FOLDER`; 't5-base' instead of a folder fetches it from the Hugging Face Hub."
         )
     tokenizer = T5Tokenizer(source)
-    if len(tokenizer) > config.vocabulary_size:
+    if tokenizer.vocabulary_size > config.vocabulary_size:
         raise PolicyError(
-            f"the tokenizer of {source} has {len(tokenizer)} ids, the policy {config.vocabulary_size}; take "
-            "the tokenizer that belongs to it."
+            f"the tokenizer of {source} has {tokenizer.vocabulary_size} ids, the policy "
+            f"{config.vocabulary_size}; take the tokenizer that belongs to it."
         )
     return tokenizer
 

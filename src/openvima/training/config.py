@@ -48,6 +48,8 @@ class TrainingConfig:
         pretraining_learning_rate: Highest learning rate of that.
         temperature: Divisor of similarities in the matching loss.
         tune_crops: Go on training the crop encoder while cloning. Slower: each step encodes its crops anew.
+        t5: Where presets that read prompts with T5 take its weights and tokenizer from: a folder, or an id on
+            the Hugging Face Hub such as "t5-base".
         assets: Asset pack to draw the pairs with: "procedural", or the folder of the original one.
         seed: Decides weights, order and augmentation.
         validation_share: Share of the demonstrations that only serve to choose the best checkpoint.
@@ -73,6 +75,7 @@ class TrainingConfig:
     pretraining_learning_rate: float = 1e-3
     temperature: float = 0.07
     tune_crops: bool = False
+    t5: str | None = None
     assets: str = "procedural"
     seed: int = 0
     validation_share: float = 0.05

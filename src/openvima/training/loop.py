@@ -14,10 +14,12 @@ from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError
+from openvima.policies.config import PolicyConfig
 from openvima.policies.inputs import Reader
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.presets import preset
+from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.config import TrainingConfig
 from openvima.training.dataset import read_examples
 from openvima.training.pretrain import render_pairs
@@ -29,7 +31,7 @@ Report = Callable[[int, int, str], None]
 
 LOG_EVERY = 20  # steps
 # Where files are, with how many threads it runs and how often it saves does not make it another run.
-_NOT_SETTINGS = ("data", "out", "threads", "force", "checkpoint_every")
+_NOT_SETTINGS = ("data", "out", "t5", "threads", "force", "checkpoint_every")
 
 
 def train(config: TrainingConfig, report: Report | None = None) -> Path:
@@ -48,36 +50,54 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
     Raises:
         ConfigError: The folder holds a run with other settings, or preset and settings contradict each other.
         DatasetError: There are no demonstrations.
-        CheckpointError: The last checkpoint is damaged.
+        CheckpointError: The last checkpoint is damaged, or T5 is not where the settings say, or of other
+            sizes.
+        MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
     sizes = preset(config.preset)
-    if sizes.prompt.tokenizer == "t5":
+    _check_preset(config, sizes)
+    load_assets(config.assets)  # what is wrong is found before there is a run folder
+    dataset = Dataset(config.data)
+    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, config.t5))
+    with _threads(config.threads):
+        model = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+        if config.t5:
+            load_t5(model, config.t5)
+        run = RunFolder(config.out, _settings(config, dataset), force=config.force)
+        _Trainer(config, dataset, model, reader, run, report or _ignore).train()
+    return run.path
+
+
+def _check_preset(config: TrainingConfig, sizes: PolicyConfig) -> None:
+    reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
+    if reads_with_t5 and config.t5 is None:
         raise ConfigError(
-            f"preset {config.preset!r} reads prompts with T5, which is not trained here; take nano, "
-            "nano-bins or a member of the family at size nano."
+            f"preset {config.preset!r} reads prompts with T5; set t5 to the folder that holds it, or to "
+            "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
         )
-    images = sizes.images
+    if config.t5 is not None and not reads_with_t5:
+        raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
     has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
     if config.pretraining_steps and not has_appearance:
         raise ConfigError(
             f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0."
         )
-    load_assets(config.assets)  # a wrong name is found before there is a run folder
-    dataset = Dataset(config.data)
-    run = RunFolder(config.out, _settings(config, dataset), force=config.force)
-    with _threads(config.threads):
-        model = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
-        _Trainer(config, dataset, model, run, report or _ignore).train()
-    return run.path
 
 
 class _Trainer:
     """One run in progress."""
 
     def __init__(
-        self, config: TrainingConfig, dataset: Dataset, model: PolicyNetwork, run: RunFolder, report: Report
+        self,
+        config: TrainingConfig,
+        dataset: Dataset,
+        model: PolicyNetwork,
+        reader: Reader,
+        run: RunFolder,
+        report: Report,
     ) -> None:
-        self.config, self.dataset, self.model, self.run, self.report = config, dataset, model, run, report
+        self.config, self.dataset, self.model, self.reader = config, dataset, model, reader
+        self.run, self.report = run, report
         self.started = time.monotonic()
         self.progress = run.resume(model)
         self.stages = [(config.steps, self._cloning)]
@@ -151,7 +171,7 @@ class _Trainer:
         best = self.progress.best_score
         if is_last_stage and (best is None or score >= best - error):
             self.progress = replace(self.progress, best_score=max(score, best or 0.0), best_checkpoint=name)
-        self.run.save(name, self.model, optimizer, self.progress)
+        self.run.save(name, self.model, optimizer, self.progress, self.reader.tokenizer)
 
     def _matching(self) -> Stage:
         def say(done: int, total: int, note: str) -> None:
@@ -166,7 +186,7 @@ class _Trainer:
         self._report(f"reading {len(self.dataset)} demonstrations")
         examples = read_examples(
             self.dataset,
-            Reader.of(self.model.config.images),
+            self.reader,
             validation_share=self.config.validation_share,
             seed=self.config.seed,
         )

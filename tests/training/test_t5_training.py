@@ -1,0 +1,125 @@
+"""Runs of policies that read prompts with T5: its weights at the start, its tokenizer in every checkpoint."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("transformers")
+
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.errors import CheckpointError, ConfigError  # noqa: E402
+from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint  # noqa: E402
+from openvima.policies.t5 import T5Tokenizer  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from published_policies import small_vima, write_tokenizer  # noqa: E402
+
+
+def small_t5_vima():
+    """The small VIMA, with the last of its two T5 layers trained."""
+    sizes = small_vima()
+    return replace(sizes, prompt=replace(sizes.prompt, trained_layers=1))
+
+
+@pytest.fixture
+def t5(tmp_path: Path) -> Path:
+    """A folder with a small T5: tokenizer and weights."""
+    from transformers import T5Config, T5EncoderModel
+
+    prompt = small_t5_vima().prompt
+    text = prompt.text
+    sizes = T5Config(
+        vocab_size=prompt.vocabulary_size,
+        d_model=text.width,
+        d_kv=text.head_width,
+        d_ff=text.hidden_width,
+        num_layers=text.num_layers,
+        num_heads=text.num_heads,
+    )
+    folder = write_tokenizer(tmp_path / "t5")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        T5EncoderModel(sizes).save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def t5_settings(settings, t5, monkeypatch) -> dict:
+    monkeypatch.setitem(presets.PRESETS, "tiny-t5", small_t5_vima)
+    changes = {"preset": "tiny-t5", "t5": str(t5), "pretraining_steps": 0, "steps": 4}
+    return {**settings, **changes}
+
+
+def checkpoints(run: Path) -> list[Path]:
+    return sorted(path for path in (run / "checkpoints").iterdir() if path.is_dir())
+
+
+def test_training_begins_with_the_weights_of_t5_and_leaves_the_frozen_ones(t5_settings, t5) -> None:
+    from transformers import T5EncoderModel
+
+    prompt = load_checkpoint(checkpoints(train(TrainingConfig(**t5_settings)))[-1]).prompt
+    reference = T5EncoderModel.from_pretrained(t5)
+    first, second = reference.encoder.block
+    assert torch.equal(prompt.words.weight, reference.shared.weight)
+    assert torch.equal(prompt.text.blocks[0].query.weight, first.layer[0].SelfAttention.q.weight)
+    change = prompt.text.blocks[1].query.weight - second.layer[0].SelfAttention.q.weight
+    assert change.any()
+    assert change.abs().max() < 0.1  # trained, not drawn anew
+
+
+def test_every_checkpoint_holds_the_tokenizer_so_that_t5_may_go(t5_settings, t5) -> None:
+    run = train(TrainingConfig(**t5_settings))
+    text = "Put the block into the bowl."
+    expected = T5Tokenizer(t5).encode(text)
+    t5.rename(t5.with_name("elsewhere"))
+    assert checkpoints(run)
+    for checkpoint in checkpoints(run):
+        assert T5Tokenizer(checkpoint / "tokenizer").encode(text) == expected
+    env = TabletopEnv("visual_manipulation")
+    observation, _ = env.reset(seed=0)
+    policy = load_policy(str(run))
+    policy.reset([env.prompt])
+    assert policy.act([observation])[0] is not None
+
+
+class Killed(BaseException):
+    """Stands for a kill signal."""
+
+
+def kill_at_4(done: int, total: int, note: str) -> None:
+    if done == 4:
+        raise Killed
+
+
+def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settings, t5, tmp_path) -> None:
+    whole = train(TrainingConfig(**{**t5_settings, "out": tmp_path / "whole"}))
+    torn = TrainingConfig(**{**t5_settings, "out": tmp_path / "torn"})
+    with pytest.raises(Killed):
+        train(torn, kill_at_4)
+    moved = t5.rename(t5.with_name("elsewhere"))
+    train(replace(torn, t5=str(moved)))
+    expected, actual = (load_checkpoint(checkpoints(run)[-1]).state_dict() for run in (whole, torn.out))
+    assert all(torch.equal(tensor, actual[name]) for name, tensor in expected.items())
+
+
+def test_a_preset_with_t5_needs_to_know_where_it_is(t5_settings) -> None:
+    with pytest.raises(ConfigError, match="'tiny-t5' reads prompts with T5; set t5"):
+        train(TrainingConfig(**{**t5_settings, "t5": None}))
+    assert not t5_settings["out"].exists()
+
+
+def test_a_preset_without_t5_refuses_one(settings, t5) -> None:
+    with pytest.raises(ConfigError, match="leave t5 out"):
+        train(TrainingConfig(**settings, t5=str(t5)))
+
+
+def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> None:
+    sizes = small_t5_vima()
+    text = replace(sizes.prompt.text, hidden_width=24)
+    wider = replace(sizes, prompt=replace(sizes.prompt, text=text))
+    monkeypatch.setitem(presets.PRESETS, "tiny-t5", lambda: wider)
+    with pytest.raises(CheckpointError, match=r"wi\.weight is \(16, 32\) instead of \(24, 32\)"):
+        train(TrainingConfig(**t5_settings))
+    assert not t5_settings["out"].exists()
