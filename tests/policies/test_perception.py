@@ -5,15 +5,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openvima.errors import ShapeError
+from openvima.errors import PolicyError, ShapeError
 from openvima.policies.perception import (
     FRONT,
     TOP,
+    GroundTruth,
     ObjectViews,
     crop_box,
     observe,
     observe_prompt_image,
     see_objects,
+    whole_frames,
 )
 from openvima.render.camera import CAMERAS, unproject
 from openvima.scene import ObjectRecord, PromptImage
@@ -210,6 +212,48 @@ def test_images_that_are_not_contiguous_give_the_same() -> None:
     np.testing.assert_array_equal(plain.crops, other.crops)
 
 
+def test_of_objects_in_one_place_the_smaller_comes_first_whatever_its_id() -> None:
+    for small, large in ((5, 6), (6, 5)):
+        segm = empty()
+        segm["top"][40:61, 100:121] = large
+        segm["top"][45:56, 105:116] = small
+        assert observe({"rgb": noise(), "segm": segm, "ee": 0}).ids.tolist() == [small, large]
+
+
+def test_the_order_can_be_that_of_the_ids() -> None:
+    segm = empty()
+    for number, column in ((7, 20), (5, 100), (6, 200)):
+        segm["top"][50:60, column : column + 10] = number
+    seen = {"rgb": noise(), "segm": segm, "ee": 0}
+    assert GroundTruth().in_observation(seen).ids.tolist() == [7, 5, 6]
+    assert GroundTruth(left_to_right=False).in_observation(seen).ids.tolist() == [5, 6, 7]
+
+
+def test_whole_frames_are_halved_with_halves_rounded_up() -> None:
+    rgb = noise(shape=(8, 12))
+    frames = whole_frames(rgb)
+    assert frames.crops.shape == (2, 1, 3, 4, 6)
+    assert frames.masks.tolist() == [[True], [True]]
+    for v, view in enumerate(VIEWS):
+        blocks = rgb[view].astype(int).reshape(3, 4, 2, 6, 2).sum(axis=(2, 4))
+        np.testing.assert_array_equal(frames.crops[v, 0], (blocks + 2) // 4)
+    corner = np.zeros((3, 2, 2), np.uint8)
+    for sum_of_four, mean in ((1, 0), (2, 1), (5, 1), (6, 2), (1020, 255)):
+        corner[:] = np.array([sum_of_four // 4 + (k < sum_of_four % 4) for k in range(4)]).reshape(2, 2)
+        assert (whole_frames(dict.fromkeys(VIEWS, corner)).crops == mean).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(7, 12), (8, 11), (0, 12)])
+def test_frames_that_cannot_be_halved_are_refused(height: int, width: int) -> None:
+    with pytest.raises(ShapeError, match="even height and width"):
+        whole_frames(noise(shape=(height, width)))
+
+
+def test_frames_of_two_sizes_are_refused() -> None:
+    with pytest.raises(ShapeError, match="same even height"):
+        whole_frames({"front": noise()["front"], "top": noise(shape=(64, 128))["top"]})
+
+
 def test_images_of_another_shape_or_dtype_are_refused() -> None:
     rgb, segm = noise(), empty()
     with pytest.raises(ShapeError, match="rgb 'front'"):
@@ -218,3 +262,46 @@ def test_images_of_another_shape_or_dtype_are_refused() -> None:
         see_objects({**rgb, "front": rgb["front"].transpose(1, 2, 0)}, segm, [ID])
     with pytest.raises(ShapeError, match="segm 'top'"):
         see_objects(rgb, {**segm, "top": segm["top"][:-1]}, [ID])
+
+
+def test_a_missing_view_is_named() -> None:
+    rgb, segm = noise(), empty()
+    with pytest.raises(PolicyError, match="rgb lacks the view top; it must hold an image of front and top"):
+        see_objects({"front": rgb["front"]}, segm, [ID])
+    with pytest.raises(PolicyError, match="segm lacks the view front"):
+        see_objects(rgb, {"top": segm["top"]}, [ID])
+    with pytest.raises(PolicyError, match="rgb lacks the view front and top"):
+        whole_frames(rgb["front"])
+
+
+@pytest.mark.parametrize("number", [-1, 256])
+def test_ids_that_no_segmentation_holds_are_refused(number: int) -> None:
+    with pytest.raises(PolicyError, match="0 … 255"):
+        see_objects(noise(), empty(), [5, number])
+
+
+@pytest.mark.parametrize("part", ["rgb", "segm", "ee"])
+def test_a_missing_part_of_an_observation_is_named(part: str) -> None:
+    seen = {"rgb": noise(), "segm": empty(), "ee": 0}
+    del seen[part]
+    with pytest.raises(PolicyError, match=f"no '{part}'; it must hold 'rgb' and 'ee'"):
+        observe(seen)
+
+
+@pytest.mark.parametrize("effector", [2, -1, 0.0, "suction", None, [0]])
+def test_an_end_effector_that_does_not_exist_is_refused(effector: object) -> None:
+    with pytest.raises(PolicyError, match=r"must be 0 \(suction\) or 1 \(spatula\)"):
+        observe({"rgb": noise(), "segm": empty(), "ee": effector})
+
+
+def test_end_effectors_may_be_numpy_numbers() -> None:
+    for effector in (np.int64(1), np.array(1), np.uint8(1)):
+        assert len(observe({"rgb": noise(), "segm": empty(), "ee": effector})) == 0
+
+
+def test_observations_and_prompt_images_of_another_size_are_refused() -> None:
+    rgb, segm = noise(shape=(64, 128)), empty((64, 128))
+    with pytest.raises(ShapeError, match=r"\(3, 64, 128\); it must be \(3, 128, 256\)"):
+        observe({"rgb": rgb, "segm": segm, "ee": 0})
+    with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
+        observe_prompt_image(PromptImage("scene", "scene", rgb, segm, ()))

@@ -1,0 +1,263 @@
+"""Objects from detectors: a perfect one sees what the segmentation says, bad ones are told what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openvima.env import TabletopEnv
+from openvima.errors import DetectionError, PolicyError, ShapeError
+from openvima.policies.detection import DetectedObjects, Detections
+from openvima.policies.perception import (
+    FRONT,
+    GROUND_TRUTH,
+    TOP,
+    ObjectViews,
+    crop_box,
+    observe,
+    observe_prompt_image,
+)
+from openvima.scene import ObjectRecord, PromptImage
+from openvima.tasks import list_tasks
+
+SHAPE = (128, 256)
+VIEWS = ("front", "top")
+
+
+class Fixed:
+    """Gives the same detections for every image of a view, and remembers what it was shown."""
+
+    def __init__(self, front: Detections, top: Detections) -> None:
+        self.found = {"front": front, "top": top}
+        self.shown: list[tuple[np.ndarray, str]] = []
+
+    def detect(self, rgb: np.ndarray, view: str) -> Detections:
+        self.shown.append((rgb, view))
+        return self.found[view]
+
+
+def perfect(segm: dict[str, np.ndarray], first: int, *, masks: bool = True) -> Fixed:
+    """A detector that knows the segmentation of the one moment that it is asked about."""
+
+    def seen(view: str) -> Detections:
+        ids = np.arange(first, 255)
+        found = Detections.from_masks(ids[np.isin(ids, segm[view])][:, None, None] == segm[view])
+        return found if masks else replace(found, masks=None)
+
+    return Fixed(seen("front"), seen("top"))
+
+
+def noise(seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {view: rng.integers(0, 256, (3, *SHAPE), dtype=np.uint8) for view in VIEWS}
+
+
+def observation(rgb: dict[str, np.ndarray] | None = None) -> dict:
+    return {"rgb": rgb or noise(), "ee": 0}
+
+
+def boxes(*rows: tuple[int, int, int, int]) -> np.ndarray:
+    return np.array(rows, np.int64).reshape(-1, 4)
+
+
+def plain(*rows: tuple[int, int, int, int]) -> Detections:
+    return Detections(boxes(*rows))
+
+
+def prompt_image(kind: str, rgb: dict[str, np.ndarray] | None = None) -> PromptImage:
+    segm = {view: np.full(SHAPE, 255, np.uint8) for view in VIEWS}
+    return PromptImage("thing", kind, rgb or noise(), segm, (ObjectRecord(2, "bowl", "red"),))
+
+
+def assert_same(found: ObjectViews, expected: ObjectViews, *, grasps: bool = True) -> None:
+    np.testing.assert_array_equal(found.masks, expected.masks)
+    np.testing.assert_array_equal(found.boxes, expected.boxes)
+    np.testing.assert_array_equal(found.crops, expected.crops)
+    if grasps:
+        np.testing.assert_array_equal(found.grasps, expected.grasps)
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_a_perfect_detector_finds_what_the_segmentation_says(task: str) -> None:
+    env = TabletopEnv(task)
+    for seed in range(3):
+        seen, _ = env.reset(seed=seed)
+        expected = observe(seen)
+        for masks in (True, False):
+            detector = perfect(seen["segm"], 5 - seen["ee"], masks=masks)
+            found = DetectedObjects(detector).in_observation(seen)
+            assert_same(found, expected, grasps=masks)
+            assert (found.ids == -1).all()
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_prompt_images_are_seen_alike_but_for_the_order_of_their_records(task: str) -> None:
+    env = TabletopEnv(task)
+    env.reset(seed=0)
+    for image in env.prompt.images.values():
+        first = min(record.object_id for record in image.objects)
+        found = DetectedObjects(perfect(image.segm, first)).in_prompt_image(image)
+        assert_same(found, observe_prompt_image(image).left_to_right())
+
+
+def test_a_segmentation_is_never_looked_at(starts) -> None:
+    _, seen = starts[0]
+    finder = DetectedObjects(perfect(seen["segm"], 5))
+    expected = finder.in_observation(seen)
+    for segm in ({}, None, dict.fromkeys(VIEWS, "garbage")):
+        assert_same(finder.in_observation({**seen, "segm": segm}), expected)
+    assert_same(finder.in_observation({key: seen[key] for key in ("rgb", "ee")}), expected)
+
+
+def test_the_detector_is_shown_both_views_as_they_are() -> None:
+    detector, rgb = Fixed(plain(), plain()), noise()
+    assert len(DetectedObjects(detector).in_observation(observation(rgb))) == 0
+    assert [view for _, view in detector.shown] == ["front", "top"]
+    for shown, view in detector.shown:
+        np.testing.assert_array_equal(shown, rgb[view])
+
+
+def test_crops_and_boxes_follow_from_the_detected_boxes_alone() -> None:
+    rgb = noise()
+    found = DetectedObjects(Fixed(plain(), plain((10, 20, 40, 70)))).in_observation(observation(rgb))
+    crop, box = crop_box(rgb["top"], (10, 40, 20, 70))
+    np.testing.assert_array_equal(found.crops[TOP, 0], crop)
+    np.testing.assert_array_equal(found.boxes[TOP, 0], box)
+    np.testing.assert_array_equal(found.grasps[TOP, 0], [25, 45])
+    assert found.masks.tolist() == [[False], [True]]
+    assert not found.crops[FRONT].any()
+    assert not found.boxes[FRONT].any()
+
+
+def test_the_grasp_point_is_the_most_interior_pixel_of_the_mask_or_else_the_centre_of_the_box() -> None:
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[0, 20:31, 10:21] = True
+    mask[0, 25, 10:100] = True
+    top = Detections(boxes((10, 20, 99, 30), (200, 20, 210, 30)), masks=mask)
+    found = DetectedObjects(Fixed(plain(), top)).in_observation(observation())
+    assert found.grasps[TOP].tolist() == [[15, 25], [205, 25]]
+
+
+@pytest.mark.parametrize("size", [20, 40])
+def test_boxes_on_the_same_place_of_the_table_are_one_object(size: int) -> None:
+    """The upper edge says nothing: in front it depends on the object's height."""
+    front, top = plain((100, 90 - size, 120, 90)), plain((100, 86, 120, 106))
+    found = DetectedObjects(Fixed(front, top)).in_observation(observation())
+    assert found.masks.tolist() == [[True], [True]]
+
+
+def test_boxes_far_apart_are_two_objects_each_hidden_in_one_view() -> None:
+    front, top = plain((200, 70, 220, 90)), plain((100, 86, 120, 106))
+    found = DetectedObjects(Fixed(front, top)).in_observation(observation())
+    assert found.masks.tolist() == [[False, True], [True, False]]
+
+
+def test_of_objects_in_one_place_those_of_one_colour_belong_together() -> None:
+    rgb = {view: np.zeros((3, *SHAPE), np.uint8) for view in VIEWS}
+    rgb["front"][0, 60:75, 100:121] = 255  # the red one stands behind
+    rgb["front"][1, 76:91, 100:121] = 255
+    rgb["top"][1, 86:100, 100:121] = 255
+    rgb["top"][0, 101:107, 100:121] = 255  # but seems in front from above
+    front = plain((100, 60, 120, 74), (100, 76, 120, 90))
+    top = plain((100, 86, 120, 99), (100, 101, 120, 106))
+    found = DetectedObjects(Fixed(front, top)).in_observation(observation(rgb))
+    assert found.masks.all()
+    colours = found.crops.max(axis=(3, 4)) > 0
+    np.testing.assert_array_equal(colours[FRONT], colours[TOP])
+
+
+def test_detections_of_low_score_are_left_out() -> None:
+    rows = boxes((10, 10, 20, 20), (50, 10, 60, 20), (90, 10, 99, 20))
+    detector = Fixed(plain(), Detections(rows, scores=np.array([0.9, 0.3, 0.5])))
+    columns = [
+        DetectedObjects(detector, min_score=score).in_observation(observation()).boxes[TOP, :, 0].tolist()
+        for score in (0.5, 0.2, 1.0)
+    ]
+    assert columns == [[15, 94], [15, 55, 94], []]
+
+
+def test_an_image_of_one_object_shows_the_likeliest_one_however_unsure() -> None:
+    rows = boxes((10, 10, 20, 20), (150, 10, 160, 20))
+    front, top = (Detections(rows, scores=np.array(scores)) for scores in ([0.1, 0.2], [0.9, 0.8]))
+    finder = DetectedObjects(Fixed(front, top))
+    found = finder.in_prompt_image(prompt_image("object"))
+    assert found.boxes[:, :, 0].tolist() == [[155], [15]]
+    assert len(finder.in_prompt_image(prompt_image("scene"))) == 2
+
+
+def test_an_image_in_which_nothing_is_found_shows_nothing() -> None:
+    finder = DetectedObjects(Fixed(plain(), plain()))
+    for kind in ("object", "scene"):
+        assert len(finder.in_prompt_image(prompt_image(kind))) == 0
+
+
+def test_prompt_images_can_be_left_to_another_finder(starts) -> None:
+    env, _ = starts[0]
+    finder = DetectedObjects(Fixed(plain(), plain()), prompt_finder=GROUND_TRUTH)
+    for image in env.prompt.images.values():
+        assert_same(finder.in_prompt_image(image), observe_prompt_image(image))
+
+
+def test_boxes_in_real_numbers_take_in_every_pixel_they_touch() -> None:
+    edges = np.array([[10.0, 20.0, 11.0, 22.0], [10.4, 19.9, 30.1, 40.0], [-5.0, -1.0, 300.0, 200.0]])
+    found = Detections.from_edges(edges)
+    assert found.boxes.tolist() == [[10, 20, 10, 21], [10, 19, 30, 39], [0, 0, 255, 127]]
+    assert found.boxes.dtype == np.int64
+
+
+def test_boxes_are_drawn_around_masks_and_specks_left_out() -> None:
+    masks = np.zeros((3, *SHAPE), bool)
+    masks[0, 5:8, 10:30] = True
+    masks[1, 5, 10] = True
+    masks[2, 127, 254:] = True
+    found = Detections.from_masks(masks, np.array([0.1, 0.2, 0.3]))
+    assert found.boxes.tolist() == [[10, 5, 29, 7], [254, 127, 255, 127]]
+    assert found.scores.tolist() == [0.1, 0.3]
+    assert len(Detections.from_masks(masks[:0])) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Detections(np.zeros((2, 4))), ShapeError, "float64.*from_edges"),
+        (lambda: Detections(np.zeros((2, 5), int)), ShapeError, r"\(2, 5\).*\(N, 4\)"),
+        (lambda: Detections([[1, 2, 3, 4]]), ShapeError, "boxes are a list.*numpy array"),
+        (lambda: Detections(boxes((5, 5, 4, 9))), DetectionError, r"box 0 is \[5, 5, 4, 9\]"),
+        (lambda: Detections(boxes(), masks=np.zeros((1, 8, 8), bool)), ShapeError, r"bool \(0, H, W\)"),
+        (lambda: Detections(boxes(), masks=np.zeros((0, 8, 8))), ShapeError, "masks are float64"),
+        (lambda: Detections(boxes(), scores=np.zeros(3)), ShapeError, r"scores are float64 \(3,\)"),
+        (lambda: Detections(boxes((1, 1, 2, 2)), scores=np.array([np.nan])), DetectionError, "finite"),
+        (lambda: Detections.from_edges(np.zeros(4)), ShapeError, "left, upper, right, lower"),
+        (lambda: Detections.from_edges(np.array([[256.0, 0, 300, 9]])), DetectionError, "outside"),
+        (lambda: Detections.from_edges(np.array([[np.nan, 0, 9, 9]])), DetectionError, "outside"),
+    ],
+)
+def test_impossible_detections_are_refused_at_once(make, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("found", "error", "message"),
+    [
+        (plain((0, 0, 256, 9)), DetectionError, r"box 0 of view 'front'.*0 … 255.*0 … 127"),
+        (plain((0, 0, 9, 9), (0, -1, 9, 9)), DetectionError, "box 1 of view 'front'"),
+        (Detections(boxes((0, 0, 9, 9)), np.ones((1, 64, 64), bool)), ShapeError, r"not \(N, 128, 256\)"),
+        (boxes((0, 0, 9, 9)), PolicyError, "gave a ndarray for view 'front'"),
+    ],
+)
+def test_detections_that_do_not_fit_the_image_are_refused(found, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        DetectedObjects(Fixed(found, plain())).in_observation(observation())
+
+
+def test_images_that_no_detector_was_made_for_are_refused() -> None:
+    finder = DetectedObjects(Fixed(plain(), plain()))
+    with pytest.raises(PolicyError, match="no 'rgb'"):
+        finder.in_observation({"ee": 0})
+    with pytest.raises(PolicyError, match="rgb lacks the view top"):
+        finder.in_observation({"rgb": {"front": noise()["front"]}, "ee": 0})
+    with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
+        finder.in_observation(observation({view: image[:, :64] for view, image in noise().items()}))
+    with pytest.raises(PolicyError, match="prompt image 'thing' lacks the view front"):
+        finder.in_prompt_image(prompt_image("object", {"top": noise()["top"]}))
