@@ -25,6 +25,14 @@ def test_batches_do_not_depend_on_the_number_of_workers():
     assert one.record() == three.record()
 
 
+def test_another_device_is_recorded_and_makes_other_batches():
+    usual, other = (EvaluationConfig(("untrained",), device=device) for device in ("cpu", "cuda"))
+    assert "device" not in usual.record()
+    assert other.record() == {**usual.record(), "device": "cuda"}
+    assert {batch.device for batch in plan(other)} == {"cuda"}
+    assert plan(usual)[0].key("same") != plan(other)[0].key("same")
+
+
 def test_all_takes_from_each_level_the_tasks_that_it_holds():
     pairs = cells(EvaluationConfig(("oracle",), levels=("L1", "L3")))
     assert ("sweep_without_exceeding", "L1") in pairs

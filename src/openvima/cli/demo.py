@@ -16,6 +16,7 @@ def main(
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
+    device: str = "cpu",
 ) -> int:
     """Film one episode: the prompt above, the table and the arm below.
 
@@ -31,6 +32,7 @@ def main(
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
+        device: Where a network computes: cpu, in float64, or cuda, in float32.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -47,7 +49,7 @@ def main(
     from openvima.evaluation.protocol import Batch
 
     setup = Setup(assets, compat, difficulty)
-    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, setup=setup)
+    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, setup=setup, device=device)
     env = setup.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = film_episode(env, load_player(batch), seed, out, title=title)

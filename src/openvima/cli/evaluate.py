@@ -29,6 +29,7 @@ def main(
     videos: int = 1,
     report: bool = True,
     force: bool = False,
+    device: str = "cpu",
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Score policies on tasks and levels, and write results.json and report.html.
@@ -54,6 +55,7 @@ def main(
         videos: Solved episodes to film, and unsolved ones, of each trained policy and task.
         report: Whether to film episodes and write report.html.
         force: Overwrite the results of another evaluation in that folder.
+        device: Where networks compute: cpu, in float64, or cuda, in float32.
         as_json: Print the rows as JSON instead of a table.
 
     Returns:
@@ -75,6 +77,7 @@ def main(
         videos=videos,
         report=report,
         force=force,
+        device=device,
     )
     with progress_bar("evaluation") as bar:
         path = evaluate(config, bar)

@@ -78,7 +78,7 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
     """
     if batch.source == ORACLE:
         return OraclePlayer()
-    return PolicyPlayer(_load_policy(batch.source, fingerprint))
+    return PolicyPlayer(_load_policy(batch.source, fingerprint, batch.device))
 
 
 @contextmanager
@@ -101,10 +101,10 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _load_policy(source: str, fingerprint: str) -> Any:  # Any: see `PolicyPlayer`
+def _load_policy(source: str, fingerprint: str, device: str) -> Any:  # Any: see `PolicyPlayer`
     from openvima.policies import load_policy
 
-    return load_policy(source)
+    return load_policy(source, device=device)
 
 
 def _oracle(env: TabletopEnv) -> Action | OracleError:

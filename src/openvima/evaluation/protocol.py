@@ -22,6 +22,7 @@ from openvima.tasks.seeding import MAX_SEED
 
 ORACLE = "oracle"
 NAMED_POLICIES = (ORACLE, "random", "untrained")
+DEFAULT_DEVICE = "cpu"
 DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
@@ -45,6 +46,8 @@ class EvaluationConfig:
         videos: Filmed episodes of each policy and task, for the report.
         report: Whether to film and to write `report.html`; needs the extra `report`.
         force: Overwrite results of another evaluation in `out`.
+        device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
+            float64, does the division into batches not change what they decide.
     """
 
     policies: tuple[str, ...]
@@ -59,6 +62,7 @@ class EvaluationConfig:
     videos: int = 1
     report: bool = True
     force: bool = False
+    device: str = DEFAULT_DEVICE
 
     def __post_init__(self) -> None:
         problems = [
@@ -93,6 +97,7 @@ class EvaluationConfig:
             "domain": "eval",
             "batch": self.batch,
             **self.setup.record(),
+            **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
         }
 
 
@@ -183,6 +188,7 @@ class Batch:
         first_seed: Seed of the first one.
         episodes: How many.
         setup: As in `EvaluationConfig`.
+        device: As in `EvaluationConfig`.
     """
 
     policy: str
@@ -192,6 +198,7 @@ class Batch:
     first_seed: int
     episodes: int
     setup: Setup = DEFAULT_SETUP
+    device: str = DEFAULT_DEVICE
 
     @property
     def seeds(self) -> range:
@@ -249,6 +256,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             first_seed=config.seed + offset,
             episodes=min(config.batch, config.episodes - offset),
             setup=config.setup,
+            device=config.device,
         )
         for policy in policy_sources(config.policies)
         for task, level in cells(config)
