@@ -18,6 +18,7 @@ from openvima.errors import PolicyError, PromptError, ShapeError
 from openvima.policies.kernels import CROP_SIZE
 from openvima.policies.layers.frame_encoder import FrameEncoderConfig
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.layers.trunk import MAX_PLACES
 from openvima.policies.perception import (
     GROUND_TRUTH,
     ObjectFinder,
@@ -273,7 +274,7 @@ class EpisodeReader:
 
         Raises:
             PolicyError: A part or a view is missing, there is no such end effector, or no object is in view.
-                With a token for each view the last is allowed after the first step.
+                With a token for each view the last is allowed after the first step. Or there are too many.
             ShapeError: An image has another shape or dtype.
         """
         layout, end_effector = self._reader.layout, end_effector_of(observation)
@@ -287,10 +288,19 @@ class EpisodeReader:
                 "the observation shows no object; there is nothing to act on. Look at its segmentation, "
                 "or at what the detector finds and at min_score."
             )
+        self._check_count(len(objects))
         if layout == "views":
             self._num_slots = max(self._num_slots, len(objects))
             objects = objects.compacted().padded(self._num_slots)
         return StepInput(objects, objects.positions(), objects.grasp_points(), end_effector)
+
+    def _check_count(self, count: int) -> None:
+        """Refuse what no history has room for; a long history may have less."""
+        limit = MAX_PLACES // (len(VIEWS) if self._reader.layout == "views" else 1) - 1
+        if count > limit:
+            raise PolicyError(
+                f"the observation shows {count} objects; this policy takes {limit}. Make the finder choosier."
+            )
 
 
 def _widest(images: Sequence[ObjectViews]) -> list[int]:

@@ -165,6 +165,7 @@ class PolicyNetwork(nn.Module):
         features = features_KF[history.crops_BTVN]
         slots_BTQD, mask_BTQ, read_BT = self.observe(history, features)
         dtype = slots_BTQD.dtype
+        metric = torch.promote_types(dtype, torch.float32)  # half precision is too coarse for metres
         unit_BTC = self.head.as_history(to_unit_range(previous_BTC.to(torch.float64))).to(dtype)
         outputs_BTQD, state = self._read_on(
             state, self.actions(unit_BTC), has_previous_BT, slots_BTQD, mask_BTQ, read_BT, history.steps_BT
@@ -175,8 +176,8 @@ class PolicyNetwork(nn.Module):
             objects_BTND=outputs_BTQD[:, :, :-1] if self.query is not None else outputs_BTQD,
             masks_BTN=history.masks_BTVN.any(dim=2),
             appearance_BTNA=self._appearance(features, history.masks_BTVN),
-            positions_BTN2=history.positions_BTN2.to(dtype),
-            grasps_BTN2=history.grasps_BTN2.to(dtype),
+            positions_BTN2=history.positions_BTN2.to(metric),
+            grasps_BTN2=history.grasps_BTN2.to(metric),
             lifts_BT=history.end_effector_BT == SUCTION,
             prompt_BMD=memory.roles_BLD,
             prompt_masks_BM=memory.object_mask_BL,

@@ -110,6 +110,7 @@ class PointingHead(ActionHead):
         pick = choose(self.pick(inputs))
         place = choose(self.place_scores(inputs, pick))
         offset, yaw_scores = self.relate(inputs, pick, place)
+        offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
         zero, one = torch.zeros_like(turn), torch.ones_like(turn)
         pose0 = [at(inputs.grasps_BTN2, pick), torch.stack([zero, zero, zero, one], dim=-1)]
@@ -130,6 +131,7 @@ class PointingHead(ActionHead):
         goal = at(inputs.positions_BTN2, place_BT)
         tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), at(inputs.objects_BTND, place_BT)]
         metric = torch.cat([grasp - start, start - 0.5, goal - 0.5], dim=-1) / _OFFSET_UNIT_M
+        metric = metric.to(inputs.query_BTD.dtype)
         hidden_BTH = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
         return self.offset(hidden_BTH) * _OFFSET_UNIT_M, self.yaw(hidden_BTH)
 

@@ -18,6 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError, PolicyError
+from openvima.policies.layers.linear import Linear
 
 MAX_PLACES = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_PLACES = 256
@@ -101,6 +102,8 @@ class TrunkState:
 class Trunk(nn.Module):
     """Positions and self blocks, which both trunks have."""
 
+    sequence = "the history"  # what has places in the position table
+
     def __init__(self, width: int, num_layers: int, num_heads: int, dropout: float) -> None:
         super().__init__()
         self.width, self.num_heads = width, num_heads
@@ -140,7 +143,7 @@ class Trunk(nn.Module):
         """
         num_read_B = state.num_read_B + mask_BL.sum(dim=1)
         if state.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_PLACES:  # only then worth a look at the data
-            _check_length(int(num_read_B.max()), MAX_PLACES, "the history")
+            _check_length(int(num_read_B.max()), MAX_PLACES, self.sequence)
         positions_BL = (state.num_read_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
         x_BLD = self.dropout(tokens_BLD + self.positions(positions_BL))
         seen_B1LS = score_bias(_seen(state.mask_BS, mask_BL)[:, None], x_BLD.dtype)
@@ -204,6 +207,8 @@ class Decoder(Trunk):
 class PrefixTrunk(Trunk):
     """One causal sequence: prompt, a learned separator, history. The prompt does not see its own future."""
 
+    sequence = "the sequence of prompt and history"
+
     def __init__(self, config: PrefixConfig) -> None:
         super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
         self.separator = nn.Parameter(torch.zeros(config.width))
@@ -229,13 +234,13 @@ class CrossBlock(nn.Module):
         width = config.width
         self.num_heads = config.num_cross_heads
         self.norm_attention = nn.LayerNorm(width)
-        self.query = nn.Linear(width, width, bias=False)
-        self.key_value = nn.Linear(width, 2 * width, bias=False)
-        self.attention_out = nn.Linear(width, width, bias=False)
+        self.query = Linear(width, width, bias=False)
+        self.key_value = Linear(width, 2 * width, bias=False)
+        self.attention_out = Linear(width, width, bias=False)
         self.norm_feed_forward = nn.LayerNorm(width)
-        self.widen = nn.Linear(width, 4 * width, bias=False)
-        self.gate = nn.Linear(width, 4 * width, bias=False)
-        self.narrow = nn.Linear(4 * width, width, bias=False)
+        self.widen = Linear(width, 4 * width, bias=False)
+        self.gate = Linear(width, 4 * width, bias=False)
+        self.narrow = Linear(4 * width, width, bias=False)
 
     def keys_values(self, prompt_BPD: torch.Tensor) -> KeysValues:
         """Keys and values of the prompt; they stay the same through an episode."""
@@ -259,12 +264,12 @@ class SelfBlock(nn.Module):
         super().__init__()
         self.num_heads = num_heads
         self.attention_dropout = dropout
-        self.query_key_value = nn.Linear(width, 3 * width)
-        self.attention_out = nn.Linear(width, width)
+        self.query_key_value = Linear(width, 3 * width)
+        self.attention_out = Linear(width, width)
         self.norm_attention = nn.LayerNorm(width)
-        self.widen = nn.Linear(width, 4 * width)
-        self.gate = nn.Linear(width, 4 * width, bias=False)
-        self.narrow = nn.Linear(4 * width, width)
+        self.widen = Linear(width, 4 * width)
+        self.gate = Linear(width, 4 * width, bias=False)
+        self.narrow = Linear(4 * width, width)
         self.norm_feed_forward = nn.LayerNorm(width)
         self.dropout = nn.Dropout(dropout)
 
