@@ -94,6 +94,12 @@ def test_options_reach_the_policy(policy, tmp_path) -> None:
     assert isinstance(load_policy("random", dtype=torch.float32), RandomPolicy)
 
 
+@pytest.mark.parametrize("device", ["cdua", "cuda:99"])
+def test_a_device_that_is_not_there_is_refused(device: str) -> None:
+    with pytest.raises(PolicyError, match=f"device '{device}' cannot be used here; allowed: cpu, and cuda"):
+        load_policy("untrained", device=device)
+
+
 def test_a_published_file_is_a_policy_once_it_has_a_tokenizer(published, tokenizer, demonstrations) -> None:
     policy = load_policy(str(published), tokenizer=tokenizer)
     assert policy.network.config == replace(small_vima(), prompt=policy.network.config.prompt)
