@@ -22,10 +22,10 @@ from openvima.policies.perception import (
 from openvima.render.camera import CAMERAS, VIEWS, View, unproject
 from openvima.scene import PromptImage
 
-# How the boxes of one object differ between the views, measured on 2,260 observations of all tasks and levels
-# with the boxes of the segmentation: half of the pairs by less than 3 mm, the worst by 99 mm. With these
-# numbers 0.8 % of the observations get a wrong pair if masks are given, 3.1 % from boxes alone; nearly all
-# are stacks, of which the view from above shows but the rim of what lies below.
+# How boxes of one object differ between the views was measured on 9,000 observations of all tasks and levels,
+# with the boxes of the segmentation: half of the pairs by less than 3 mm, the worst by 99 mm. With these numbers
+# 1.0 % of 1,523 other observations get a wrong pair if masks are given, 2.8 % from boxes alone (5.9 % without
+# colours): stacks above all, where the view from above shows but the rim of what lies below.
 MAX_DISTANCE_M = 0.1
 DEPTH_WEIGHT = 0.5  # the front camera looks down at 45 degrees and takes height for distance
 COLOUR_WEIGHT_M = 0.5  # metres that black against full red is worth
