@@ -327,7 +327,10 @@ def _seen(past_BS: torch.Tensor, new_BL: torch.Tensor) -> torch.Tensor:
 
 def _check_length(length: int, limit: int, what: str) -> None:
     if length > limit:
-        raise PolicyError(f"{what} has {length} tokens; this policy takes {limit}. Shorten it.")
+        raise PolicyError(
+            f"{what} has {length} tokens; this policy takes {limit}. Give a shorter prompt, fewer objects in "
+            "view or fewer steps."
+        )
 
 
 def _check_sizes(what: str, width: int, heads: int, dropout: float) -> None:
