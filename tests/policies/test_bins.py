@@ -125,3 +125,43 @@ def test_steps_that_do_not_exist_have_no_loss():
     changed, changed_metrics = network.loss(inputs(query), replace(targets, actions_BTC=actions))
     assert changed == loss
     assert changed_metrics == metrics
+
+
+def test_a_position_counts_as_much_as_a_rotation_of_twice_its_length():
+    network = head()
+    query = torch.randn(1, 2, 6, generator=torch.Generator().manual_seed(3))
+    actions = torch.tensor([0.6, 0.1, 0.0, 0.0, 0.6, 0.8, 0.4, -0.2, 0.0, 0.0, -0.6, 0.8]).expand(1, 2, 12)
+    exists, slots = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.int64)
+    loss, _ = network.loss(inputs(query), ActionTargets(actions, slots, slots, exists))
+    bins = encode_bins(to_unit_range(actions))
+    surprises = []
+    for component, scores in enumerate(network.logits(query)):
+        chances = scores.detach().log_softmax(-1)
+        surprises.append(-sum(chances[0, t, bins[0, t, component]].item() for t in range(2)) / 2)
+    expected = sum(sum(surprises[part]) / len(surprises[part]) for part in ACTION_PARTS.values())
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_accuracies_count_whole_actions_parts_and_components():
+    network = head()
+    for parameter in network.parameters():
+        torch.nn.init.zeros_(parameter)
+    actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).repeat(1, 4, 1)
+    bins = encode_bins(to_unit_range(actions))
+    with torch.no_grad():  # it always decides for the first step's bins
+        for component, classifier in enumerate(network.classifiers):
+            classifier[-1].bias[bins[0, 0, component]] = 1.0
+    actions[0, 1, 0] = 0.7  # one component of the first position
+    actions[0, 2, 8:] = torch.tensor([0.0, 0.0, 1.0, 0.0])  # two of the last rotation
+    actions[0, 3] = 0.3  # does not exist
+    exists, slots = torch.tensor([[True, True, True, False]]), torch.zeros(1, 4, dtype=torch.int64)
+    _, metrics = network.loss(inputs(torch.zeros(1, 4, 6)), ActionTargets(actions, slots, slots, exists))
+    expected = {
+        "accuracy": 1 / 3,
+        "component_accuracy": 33 / 36,
+        "pose0_position_accuracy": 2 / 3,
+        "pose0_rotation_accuracy": 1,
+        "pose1_position_accuracy": 1,
+        "pose1_rotation_accuracy": 2 / 3,
+    }
+    assert {name: value.item() for name, value in metrics.items()} == pytest.approx(expected)

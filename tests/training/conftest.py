@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from openvima.data import GenerateConfig, generate
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
 from openvima.policies import presets
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
@@ -16,6 +18,16 @@ def data(tmp_path_factory) -> Path:
     """Eight demonstrations of each of three tasks."""
     folder = tmp_path_factory.mktemp("data")
     return generate(GenerateConfig(out=folder / "demos", tasks=TASKS, episodes=8))
+
+
+@pytest.fixture(scope="session")
+def demonstrations_of_several_steps() -> list[Demonstration]:
+    """Six, of one to three steps, some with objects that get hidden on the way."""
+    several = TabletopEnv("manipulate_old_neighbor", level="train", domain="user")
+    single = TabletopEnv("visual_manipulation", level="train", domain="user")
+    return [rollout_oracle(several, seed) for seed in range(4)] + [
+        rollout_oracle(single, seed) for seed in range(2)
+    ]
 
 
 @pytest.fixture

@@ -1,10 +1,13 @@
 """Settings: those out of range are named, all at once, with what would be allowed."""
 
+import inspect
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
+from openvima.cli import train as verb
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig
 
@@ -26,21 +29,26 @@ BAD = {
     "validation_share": (-0.1, 1.0),
     "checkpoint_every": (0,),
     "threads": (0, -2, 100_000),
-    "preset": ("huge", ""),
 }
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name in BAD for value in BAD[name]])
 def test_a_value_out_of_range_is_named_with_what_is_allowed(name: str, value: object) -> None:
-    with pytest.raises(ConfigError, match=rf"^{name} is .+(it must be|allowed: nano)"):
+    with pytest.raises(ConfigError, match=rf"^{name} is .+it must be"):
         TrainingConfig(**FOLDERS, **{name: value})
+
+
+def test_an_unknown_preset_is_named_with_the_nearest_one() -> None:
+    with pytest.raises(ConfigError, match=r"^there is no preset 'vima-nona'\. Did you mean 'vima-nano'\?"):
+        TrainingConfig(**FOLDERS, preset="vima-nona")
 
 
 def test_all_problems_are_in_one_message() -> None:
     with pytest.raises(ConfigError) as caught:
         TrainingConfig(**FOLDERS, steps=0, batch=0, preset="huge", validation_share=2.0)
     message = str(caught.value)
-    assert all(f"{name} is" in message for name in ("steps", "batch", "preset", "validation_share"))
+    assert all(f"{name} is" in message for name in ("steps", "batch", "validation_share"))
+    assert "no preset 'huge'" in message
     assert "\n" not in message
 
 
@@ -53,3 +61,11 @@ def test_settings_cannot_be_changed_afterwards() -> None:
     config = TrainingConfig(**FOLDERS)
     with pytest.raises(AttributeError):
         config.steps = 3  # type: ignore[misc]
+
+
+def test_the_command_line_has_the_same_defaults() -> None:
+    offered = inspect.signature(verb.main).parameters
+    settings = {field.name: field.default for field in fields(TrainingConfig) if field.name not in FOLDERS}
+    assert {
+        name: offered[name].default for name in offered if name not in FOLDERS
+    }.items() <= settings.items()

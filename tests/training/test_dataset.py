@@ -64,7 +64,7 @@ def test_groups_hold_all_examples_of_like_length(examples):
 def test_targets_follow_their_objects_through_shuffling(examples):
     batch = make_batch(examples.training)
     generator = torch.Generator().manual_seed(0)
-    changed = augmented(batch, probability=0.5, generator=generator)
+    changed = augmented(batch, "objects", probability=0.5, generator=generator)
     for b, t in np.argwhere(batch.targets.steps_BT.numpy()):
         for targets in ("pick_BT", "place_BT"):
             old, new = getattr(batch.targets, targets)[b, t], getattr(changed.targets, targets)[b, t]
@@ -83,8 +83,97 @@ def test_a_false_detection_shows_in_one_view_only(examples):
     batch = make_batch(examples.training[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
     changed = augmented(
-        replace(batch, history=nothing), probability=1.0, generator=torch.Generator().manual_seed(0)
+        replace(batch, history=nothing),
+        "objects",
+        probability=1.0,
+        generator=torch.Generator().manual_seed(0),
     )
     views = changed.history.masks_BTVN.sum(dim=2)[changed.history.steps_BT]
     assert views.max() == 1
     assert (views.sum(dim=1) == 2).all()
+
+
+@pytest.fixture(scope="module")
+def views(demonstrations_of_several_steps):
+    """With a token for each view, as the published VIMA has it."""
+    reader = Reader("views")
+    return read_examples(demonstrations_of_several_steps, reader, validation_share=0.0, seed=0)
+
+
+def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
+    """Number and box of all that one view shows, in order."""
+    visible = history.masks_BTVN[b, t, v]
+    numbers, boxes = history.crops_BTVN[b, t, v, visible], history.boxes_BTVN4[b, t, v, visible]
+    return [(int(number), *box.tolist()) for number, box in zip(numbers, boxes, strict=True)]
+
+
+def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_their_order(views):
+    batch = make_batch(views.training)
+    changed = augmented(batch, "views", probability=0.5, generator=torch.Generator().manual_seed(0))
+    before, after = batch.history, changed.history
+    places = []
+    for b, t, v in np.ndindex(*before.masks_BTVN.shape[:3]):
+        old, new = shown(before, b, t, v), shown(after, b, t, v)
+        assert [slot for slot in new if slot in old] == old
+        added = [slot for slot in new if slot not in old]
+        false = (int(batch.spurious.crops[b, t, v]), *batch.spurious.boxes[b, t, v].tolist())
+        assert added in ([], [false])
+        assert not added or before.steps_BT[b, t]
+        places += [(new.index(slot), len(old)) for slot in added]
+    assert 0.3 < len(places) / (2 * int(before.steps_BT.sum())) < 0.7
+    assert {place == 0 for place, _ in places} == {True, False}
+    assert {place == count for place, count in places} == {True, False}
+    assert changed.targets is batch.targets
+
+
+def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
+    batch = make_batch(views.training)
+    after = augmented(batch, "views", probability=0.3, generator=torch.Generator().manual_seed(1)).history
+    visible_BTV = after.masks_BTVN.sum(dim=3)
+    for b, t in np.argwhere(batch.history.steps_BT.numpy()):
+        for v in range(2):  # visible ones first, then empty ones: black, without a box
+            count = int(visible_BTV[b, t, v])
+            assert after.masks_BTVN[b, t, v, :count].all()
+            assert not after.crops_BTVN[b, t, v, count:].any()
+            assert not after.boxes_BTVN4[b, t, v, count:].any()
+        false = visible_BTV[b, : t + 1] - batch.history.masks_BTVN.sum(dim=3)[b, : t + 1]
+        expected = (batch.history.counts_BT[b, : t + 1] + false.sum(dim=1)).max()
+        assert after.counts_BT[b, t] == expected
+    assert not after.counts_BT[~batch.history.steps_BT].any()
+    assert not views.images[0].any()
+
+
+def test_without_false_detections_views_stay_as_they_are(views):
+    batch = make_batch(views.training)
+    after = augmented(batch, "views", probability=0.0, generator=torch.Generator().manual_seed(0)).history
+    count = batch.history.masks_BTVN.shape[3]
+    assert torch.equal(after.counts_BT, batch.history.counts_BT)
+    assert torch.equal(after.crops_BTVN[..., :count], batch.history.crops_BTVN)
+    assert torch.equal(after.boxes_BTVN4[..., :count, :], batch.history.boxes_BTVN4)
+    assert not after.masks_BTVN[..., count:].any()
+
+
+def test_whole_frames_know_no_false_detections_and_stay_bytes(demonstrations_of_several_steps):
+    reader = Reader("frames", (64, 128), tokens_per_frame_pair=1)
+    examples = read_examples(demonstrations_of_several_steps, reader, validation_share=0.0, seed=0)
+    assert examples.images.dtype == torch.uint8
+    assert examples.images.shape[1:] == (3, 64, 128)
+    batch = make_batch(examples.training)
+    assert augmented(batch, "frames", probability=1.0, generator=torch.Generator()) is batch
+
+
+@pytest.mark.parametrize("layout", ["objects", "views"])
+def test_only_visible_objects_have_an_image_of_their_own(demonstrations_of_several_steps, layout):
+    examples = read_examples(demonstrations_of_several_steps, Reader(layout), validation_share=0.0, seed=0)
+    numbers = [0]
+    for example in examples.training:
+        for objects, crops in zip(
+            (example.prompt.objects, *(step.objects for step in example.steps)),
+            (example.prompt_crops, *example.step_crops),
+            strict=True,
+        ):
+            assert np.array_equal(crops > 0, objects.masks)
+            assert np.array_equal(examples.images[torch.from_numpy(crops)].numpy(), objects.crops)
+            numbers += crops[objects.masks].tolist()
+        numbers += example.spurious.crops.flatten().tolist()
+    assert sorted(numbers) == list(range(len(examples.images)))

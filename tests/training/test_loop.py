@@ -193,7 +193,7 @@ def test_an_empty_run_folder_has_nothing_to_go_on_from(tmp_path):
     [
         ({"steps": 0}, "steps is 0; it must be at least 1"),
         ({"spurious_probability": 1.5}, "between 0 and 1"),
-        ({"preset": "nanno"}, "preset is 'nanno'; allowed: nano"),
+        ({"preset": "gato-nanno"}, "no preset 'gato-nanno'. Did you mean 'gato-nano'"),
     ],
 )
 def test_settings_out_of_range_are_named(settings, change, message):

@@ -11,11 +11,11 @@ def main(
     data: Path,
     out: Path,
     preset: str = "nano",
-    steps: int | None = None,
-    batch: int | None = None,
-    learning_rate: float | None = None,
+    steps: int = 400,
+    batch: int = 64,
+    learning_rate: float = 1e-3,
     pretraining_steps: int | None = None,
-    checkpoint_every: int | None = None,
+    checkpoint_every: int = 100,
     seed: int = 0,
     threads: int = 1,
     t5: str | None = None,
@@ -24,20 +24,21 @@ def main(
 ) -> int:
     """Train a policy on demonstrations, or go on with a run that was interrupted.
 
-    First the crop encoder learns to match objects in prompt images with objects in scenes drawn for that.
-    Then the whole policy learns by behaviour cloning. The same command continues an interrupted run exactly
-    where its last checkpoint stands.
+    The whole policy learns by behaviour cloning. Before that, with nano and nano-bins, the crop encoder
+    learns to match objects in prompt images with objects in scenes drawn for that. The same command continues
+    an interrupted run exactly where its last checkpoint stands.
 
     Example: openvima train --data demos --preset nano --out run
 
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder for checkpoints, settings and metrics; `openvima evaluate --policy` takes it.
-        preset: Network sizes: nano (2.2 M parameters, points at objects) or nano-bins (the published bins).
-        steps: Steps of behaviour cloning; by default what the preset needs.
+        preset: Network and sizes, such as nano or gato-nano; `openvima policies` lists all.
+        steps: Steps of behaviour cloning.
         batch: Demonstrations a step.
         learning_rate: Highest learning rate of cloning.
-        pretraining_steps: Steps of matching prompt and scene; 0 leaves it out.
+        pretraining_steps: Steps of matching prompt and scene; 0 leaves it out. None is as the preset wants:
+            400 for nano and nano-bins, 0 for the others.
         checkpoint_every: Steps between checkpoints.
         seed: Decides weights, order of the data and augmentation.
         threads: Threads to compute with; equal numbers give equal weights.
@@ -48,23 +49,20 @@ def main(
     """
     from openvima.training import TrainingConfig, train
 
-    given = {
-        "steps": steps,
-        "batch": batch,
-        "learning_rate": learning_rate,
-        "pretraining_steps": pretraining_steps,
-        "checkpoint_every": checkpoint_every,
-    }
     config = TrainingConfig(
         data=data,
         out=out,
         preset=preset,
+        steps=steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        pretraining_steps=pretraining_steps,
+        checkpoint_every=checkpoint_every,
         seed=seed,
         threads=threads,
         t5=t5,
         assets=assets,
         force=force,
-        **{name: value for name, value in given.items() if value is not None},
     )
     with progress_bar("training") as report:
         run = train(config, report)

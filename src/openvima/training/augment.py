@@ -1,47 +1,53 @@
 """Augmentation of batches: false detections among the objects, and objects in any order.
 
-Shape suffixes: B batch, T steps, V views, N objects in view.
+Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 """
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 
 from openvima.policies.inputs import HistoryBatch
+from openvima.render.camera import VIEWS
 from openvima.training.dataset import Batch
 
-NUM_VIEWS = 2
+NUM_VIEWS = len(VIEWS)
+_LAST = 1e6  # sorts after every slot
 
 
-def augmented(batch: Batch, *, probability: float, generator: torch.Generator) -> Batch:
-    """Add false detections and shuffle the objects of every step.
+def augmented(
+    batch: Batch,
+    layout: Literal["objects", "views", "frames"],
+    *,
+    probability: float,
+    generator: torch.Generator,
+) -> Batch:
+    """Add false detections, and shuffle objects where their order means nothing.
 
     Args:
-        batch: Demonstrations with fused views.
+        batch: Demonstrations.
+        layout: What a token shows, as in `Reader`. Fused objects are shuffled, since that head points at
+            them. With a token for each view they keep their order, as in the published policies, and a false
+            detection comes anywhere among them. Whole frames stay as they are.
         probability: Chance that a view of a step shows an object that is none.
         generator: Draws both.
 
     Returns:
-        The batch with two more slots, one for each view; targets follow their objects.
+        The batch with two more slots for objects; targets follow their objects.
     """
-    history = _with_spurious(batch, probability, generator)
-    shape = history.positions_BTN2.shape[:3]
-    order_BTN = torch.rand(shape, generator=generator).argsort(dim=-1)
-    place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
-    targets = replace(
-        batch.targets,
-        pick_BT=_moved(batch.targets.pick_BT, place_BTN),
-        place_BT=_moved(batch.targets.place_BT, place_BTN),
-    )
-    return replace(batch, history=_reordered(history, order_BTN), targets=targets)
+    if layout == "frames":
+        return batch
+    shows_BTV = torch.rand(*batch.history.steps_BT.shape, NUM_VIEWS, generator=generator) < probability
+    shows_BTV &= batch.history.steps_BT[..., None]
+    if layout == "views":
+        return _with_spurious_in_views(batch, shows_BTV, generator)
+    return _shuffled(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), generator)
 
 
-def _with_spurious(batch: Batch, probability: float, generator: torch.Generator) -> HistoryBatch:
+def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:
     """Append a slot for each view; slot N + v shows the false detection of view v, or nothing."""
     history, spurious = batch.history, batch.spurious
-    shape = history.steps_BT.shape
-    shows_BTV = torch.rand(*shape, NUM_VIEWS, generator=generator) < probability
-    shows_BTV &= history.steps_BT[..., None]
     visible_BTVN = torch.diag_embed(shows_BTV)  # view v, slot v
     crops_BTVN = torch.diag_embed(torch.from_numpy(spurious.crops)) * visible_BTVN
     boxes_BTV4 = torch.from_numpy(spurious.boxes)
@@ -58,17 +64,54 @@ def _with_spurious(batch: Batch, probability: float, generator: torch.Generator)
     )
 
 
-def _reordered(history: HistoryBatch, order_BTN: torch.Tensor) -> HistoryBatch:
-    order_BTVN = order_BTN[:, :, None].expand_as(history.crops_BTVN)
+def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, generator: torch.Generator) -> Batch:
+    """Put false detections anywhere among the visible slots of their view.
+
+    The numbers of slots become what `EpisodeReader` would make of such detections: each is an object that one
+    view shows, so that the other view gets an empty slot; and slots once there stay for the episode.
+    """
+    history = _with_spurious_objects(batch, shows_BTV)
+    num_visible_BTV = batch.history.masks_BTVN.sum(dim=3)
+    place_BTV = (torch.rand(shows_BTV.shape, generator=generator) * (num_visible_BTV + 1)).floor() - 0.5
+    num_slots = history.masks_BTVN.shape[3]
+    rank_BTVN = torch.arange(num_slots).expand(history.masks_BTVN.shape).to(torch.float32)
+    rank_BTVN = torch.where(history.masks_BTVN, rank_BTVN, rank_BTVN + _LAST)
+    rank_BTVN[..., -NUM_VIEWS:] = torch.where(
+        torch.diag_embed(shows_BTV), place_BTV[..., None], rank_BTVN[..., -NUM_VIEWS:]
+    )
+    counts_BT = (batch.history.counts_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
+    counts_BT = torch.where(history.steps_BT, counts_BT, 0)
+    views = _in_order(history, rank_BTVN.argsort(dim=3))
+    return replace(batch, history=replace(views, counts_BT=counts_BT))
+
+
+def _shuffled(batch: Batch, generator: torch.Generator) -> Batch:
+    """Shuffle the objects of every step."""
+    history = batch.history
+    order_BTN = torch.rand(history.positions_BTN2.shape[:3], generator=generator).argsort(dim=-1)
+    place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
+    order_BTN2 = order_BTN[..., None].expand_as(history.positions_BTN2)
+    views = _in_order(history, order_BTN[:, :, None].expand_as(history.crops_BTVN))
+    moved = replace(
+        views,
+        positions_BTN2=history.positions_BTN2.gather(2, order_BTN2),
+        grasps_BTN2=history.grasps_BTN2.gather(2, order_BTN2),
+    )
+    targets = replace(
+        batch.targets,
+        pick_BT=_moved(batch.targets.pick_BT, place_BTN),
+        place_BT=_moved(batch.targets.place_BT, place_BTN),
+    )
+    return replace(batch, history=moved, targets=targets)
+
+
+def _in_order(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
+    """Reorder what views show of the objects."""
     return replace(
         history,
         crops_BTVN=history.crops_BTVN.gather(3, order_BTVN),
         boxes_BTVN4=history.boxes_BTVN4.gather(3, order_BTVN[..., None].expand_as(history.boxes_BTVN4)),
         masks_BTVN=history.masks_BTVN.gather(3, order_BTVN),
-        positions_BTN2=history.positions_BTN2.gather(
-            2, order_BTN[..., None].expand_as(history.positions_BTN2)
-        ),
-        grasps_BTN2=history.grasps_BTN2.gather(2, order_BTN[..., None].expand_as(history.grasps_BTN2)),
     )
 
 

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
+
+MATCHING_STEPS = 400  # of presets with an appearance embedding
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {
@@ -29,12 +31,12 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class TrainingConfig:
-    """One training run: first the crop encoder on rendered pairs, then behaviour cloning.
+    """One training run: first the crop encoder on rendered pairs, if the preset matches looks; then cloning.
 
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder: checkpoints, settings, metrics.
-        preset: Network sizes, such as "nano".
+        preset: Network and sizes, such as "nano" or "gato-nano"; `openvima policies` lists them.
         steps: Steps of behaviour cloning.
         batch: Demonstrations a step.
         learning_rate: Highest learning rate of cloning.
@@ -42,7 +44,9 @@ class TrainingConfig:
         weight_decay: Decay of weight matrices, as in AdamW.
         clip_norm: Largest norm of the gradient.
         spurious_probability: How often each view of each step shows an object that is none.
-        pretraining_steps: Steps in which the crop encoder learns to match prompt and scene; 0 leaves it out.
+        pretraining_steps: Steps in which the crop encoder learns to match prompt and scene; 0 leaves it out,
+            and the image encoder then learns while cloning. None is as the preset wants: 400 with an
+            appearance embedding (nano, nano-bins), 0 without one.
         pretraining_scenes: Scenes drawn for that.
         pretraining_batch: Pairs of one object a step.
         pretraining_learning_rate: Highest learning rate of that.
@@ -69,7 +73,7 @@ class TrainingConfig:
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
-    pretraining_steps: int = 400
+    pretraining_steps: int | None = None
     pretraining_scenes: int = 2500
     pretraining_batch: int = 128
     pretraining_learning_rate: float = 1e-3
@@ -86,8 +90,11 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         problems = []
         if self.preset not in PRESETS:
-            problems.append(f"preset is {self.preset!r}; allowed: {', '.join(PRESETS)}.")
+            hint = "`openvima policies` lists all."
+            problems.append(unknown_name("preset", self.preset, PRESETS, hint))
         for name, (low, high) in _BOUNDS.items():
+            if name == "pretraining_steps" and self.pretraining_steps is None:
+                continue
             value = getattr(self, name)
             if not (low <= value and (high is None or value <= high)):
                 allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"

@@ -23,7 +23,7 @@ from openvima.policies.inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.policies.perception import crop_box
+from openvima.policies.perception import ObjectViews, crop_box
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import Action
 from openvima.training.schedule import step_seed
@@ -32,6 +32,8 @@ from openvima.training.schedule import step_seed
 @dataclass(frozen=True, slots=True, eq=False)
 class Spurious:
     """False detections: for each step one rectangle of each view that shows no object in particular.
+
+    Policies that see whole frames have no detections, true or false; all is 0 for them.
 
     Args:
         crops: Numbers of the crops, shape (T, 2).
@@ -97,7 +99,8 @@ class Examples:
     Args:
         training: Those to learn from.
         validation: Those that choose the best checkpoint.
-        images: All crops or frames, shape (K, 3, height, width), uint8.
+        images: All crops or frames, shape (K, 3, height, width), uint8. Number 0 is black: that is what slots
+            show that hold no visible object.
     """
 
     training: tuple[Example, ...]
@@ -123,6 +126,7 @@ def read_examples(
         PromptError: A prompt has a word that the vocabulary lacks.
     """
     stack = ImageStack(reader.image_size)
+    stack.add(np.zeros((3, *reader.image_size), np.uint8))
     rng = np.random.default_rng(step_seed(seed, "spurious", 0))
     parts: tuple[list[Example], list[Example]] = ([], [])
     for demonstration in demonstrations:
@@ -184,16 +188,23 @@ def _read_example(
         task=demo.task,
         seed=demo.seed,
         prompt=prompt,
-        prompt_crops=stack.add(prompt.objects.crops),
+        prompt_crops=_add_visible(prompt.objects, stack),
         steps=steps,
-        step_crops=tuple(stack.add(step.objects.crops) for step in steps),
+        step_crops=tuple(_add_visible(step.objects, stack) for step in steps),
         actions=np.array([_action_vector(action) for action in demo.actions]),
         pick_slots=_slots(demo.pick_ids, steps),
         place_slots=_slots(demo.place_ids, steps),
-        spurious=_draw_spurious(observations, steps, stack, rng)
-        if reader.layout == "objects"
-        else _none(steps),
+        spurious=_no_spurious(steps)
+        if reader.layout == "frames"
+        else _draw_spurious(observations, steps, stack, rng),
     )
+
+
+def _add_visible(objects: ObjectViews, stack: ImageStack) -> np.ndarray:
+    """Add the images of visible objects, and return the numbers of all, shape (2, objects)."""
+    numbers = np.zeros(objects.masks.shape, np.int64)
+    numbers[objects.masks] = stack.add(objects.crops[objects.masks])
+    return numbers
 
 
 def _draw_spurious(
@@ -215,7 +226,7 @@ def _draw_spurious(
     return Spurious(crops, boxes, points)
 
 
-def _none(steps: Sequence[StepInput]) -> Spurious:
+def _no_spurious(steps: Sequence[StepInput]) -> Spurious:
     shape = (len(steps), len(VIEWS))
     return Spurious(np.zeros(shape, np.int64), np.zeros((*shape, 4), np.int64), np.zeros((*shape, 2)))
 

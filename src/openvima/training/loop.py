@@ -20,7 +20,7 @@ from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
-from openvima.training.config import TrainingConfig
+from openvima.training.config import MATCHING_STEPS, TrainingConfig
 from openvima.training.dataset import read_examples
 from openvima.training.pretrain import render_pairs
 from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, RunFolder
@@ -55,7 +55,7 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
         MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
     sizes = preset(config.preset)
-    _check_preset(config, sizes)
+    config = _resolved(config, sizes)
     load_assets(config.assets)  # what is wrong is found before there is a run folder
     dataset = Dataset(config.data)
     reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, config.t5))
@@ -68,7 +68,8 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
     return run.path
 
 
-def _check_preset(config: TrainingConfig, sizes: PolicyConfig) -> None:
+def _resolved(config: TrainingConfig, sizes: PolicyConfig) -> TrainingConfig:
+    """Fill in what the settings leave to the preset, and check that both fit together."""
     reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
     if reads_with_t5 and config.t5 is None:
         raise ConfigError(
@@ -80,8 +81,12 @@ def _check_preset(config: TrainingConfig, sizes: PolicyConfig) -> None:
     has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
     if config.pretraining_steps and not has_appearance:
         raise ConfigError(
-            f"preset {config.preset!r} has no appearance embedding; set pretraining_steps to 0."
+            f"pretraining_steps is {config.pretraining_steps}, but preset {config.preset!r} has no "
+            "appearance embedding to match prompt and scene with; leave it out, or set it to 0."
         )
+    if config.pretraining_steps is None:
+        return replace(config, pretraining_steps=MATCHING_STEPS if has_appearance else 0)
+    return config
 
 
 class _Trainer:

@@ -7,6 +7,7 @@ from typing import Protocol
 import torch
 
 from openvima.policies.heads.base import HeadInputs
+from openvima.policies.inputs import Reader
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
@@ -29,13 +30,11 @@ class Stage(Protocol):
 
     Attributes:
         name: In file names and metrics.
-        num_steps: Length.
         learning_rate: Highest learning rate.
         parameters: What is trained.
     """
 
     name: str
-    num_steps: int
     learning_rate: float
     parameters: list[torch.nn.Parameter]
 
@@ -54,7 +53,6 @@ class Matching:
     name = "1-matching"
 
     def __init__(self, model: PolicyNetwork, config: TrainingConfig, pairs: Pairs) -> None:
-        self.num_steps = config.pretraining_steps
         self.learning_rate = config.pretraining_learning_rate
         assert isinstance(model.images, ObjectEncoder)  # the loop has seen to it
         self.encoder = model.images
@@ -85,15 +83,16 @@ class Matching:
 class Cloning:
     """Behaviour cloning: the loss of the action head over whole demonstrations.
 
-    Unless crops are to be tuned, the crop encoder stays as it is and each crop is encoded once.
+    After a matching stage the crop encoder stays as it is and each crop is encoded once, unless crops are to
+    be tuned. Without such a stage the image encoder is trained here; each step encodes its images, each once.
     """
 
     name = "2-cloning"
 
     def __init__(self, model: PolicyNetwork, config: TrainingConfig, examples: Examples) -> None:
-        self.num_steps = config.steps
         self.learning_rate = config.learning_rate
         self.model = model
+        self._reader = Reader.of(model.config.images)
         self._config = config
         self._examples = examples
         self._features: torch.Tensor | None = None
@@ -113,9 +112,12 @@ class Cloning:
         total = sum(len(example.steps) for example in chosen)
         sums: Metrics = {}
         for group in groups_of_equal_length(chosen):
-            batch = make_batch(group)
-            if _shuffles_objects(self.model):
-                batch = augmented(batch, probability=config.spurious_probability, generator=generator)
+            batch = augmented(
+                make_batch(group),
+                self._reader.layout,
+                probability=config.spurious_probability,
+                generator=generator,
+            )
             share = sum(len(example.steps) for example in group) / total
             loss, metrics = self._loss(batch)
             (loss * share).backward()
@@ -125,18 +127,20 @@ class Cloning:
 
     @torch.no_grad()
     def validate(self) -> Metrics:
-        """Loss and metrics on the held-out demonstrations; the score is the accuracy of actions."""
+        """Loss and metrics on the held-out demonstrations; the score is the accuracy that the head names."""
         examples = self._examples.validation
         if not examples:
             return {}
         total = sum(len(example.steps) for example in examples)
         sums: Metrics = {}
         for group in groups_of_equal_length(examples):
-            share = sum(len(example.steps) for example in group) / total
-            loss, metrics = self._loss(make_batch(group))
-            for name, value in {"loss": loss, **metrics}.items():
-                sums[name] = sums.get(name, 0.0) + value.item() * share
-        score = sums["accuracy"]
+            for start in range(0, len(group), self._config.batch):
+                part = group[start : start + self._config.batch]
+                share = sum(len(example.steps) for example in part) / total
+                loss, metrics = self._loss(make_batch(part))
+                for name, value in {"loss": loss, **metrics}.items():
+                    sums[name] = sums.get(name, 0.0) + value.item() * share
+        score = sums[self.model.head.score]
         return {**sums, "score": score, "score_error": math.sqrt(score * (1 - score) / total)}
 
     def _loss(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -172,8 +176,3 @@ def _crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
         return list(images.frame_encoder.parameters())
     appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
     return [*images.crop_encoder.parameters(), *appearance]
-
-
-def _shuffles_objects(model: PolicyNetwork) -> bool:
-    """Whether slots have no order, so that they may be shuffled with false detections among them."""
-    return isinstance(model.images, ObjectEncoder) and model.images.config.fuse_views

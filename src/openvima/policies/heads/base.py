@@ -41,8 +41,8 @@ class HeadInputs:
         objects_BTND: Output of the decoder at the objects in view.
         masks_BTN: Which of these exist.
         appearance_BTNA: Appearance of the objects in view.
-        positions_BTN2: Table points under the objects' boxes, metres.
-        grasps_BTN2: Table points under the objects' most interior pixels, metres.
+        positions_BTN2: Table points under the objects' boxes, metres; in float32 at least.
+        grasps_BTN2: Table points under the objects' most interior pixels, metres; in float32 at least.
         lifts_BT: Whether the tool lifts what it picks, which then moves rigidly with it; else it pushes.
         prompt_BMD: Encoded prompt, one row for each place.
         prompt_masks_BM: Which of these places are objects.
@@ -84,7 +84,13 @@ def likeliest(scores: torch.Tensor) -> torch.Tensor:
 
 
 class ActionHead(nn.Module):
-    """Base of the heads: a loss for training, a decision for acting."""
+    """Base of the heads: a loss for training, a decision for acting.
+
+    Attributes:
+        score: The metric that chooses the best checkpoint, a share of 1.
+    """
+
+    score = "accuracy"
 
     def loss(
         self, inputs: HeadInputs, targets: ActionTargets
