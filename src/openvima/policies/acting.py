@@ -37,7 +37,7 @@ class _Episodes:
         generators: Generators of their draws.
         memory: Their prompts.
         state: What the trunk has read of them.
-        actions_BC: Their last actions, metres and quaternions; None before the first.
+        actions_BC: Their last actions, metres and quaternions, float32; None before the first.
         features: Features of the images that were encoded for the last step, by the bytes of the images.
     """
 
@@ -179,7 +179,7 @@ class NetworkPolicy(Policy):
         if seen:
             episodes = self._decide(episodes, list(seen.values()))
             assert episodes.actions_BC is not None
-            arrays_BC = episodes.actions_BC.to("cpu", torch.float32).numpy()
+            arrays_BC = episodes.actions_BC.cpu().numpy()
             for place, array_C in zip(seen, arrays_BC, strict=True):
                 actions[place] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
         self._episodes = episodes
@@ -221,8 +221,9 @@ class NetworkPolicy(Policy):
         inputs, state = self.network.extend(
             episodes.memory, episodes.state, history, features_KF, previous_BC[:, None], has_previous_B1
         )
-        choose = _drawing(episodes.generators, self._temperature) if self._temperature else likeliest
-        actions_BC = self.network.head.decide(inputs, choose)[:, 0]
+        choose = drawing(episodes.generators, self._temperature) if self._temperature else likeliest
+        # The history holds actions as they are sent.
+        actions_BC = self.network.head.decide(inputs, choose)[:, 0].to(torch.float32)
         return replace(episodes, readers=readers, state=state, actions_BC=actions_BC, features=features)
 
     def _encode(
@@ -256,13 +257,21 @@ def _usable_device(device: torch.device | str) -> torch.device:
     return found
 
 
-def _drawing(generators: Sequence[torch.Generator], temperature: float) -> Choose:
+def drawing(generators: Sequence[torch.Generator], temperature: float) -> Choose:
+    """Make the choice that draws classes instead of taking the likeliest.
+
+    Args:
+        generators: One for each row of the scores. A draw takes one number of it, however many classes there
+            are, so that padding changes nothing.
+        temperature: Scores are divided by it.
+    """
+
     def draw(scores: torch.Tensor) -> torch.Tensor:
         chances = torch.softmax(scores.to("cpu", torch.float64) / temperature, dim=-1)
-        drawn = [
-            torch.multinomial(row.flatten(0, -2), 1, generator=generator).view(row.shape[:-1])
-            for row, generator in zip(chances, generators, strict=True)
-        ]
-        return torch.stack(drawn).to(scores.device)
+        sums = chances.cumsum(dim=-1)
+        shape = (*scores.shape[1:-1], 1)
+        drawn = [torch.rand(shape, dtype=torch.float64, generator=generator) for generator in generators]
+        chosen = torch.searchsorted(sums, torch.stack(drawn) * sums[..., -1:], right=True)
+        return chosen.squeeze(-1).clamp(max=scores.shape[-1] - 1).to(scores.device)
 
     return draw
