@@ -235,14 +235,13 @@ class NetworkPolicy(Policy):
             Features of all images, and by their bytes.
         """
         keys = [image.tobytes() for image in images]
-        new = {key: place for place, key in enumerate(keys) if key not in known}
-        chosen = torch.from_numpy(images[list(new.values())]).to(self.device)
-        features = self.network.encode_images(chosen)
+        new = [number for number, key in enumerate(keys) if key not in known]
+        encoded = self.network.encode_images(torch.from_numpy(images[new]).to(self.device))
         if len(new) == len(keys):
-            return features, dict(zip(keys, features, strict=True))
-        by_key = {**known, **dict(zip(new, features, strict=True))}
-        kept = {key: by_key[key] for key in keys}
-        return torch.stack([kept[key] for key in keys]), kept
+            return encoded, dict(zip(keys, encoded, strict=True))
+        by_key = {**known, **dict(zip((keys[number] for number in new), encoded, strict=True))}
+        features = torch.stack([by_key[key] for key in keys])
+        return features, dict(zip(keys, features, strict=True))
 
 
 def _usable_device(device: torch.device | str) -> torch.device:
