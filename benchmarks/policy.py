@@ -1,0 +1,366 @@
+"""How fast the policies decide and learn: on one core, and on a GPU where there is one.
+
+    python benchmarks/policy.py [--quick] [--rounds R] [--json FILE]
+
+Weights are random and words are numbered by a hash; neither changes the time. Observations are those of
+episodes that the oracle plays. The processor computes in float32, as the original does.
+
+A decision at history 5 is the fifth of an episode, from images to action. Against it stand reading everything
+anew (the prompt with T5-base, the crops of prompt and all steps, the trunk over all steps), the same with
+equal crops encoded once, and the original's way (prompt and tokens are kept, the trunk reads all steps
+again). None of these three is charged for cutting out crops, which the first one is. Ways take turns; medians
+are reported.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from openvima.data.records import Demonstration, rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.policies import preset
+from openvima.policies.acting import NetworkPolicy
+from openvima.policies.heads.base import ACTION_WIDTH, ActionTargets
+from openvima.policies.inputs import ImageStack, Reader, batch_histories, batch_prompts
+from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
+from openvima.training.dataset import make_batch, read_examples
+from sim import circumstances
+
+HISTORY = 5
+NUM_ENVS = 8
+ACTING_TASKS = ("sweep_without_touching", "rearrange_then_restore")  # of many steps
+TRAINING_TASKS = (
+    "visual_manipulation",
+    "rotate",
+    "follow_order",
+    "novel_noun",
+    "rearrange",
+    "scene_understanding",
+)
+NUM_TRAJECTORIES = 12
+FIRST_SEED = 2_000_000
+PEAK_SIZE = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product shows what the machine can do
+
+
+class WordHash:
+    """Numbers words without the files of T5, within the size of its vocabulary."""
+
+    end_id = 1
+
+    def encode(self, text: str) -> list[int]:
+        """Give each word a number that follows from its letters."""
+        return [3 + zlib.crc32(word.encode()) % 32000 for word in text.split()]
+
+
+class Decision:
+    """The fifth decision of an episode, to be made in each way."""
+
+    def __init__(self, policy: NetworkPolicy, episode: Demonstration) -> None:
+        self._policy, self._network, self._episode = policy, policy.network, episode
+        reader = policy.reader.begin_episode()
+        self._prompt = policy.reader.read_prompt(episode.prompt)
+        self._steps = [reader.read_step(episode.observation(t)) for t in range(HISTORY)]
+        self._images = [self._prompt.objects.crops, *(step.objects.crops for step in self._steps)]
+        self._actions = torch.full((1, HISTORY, ACTION_WIDTH), 0.3)
+        with torch.inference_mode():
+            self._features, self._numbers = self._encode(share=False)
+            self._memory = self._read_prompt(self._features, self._numbers[0])
+
+    def sizes(self) -> dict[str, int]:
+        """Return how much there is to read."""
+        return {
+            "prompt_places": len(self._prompt.words),
+            "prompt_crops": int(self._prompt.objects.masks.sum()),
+            "crops_in_all_steps": sum(int(step.objects.masks.sum()) for step in self._steps),
+            "different_ones": len(
+                {crop.tobytes() for step in self._steps for crop in _flat(step.objects.crops)}
+            ),
+        }
+
+    def approach(self) -> None:
+        """Begin the episode anew and make the decisions before it."""
+        self._policy.reset([self._episode.prompt])
+        for t in range(HISTORY - 1):
+            self._policy.act([self._episode.observation(t)])
+
+    def keeping(self) -> None:
+        """Decide with keys, values and features kept; `approach` comes first."""
+        self._policy.act([self._episode.observation(HISTORY - 1)])
+
+    @torch.inference_mode()
+    def anew(self, *, share: bool = False) -> None:
+        """Decide from scratch; `share` encodes equal crops once."""
+        features, numbers = self._encode(share=share)
+        self._decode(self._read_prompt(features, numbers[0]), features, numbers)
+
+    @torch.inference_mode()
+    def trunk_anew(self) -> None:
+        """Decide with prompt and tokens kept, but nothing in the trunk."""
+        self._network.encode_images(torch.from_numpy(_flat(self._images[-1])))
+        self._decode(self._memory, self._features, self._numbers)
+
+    def _encode(self, *, share: bool) -> tuple[torch.Tensor, list[np.ndarray]]:
+        if share:
+            stack = ImageStack(self._policy.reader.image_size)
+            numbers = [stack.add(images) for images in self._images]
+            return self._network.encode_images(torch.from_numpy(stack.stacked())), numbers
+        images = np.concatenate([_flat(images) for images in self._images])
+        ends = np.cumsum([images.shape[0] * images.shape[1] for images in self._images])
+        numbers = np.split(np.arange(len(images)), ends[:-1])
+        shaped = [part.reshape(images.shape[:2]) for part, images in zip(numbers, self._images, strict=True)]
+        return self._network.encode_images(torch.from_numpy(images)), shaped
+
+    def _read_prompt(self, features: torch.Tensor, numbers: np.ndarray) -> Any:  # Any: the network's memory
+        return self._network.encode_prompts(batch_prompts([self._prompt], [numbers]), features)
+
+    def _decode(self, memory: Any, features: torch.Tensor, numbers: Sequence[np.ndarray]) -> None:
+        history = batch_histories([self._steps], [numbers[1:]])
+        self._network.head.decide(self._network(memory, history, features, self._actions))
+
+
+class Training:
+    """Steps of behaviour cloning on one batch of demonstrations, image encoder included.
+
+    On a GPU it multiplies in bfloat16, with weights in float32.
+    """
+
+    def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
+        self._network, self._device = network.to(device).train(), device
+        reader = Reader.of(network.config.images, tokenizer_of(network))
+        examples = read_examples(demos, reader, validation_share=0.0, seed=0)
+        batch = make_batch(examples.training)
+        used = torch.cat([batch.prompts.crops_VS.flatten(), batch.history.crops_BTVN.flatten()]).unique()
+        self._used, self._images = used.to(device), examples.images[used].to(device)
+        self._num_images = len(examples.images)
+        self._prompts, self._history = batch.prompts.to(device), batch.history.to(device)
+        targets = (getattr(batch.targets, field.name).to(device) for field in fields(ActionTargets))
+        self._targets = ActionTargets(*targets)
+        trained = [p for p in network.parameters() if p.requires_grad]
+        self._optimizer = torch.optim.AdamW(trained, lr=1e-6, fused=True)
+        with FlopCounterMode(display=False) as counter:
+            self.step()
+        self.tflop = counter.get_total_flops() / 1e12
+
+    def step(self) -> None:
+        """Forward, backward and update."""
+        network = self._network
+        half = torch.autocast("cuda", torch.bfloat16) if self._device == "cuda" else nullcontext()
+        with half:
+            encoded = network.encode_images(self._images)
+            shape = (self._num_images, *encoded.shape[1:])
+            features = encoded.new_zeros(shape).index_copy(0, self._used, encoded)
+            memory = network.encode_prompts(self._prompts, features)
+            inputs = network(memory, self._history, features, self._targets.actions_BTC)
+            loss, _ = network.head.loss(inputs, self._targets)
+        loss.backward()
+        self._optimizer.step()
+        self._optimizer.zero_grad(set_to_none=True)
+
+
+def _flat(images: np.ndarray) -> np.ndarray:
+    return images.reshape(-1, *images.shape[-3:])
+
+
+def random_network(name: str) -> PolicyNetwork:
+    """Build a preset with random weights, without the costly orthogonal ones."""
+    network = outline_network(preset(name))
+    generator = torch.Generator().manual_seed(0)
+    weights = {
+        key: torch.randn(tensor.shape, generator=generator).mul_(0.02).add_(tensor.ndim == 1)
+        for key, tensor in network.state_dict().items()
+    }
+    network.load_state_dict(weights, assign=True)
+    return network
+
+
+def tokenizer_of(network: PolicyNetwork) -> Tokenizer:
+    """Return the closed vocabulary for networks that have it, else a stand-in for that of T5."""
+    return CLOSED_TOKENIZER if network.config.prompt.tokenizer == "closed" else WordHash()
+
+
+def demonstrations(tasks: Sequence[str], count: int, *, min_steps: int) -> list[Demonstration]:
+    """Let the oracle play episodes of the tasks in turn."""
+    envs = [TabletopEnv(task) for task in tasks]
+    found: list[Demonstration] = []
+    seed = FIRST_SEED
+    while len(found) < count:
+        demo = rollout_oracle(envs[len(found) % len(envs)], seed)
+        seed += 1
+        if demo.num_steps >= min_steps:
+            found.append(demo)
+    return found
+
+
+def seconds(work: Callable[[], object], device: str = "cpu") -> float:
+    """Time one call."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+    start = time.perf_counter()
+    work()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def in_turns(works: dict[str, Callable[[], float]], num_rounds: int) -> dict[str, float]:
+    """Run works that time themselves in alternating rounds, after a round to warm up; return medians."""
+    rounds = [{name: work() for name, work in works.items()} for _ in range(num_rounds + 1)][1:]
+    return {name: statistics.median(times[name] for times in rounds) for name in works}
+
+
+def measure_decision(policy: NetworkPolicy, episode: Demonstration, num_rounds: int) -> dict[str, float]:
+    """Time the fifth decision in every way; return seconds and sizes."""
+    decision = Decision(policy, episode)
+
+    def keeping() -> float:
+        decision.approach()
+        return seconds(decision.keeping)
+
+    works = {
+        "keeping": keeping,
+        "anew": lambda: seconds(decision.anew),
+        "anew_sharing_crops": lambda: seconds(lambda: decision.anew(share=True)),
+        "trunk_anew": lambda: seconds(decision.trunk_anew),
+    }
+    times = in_turns(works, num_rounds)
+    return {f"{name}_s": round(value, 4) for name, value in times.items()} | decision.sizes()
+
+
+def measure_batch(
+    policy: NetworkPolicy, episodes: Sequence[Demonstration], num_rounds: int
+) -> dict[str, float]:
+    """Time the first five decisions of all episodes, one after the other and together."""
+
+    def acting(group: Sequence[Demonstration]) -> float:
+        policy.reset([episode.prompt for episode in group])
+        return sum(
+            seconds(lambda t=t: policy.act([episode.observation(t) for episode in group]), policy.device.type)
+            for t in range(HISTORY)
+        )
+
+    works = {
+        "singles": lambda: sum(acting([episode]) for episode in episodes),
+        "batch": lambda: acting(episodes),
+    }
+    times = in_turns(works, num_rounds)
+    number = HISTORY * len(episodes)
+    return {
+        "batch8_cost_over_8_singles": round(times["batch"] / times["singles"], 3),
+        "decisions_per_s": round(number / times["singles"], 2),
+        "decisions_per_s_in_batches": round(number / times["batch"], 2),
+    }
+
+
+def measure_training(
+    network: PolicyNetwork, demos: Sequence[Demonstration], num_rounds: int, device: str = "cpu"
+) -> dict[str, float]:
+    """Time training steps and, in turns with them, the machine's matrix products."""
+    training = Training(network, demos, device)
+    precision = torch.float32 if device == "cpu" else torch.bfloat16
+    size = PEAK_SIZE[device]
+    matrix = torch.randn(size, size, dtype=precision, device=device)
+    works = {
+        "step": lambda: seconds(training.step, device),
+        "product": lambda: seconds(lambda: matrix @ matrix, device),
+    }
+    times = in_turns(works, num_rounds)
+    peak = 2 * size**3 / 1e12 / times["product"]
+    return {
+        "trajectories_per_s": round(len(demos) / times["step"], 2),
+        "tflop_per_step": round(training.tflop, 4),
+        "peak_tflop_per_s": round(peak, 4),
+        "share_of_peak": round(training.tflop / times["step"] / peak, 3),
+    }
+
+
+def measure(large: str, *, quick: bool, num_rounds: int) -> dict[str, Any]:
+    """Measure everything; `large` is the preset of the ratios."""
+    episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
+    demos = demonstrations(TRAINING_TASKS, NUM_TRAJECTORIES, min_steps=1)
+    trained = ("nano",) if quick else ("vima-2m", "vima-20m")
+    acting: dict[str, dict[str, float]] = {}
+    training: dict[str, dict[str, float]] = {}
+    for name in dict.fromkeys(("nano", *trained, large)):
+        network = random_network(name)
+        if name in trained:
+            training[name] = measure_training(network, demos, num_rounds)
+            show(name, "training", training[name])
+        policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), dtype=torch.float32)
+        acting[name] = measure_batch(policy, episodes, 1 if name == large else num_rounds)
+        if name == large:
+            acting[name] |= measure_decision(policy, episodes[0], num_rounds)
+        show(name, "acting", acting[name])
+    return {**ratios(large, acting[large]), "acting": acting, "training": training}
+
+
+def ratios(name: str, times: dict[str, float]) -> dict[str, float]:
+    """Return the ratios that are promised, by name."""
+    title = f"decision_speedup_{name.split('-')[-1].upper()}_history{HISTORY}"
+    keeping = times["keeping_s"]
+    return {
+        title: round(times["anew_s"] / keeping, 2),
+        f"{title}_sharing_crops": round(times["anew_sharing_crops_s"] / keeping, 2),
+        f"{title}_decoder_only": round(times["trunk_anew_s"] / keeping, 2),
+        "batch8_cost_over_8_singles": times["batch8_cost_over_8_singles"],
+    }
+
+
+def measure_gpu(num_rounds: int) -> dict[str, Any]:
+    """Measure training and acting of the largest preset on the GPU, in bfloat16."""
+    demos = demonstrations(TRAINING_TASKS, 32, min_steps=1)
+    training = measure_training(random_network("vima-200m"), demos, num_rounds, "cuda")
+    network = random_network("vima-200m")
+    policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), device="cuda", dtype=torch.bfloat16)
+    episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
+    acting = measure_batch(policy, episodes, num_rounds)
+    result = {"device": torch.cuda.get_device_name(), "training": training, "acting": acting}
+    show("vima-200m on the GPU", "bfloat16", training | acting)
+    return result
+
+
+def show(name: str, what: str, values: dict[str, float]) -> None:
+    """Print one line of numbers."""
+    print(f"{name}, {what}: " + ", ".join(f"{key} {value}" for key, value in values.items()), flush=True)
+
+
+def main() -> None:
+    """Measure, print, and write the numbers as JSON if asked."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--quick", action="store_true", help="smaller presets, to try it out")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="alternating rounds, after a first that warms up"
+    )
+    parser.add_argument("--json", type=Path, help="file to write")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    where = circumstances() | {"torch": torch.__version__, "threads": 1, "rounds": options.rounds}
+    print(", ".join(f"{name}: {value}" for name, value in where.items()))
+    large = "vima-2m" if options.quick else "vima-200m"
+    results = measure(large, quick=options.quick, num_rounds=options.rounds)
+    if torch.cuda.is_available() and not options.quick:
+        results["gpu"] = measure_gpu(options.rounds)
+    for key, value in results.items():
+        if not isinstance(value, dict):
+            print(f"{key}: {value}")
+    if options.json:
+        options.json.write_text(json.dumps(results | where, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
