@@ -13,7 +13,7 @@ from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
-from openvima.policies.perception import GROUND_TRUTH  # noqa: E402
+from openvima.policies.perception import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
 VIEWS = ("front", "top")
@@ -158,3 +158,13 @@ def test_more_objects_than_a_history_holds_are_refused(name: str, demonstrations
     with pytest.raises(PolicyError, match=r"this policy takes 512\. Give.*fewer objects"):
         for _ in range(3):
             policy.act([crowded(250)])
+
+
+def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it(starts) -> None:
+    for _, seen in starts:
+        in_order = GroundTruth(left_to_right=False).in_observation(seen)
+        assert (np.diff(in_order.ids) > 0).all()
+        step = Reader.of(preset("vima-nano").images).begin_episode().read_step(seen)
+        np.testing.assert_array_equal(step.objects.crops, in_order.compacted().crops)
+        step = Reader.of(preset("nano").images).begin_episode().read_step(seen)
+        np.testing.assert_array_equal(step.objects.ids, in_order.left_to_right().ids)

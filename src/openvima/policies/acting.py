@@ -21,7 +21,7 @@ from openvima.policies.inputs import (
 )
 from openvima.policies.layers.trunk import TrunkState
 from openvima.policies.network import Memory, PolicyNetwork
-from openvima.policies.perception import GROUND_TRUTH, ObjectFinder
+from openvima.policies.perception import ObjectFinder
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
@@ -79,7 +79,7 @@ class NetworkPolicy(Policy):
     Args:
         network: The network; it is moved to the device and precision, and set to evaluation.
         tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
-        finder: Finds the objects in images; by default by the simulator's segmentation.
+        finder: Finds the objects in images; by default by the simulator's segmentation, see `Reader.of`.
         device: Where to compute, such as "cpu" or "cuda".
         dtype: Precision; by default float64 on a processor and float32 elsewhere.
         temperature: 0 takes the likeliest action. Above 0 actions are drawn, with scores divided by it.
@@ -96,7 +96,7 @@ class NetworkPolicy(Policy):
         network: PolicyNetwork,
         *,
         tokenizer: Tokenizer | None = None,
-        finder: ObjectFinder = GROUND_TRUTH,
+        finder: ObjectFinder | None = None,
         device: torch.device | str = "cpu",
         dtype: torch.dtype | None = None,
         temperature: float = 0.0,

@@ -22,6 +22,7 @@ from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.layers.trunk import MAX_PLACES
 from openvima.policies.perception import (
     GROUND_TRUTH,
+    PUBLISHED_ORDER,
     ObjectFinder,
     ObjectViews,
     end_effector_of,
@@ -185,15 +186,20 @@ class Reader:
     def of(
         images: ObjectEncoderConfig | FrameEncoderConfig,
         tokenizer: Tokenizer | None = None,
-        finder: ObjectFinder = GROUND_TRUTH,
+        finder: ObjectFinder | None = None,
     ) -> "Reader":
-        """Make the reader for a network whose images are encoded in this way."""
+        """Make the reader for a network whose images are encoded in this way.
+
+        Objects are found by segmentation unless a finder is given: in the order of their ids for a token in
+        each view, as the published policies know them, and from left to right otherwise.
+        """
         tokenizer = tokenizer or CLOSED_TOKENIZER
         if isinstance(images, FrameEncoderConfig):
             size = (images.frame.image_height, images.frame.image_width)
-            return Reader("frames", size, images.num_tokens, tokenizer, finder)
-        layout = "objects" if images.fuse_views else "views"
-        return Reader(layout, tokenizer=tokenizer, finder=finder)
+            return Reader("frames", size, images.num_tokens, tokenizer)
+        if images.fuse_views:
+            return Reader("objects", tokenizer=tokenizer, finder=finder or GROUND_TRUTH)
+        return Reader("views", tokenizer=tokenizer, finder=finder or PUBLISHED_ORDER)
 
     def read_prompt(self, prompt: RenderedPrompt) -> PromptInput:
         """Turn a prompt into words and images.

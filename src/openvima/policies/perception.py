@@ -165,6 +165,7 @@ class GroundTruth:
 
 
 GROUND_TRUTH = GroundTruth()
+PUBLISHED_ORDER = GroundTruth(left_to_right=False)
 
 
 def see_nothing(count: int = 0) -> ObjectViews:
