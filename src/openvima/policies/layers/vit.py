@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.errors import ConfigError
+from openvima.policies.layers.linear import Linear
 
 # Mean and standard deviation of R, G, B over training frames, as the published policies use them.
 PIXEL_MEAN = (0.3471, 0.3429, 0.3383)
@@ -93,14 +94,17 @@ class VisionTransformer(nn.Module):
             Shape (N, output_width), or (N, P, output_width) without a class token, in the precision of the
             weights.
         """
-        pixels = images_NCYX.to(self.positions.dtype) / 255
-        x_NPW = self.patches((pixels - self.pixel_mean) / self.pixel_std).flatten(2).transpose(1, 2)
+        pixels = images_NCYX.to(self.positions.dtype) / 255  # a copy, so that what follows can be in place
+        x_NPW = self.patches(pixels.sub_(self.pixel_mean).div_(self.pixel_std)).flatten(2).transpose(1, 2)
         if self.class_token is not None:
             x_NPW = torch.cat([self.class_token.expand(len(x_NPW), 1, -1), x_NPW], dim=1)
         x_NPW = self.norm_before(x_NPW + self.positions)
-        for block in self.blocks:
+        *blocks, last_block = self.blocks
+        for block in blocks:
             x_NPW = block(x_NPW)
-        return self.projection(self.norm_after(x_NPW if self.class_token is None else x_NPW[:, 0]))
+        if self.class_token is None:
+            return self.projection(self.norm_after(last_block(x_NPW)))
+        return self.projection(self.norm_after(last_block(x_NPW, num_read=1)[:, 0]))
 
 
 class VitBlock(nn.Module):
@@ -110,18 +114,18 @@ class VitBlock(nn.Module):
         super().__init__()
         self.num_heads = num_heads
         self.norm_attention = nn.LayerNorm(width)
-        self.query_key_value = nn.Linear(width, 3 * width)
-        self.attention_out = nn.Linear(width, width)
+        self.query_key_value = Linear(width, 3 * width)
+        self.attention_out = Linear(width, width)
         self.norm_mlp = nn.LayerNorm(width)
-        self.widen = nn.Linear(width, 4 * width)
-        self.narrow = nn.Linear(4 * width, width)
+        self.widen = Linear(width, 4 * width)
+        self.narrow = Linear(4 * width, width)
 
-    def forward(self, x_NPW: torch.Tensor) -> torch.Tensor:
-        """Map tokens to tokens, shape (N, P, W)."""
+    def forward(self, x_NPW: torch.Tensor, *, num_read: int | None = None) -> torch.Tensor:
+        """Map tokens to tokens, shape (N, P, W); only the first few of them if no more are read."""
         packed = self.query_key_value(self.norm_attention(x_NPW))
         # (N, P, 3·W) -> (3, N, H, P, K)
         query, key, value = packed.unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(query, key, value)
-        x_NPW = x_NPW + self.attention_out(mixed.transpose(1, 2).flatten(2))
+        mixed = F.scaled_dot_product_attention(query[:, :, :num_read], key, value)
+        x_NPW = x_NPW[:, :num_read] + self.attention_out(mixed.transpose(1, 2).flatten(2))
         hidden = self.widen(self.norm_mlp(x_NPW))
         return x_NPW + self.narrow(hidden * torch.sigmoid(1.702 * hidden))  # QuickGELU
