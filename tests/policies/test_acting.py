@@ -14,7 +14,6 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.acting import NetworkPolicy, drawing  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
 from openvima.policies.inputs import ImageStack, batch_histories, batch_prompts  # noqa: E402
-from openvima.policies.layers.linear import Linear  # noqa: E402
 from openvima.policies.layers.trunk import MAX_PLACES  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.perception import GroundTruth  # noqa: E402
@@ -358,13 +357,3 @@ def test_frames_of_another_size_are_refused(policy, prompts, pool) -> None:
     segm = {view: np.ascontiguousarray(segm[:64]) for view, segm in pool[0]["segm"].items()}
     with pytest.raises(ShapeError, match=r"64, 256\)"):
         policy.act([{**pool[0], "rgb": small, "segm": segm}])
-
-
-@pytest.mark.parametrize("rows", [1, 2, 15, 64, 65])
-def test_a_linear_layer_gives_the_same_by_either_kernel(rows) -> None:
-    torch.manual_seed(0)
-    layer = Linear(1024, 1024)
-    x = torch.randn(1, rows, 1024)
-    expected = layer(x)
-    with torch.inference_mode():
-        torch.testing.assert_close(layer(x), expected.detach(), rtol=0, atol=2e-5)

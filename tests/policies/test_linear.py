@@ -1,0 +1,77 @@
+"""The linear layer gives the same by either kernel, whatever happens to its weights in between."""
+
+from copy import deepcopy
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from torch.nn import functional as F  # noqa: E402
+
+from openvima.policies.layers import linear  # noqa: E402
+from openvima.policies.layers.linear import Linear  # noqa: E402
+
+
+@pytest.fixture
+def layer() -> Linear:
+    torch.manual_seed(0)
+    return Linear(1024, 512).eval()
+
+
+def assert_right(layer: Linear, rows: int = 5) -> None:
+    """The layer agrees with the plain product in inference mode."""
+    x = torch.randn(1, rows, layer.in_features, dtype=layer.weight.dtype)
+    expected = F.linear(x, layer.weight, layer.bias).detach()
+    with torch.inference_mode():
+        torch.testing.assert_close(layer(x), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 15, 64, 65])
+@pytest.mark.parametrize("bias", [True, False])
+def test_any_number_of_rows_gives_the_product(rows: int, bias: bool) -> None:
+    torch.manual_seed(1)
+    assert_right(Linear(1024, 512, bias=bias), rows)
+
+
+def test_weights_changed_in_place_count_at_once(layer) -> None:
+    assert_right(layer)
+    with torch.no_grad():
+        layer.weight.mul_(-2)
+    assert_right(layer)
+    layer.load_state_dict({name: 3 * tensor for name, tensor in layer.state_dict().items()})
+    assert_right(layer)
+
+
+def test_weights_in_another_place_or_precision_count_at_once(layer) -> None:
+    assert_right(layer)
+    weights = {name: 3 * tensor for name, tensor in layer.state_dict().items()}
+    layer.load_state_dict(weights, assign=True)
+    assert_right(layer)
+    assert_right(layer.double())
+    assert_right(layer.float())
+
+
+@pytest.mark.skipif(not linear._CAN_PACK, reason="this torch has no oneDNN")
+def test_only_acting_makes_a_packed_copy_and_training_drops_it(layer) -> None:
+    layer(torch.randn(5, 1024))
+    assert layer._packed is None
+    assert_right(layer)
+    assert layer._packed is not None
+    assert "_packed" not in layer.state_dict()
+    layer.train()
+    assert layer._packed is None
+
+
+def test_a_copy_of_a_layer_that_acted_is_independent(layer) -> None:
+    assert_right(layer)
+    copied = deepcopy(layer)
+    with torch.no_grad():
+        copied.weight.zero_()
+    assert_right(copied)
+    assert_right(layer)
+
+
+def test_gradients_are_those_of_a_linear_layer(layer) -> None:
+    x = torch.randn(5, 1024)
+    layer(x).sum().backward()
+    torch.testing.assert_close(layer.weight.grad, x.sum(0).expand(512, -1))
