@@ -16,7 +16,7 @@ from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs 
 from openvima.policies.inputs import ImageStack, batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.layers.trunk import MAX_PLACES  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
-from openvima.policies.perception import GroundTruth  # noqa: E402
+from openvima.policies.perception import GroundTruth, observe  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
 NAMES = ("nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano")
@@ -200,11 +200,12 @@ def broken(observation: dict) -> dict:
 def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
     """Each call below fails in a different place; then the episodes go on as if it had not been made."""
     expected = played(policy, prompts, pool)
+    crowded = max(pool, key=lambda observation: len(observe(observation)))
     policy.reset(prompts)
     for step in range(max(LENGTHS)):
         seen = batch_at(step, range(4), pool)
         with pytest.raises(ShapeError, match="rgb 'front' is float32"):
-            policy.act([seen_by(1, 9, pool), None, None, broken(pool[0])])
+            policy.act([crowded, None, None, broken(pool[0])])
         with pytest.raises(PolicyError, match="got 1 observations for 4 prompts"):
             policy.act(seen[:1])
         with pytest.raises(PromptError, match="the prompt is empty"):
