@@ -301,7 +301,7 @@ def measure(large: str, *, quick: bool, num_rounds: int) -> dict[str, Any]:
             training[name] = measure_training(network, demos, num_rounds)
             show(name, "training", training[name])
         policy = NetworkPolicy(network, tokenizer=tokenizer_of(network), dtype=torch.float32)
-        acting[name] = measure_batch(policy, episodes, 1 if name == large else num_rounds)
+        acting[name] = measure_batch(policy, episodes, max(1, num_rounds - 1))
         if name == large:
             acting[name] |= measure_decision(policy, episodes[0], num_rounds)
         show(name, "acting", acting[name])

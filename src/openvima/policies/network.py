@@ -242,7 +242,10 @@ class PolicyNetwork(nn.Module):
         order_BP = order_BP[:, : int(kept_BL.sum(dim=1).max())]
         places_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
         read_BPD, state = self.trunk.extend(
-            state, sequence_BLD.gather(1, places_BPD), mask_BL.gather(1, order_BP)
+            state,
+            sequence_BLD.gather(1, places_BPD),
+            mask_BL.gather(1, order_BP),
+            kept_BL.gather(1, order_BP),
         )
         outputs_BLD = torch.zeros_like(sequence_BLD).scatter(1, places_BPD, read_BPD)
         return outputs_BLD.view(batch, steps, slots + 1, -1)[:, :, 1:], state

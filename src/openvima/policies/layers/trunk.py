@@ -5,8 +5,8 @@ stand before the history in one sequence (VIMA-Gato, VIMA-GPT). Both read a hist
 keys and values of what they have read; a whole history is one long piece. So training and acting run the same
 code.
 
-Shape suffixes: B batch, L new places, S all places so far, P places of the prompt, D width, H heads, K width
-of a head.
+Shape suffixes: B batch, L new places, N those of all rows that are computed, S all places so far, P places of
+the prompt, D width, H heads, K width of a head.
 """
 
 from collections.abc import Sequence
@@ -36,6 +36,7 @@ class DecoderConfig:
         num_self_heads: Heads of self-attention.
         num_cross_heads: Heads of cross-attention.
         dropout: Share of values dropped in training, in self blocks and after the position embedding.
+        initial_std: Standard deviation of fresh weights.
     """
 
     width: int
@@ -43,6 +44,7 @@ class DecoderConfig:
     num_self_heads: int
     num_cross_heads: int
     dropout: float = 0.1
+    initial_std: float = 0.02
 
     def __post_init__(self) -> None:
         _check_sizes("decoder", self.width, self.num_self_heads, self.dropout)
@@ -58,12 +60,14 @@ class PrefixConfig:
         num_layers: Self blocks.
         num_heads: Heads of each.
         dropout: Share of values dropped in training, in the blocks and after the position embedding.
+        initial_std: Standard deviation of fresh weights.
     """
 
     width: int
     num_layers: int
     num_heads: int
     dropout: float = 0.1
+    initial_std: float = 0.02
 
     def __post_init__(self) -> None:
         _check_sizes("prefix trunk", self.width, self.num_heads, self.dropout)
@@ -99,6 +103,30 @@ class TrunkState:
         )
 
 
+class Places:
+    """Which places of a padded batch are computed; the others take part in attention alone, as zeros.
+
+    Args:
+        exist_BL: The places that are computed.
+    """
+
+    def __init__(self, exist_BL: torch.Tensor) -> None:
+        self._shape = exist_BL.shape
+        found_N = exist_BL.flatten().nonzero().squeeze(1)
+        self._index_N = None if len(found_N) == exist_BL.numel() else found_N
+
+    def pack(self, x_BLD: torch.Tensor) -> torch.Tensor:
+        """Return the rows that are computed, (N, D); or the batch as it is, if that is all."""
+        return x_BLD if self._index_N is None else x_BLD.flatten(0, 1).index_select(0, self._index_N)
+
+    def unpack(self, x_ND: torch.Tensor) -> torch.Tensor:
+        """Undo `pack`, with zeros at the other places."""
+        if self._index_N is None:
+            return x_ND
+        zeros = x_ND.new_zeros(self._shape.numel(), x_ND.shape[-1])
+        return zeros.index_copy(0, self._index_N, x_ND).unflatten(0, self._shape)
+
+
 class Trunk(nn.Module):
     """Positions and self blocks, which both trunks have."""
 
@@ -124,7 +152,11 @@ class Trunk(nn.Module):
         raise NotImplementedError
 
     def extend(
-        self, state: TrunkState, tokens_BLD: torch.Tensor, mask_BL: torch.Tensor
+        self,
+        state: TrunkState,
+        tokens_BLD: torch.Tensor,
+        mask_BL: torch.Tensor,
+        exist_BL: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, TrunkState]:
         """Read on.
 
@@ -132,6 +164,7 @@ class Trunk(nn.Module):
             state: What has been read.
             tokens_BLD: Objects and actions in the order of time.
             mask_BL: Which of these places may be looked at, bool. Masked places still get an output.
+            exist_BL: Which get one, bool, those of the mask among them; all by default. It is zero elsewhere.
 
         Returns:
             Outputs, shape (B, L, D), and the state after them. A place sees the valid places before
@@ -145,22 +178,23 @@ class Trunk(nn.Module):
         if state.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_PLACES:  # only then worth a look at the data
             _check_length(int(num_read_B.max()), MAX_PLACES, self.sequence)
         positions_BL = (state.num_read_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
-        x_BLD = self.dropout(tokens_BLD + self.positions(positions_BL))
-        seen_B1LS = score_bias(_seen(state.mask_BS, mask_BL)[:, None], x_BLD.dtype)
-        seen_B11P = score_bias(state.prompt_mask_BP[:, None, None, :], x_BLD.dtype)
+        places = Places(torch.ones_like(mask_BL) if exist_BL is None else exist_BL)
+        x_ND = self.dropout(places.pack(tokens_BLD + self.positions(positions_BL)))
+        seen_B1LS = score_bias(_seen(state.mask_BS, mask_BL)[:, None], x_ND.dtype)
+        seen_B11P = score_bias(state.prompt_mask_BP[:, None, None, :], x_ND.dtype)
         past = []
         for layer, block in enumerate(self.self_blocks):
-            x_BLD = self._condition(layer, x_BLD, state, seen_B11P)
-            x_BLD, keys_values = block(x_BLD, state.past[layer], seen_B1LS)
+            x_ND = self._condition(layer, x_ND, places, state, seen_B11P)
+            x_ND, keys_values = block(x_ND, places, state.past[layer], seen_B1LS)
             past.append(keys_values)
         mask_BS = torch.cat([state.mask_BS, mask_BL], dim=1)
-        return x_BLD, replace(state, past=tuple(past), mask_BS=mask_BS, num_read_B=num_read_B)
+        return places.unpack(x_ND), replace(state, past=tuple(past), mask_BS=mask_BS, num_read_B=num_read_B)
 
     def _condition(
-        self, layer: int, x_BLD: torch.Tensor, state: TrunkState, seen_B11P: torch.Tensor
+        self, layer: int, x_ND: torch.Tensor, places: Places, state: TrunkState, seen_B11P: torch.Tensor
     ) -> torch.Tensor:
         """Look at the prompt before a self block, if the trunk does that."""
-        return x_BLD
+        return x_ND
 
     def _nothing_read(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> TrunkState:
         batch = len(prompt_BPD)
@@ -173,10 +207,10 @@ class Trunk(nn.Module):
             mask_BP,
         )
 
-    def _init_weights(self) -> None:
+    def _init_weights(self, std: float) -> None:
         for module in self.modules():
             if isinstance(module, nn.Linear | nn.Embedding):
-                nn.init.normal_(module.weight, std=0.02)
+                nn.init.normal_(module.weight, std=std)
             if isinstance(module, nn.Linear) and module.bias is not None:
                 nn.init.zeros_(module.bias)
 
@@ -188,7 +222,7 @@ class Decoder(Trunk):
         super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
         self.prompt_positions = nn.Embedding(MAX_PROMPT_PLACES, config.width)
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
-        self._init_weights()
+        self._init_weights(config.initial_std)
 
     def begin(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> TrunkState:
         """Compute the keys and values of the prompt for every cross block."""
@@ -199,9 +233,9 @@ class Decoder(Trunk):
         return replace(self._nothing_read(prompt_BPD, mask_BP), prompt=prompt)
 
     def _condition(
-        self, layer: int, x_BLD: torch.Tensor, state: TrunkState, seen_B11P: torch.Tensor
+        self, layer: int, x_ND: torch.Tensor, places: Places, state: TrunkState, seen_B11P: torch.Tensor
     ) -> torch.Tensor:
-        return self.cross_blocks[layer](x_BLD, state.prompt[layer], seen_B11P)
+        return self.cross_blocks[layer](x_ND, places, state.prompt[layer], seen_B11P)
 
 
 class PrefixTrunk(Trunk):
@@ -212,7 +246,7 @@ class PrefixTrunk(Trunk):
     def __init__(self, config: PrefixConfig) -> None:
         super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
         self.separator = nn.Parameter(torch.zeros(config.width))
-        self._init_weights()
+        self._init_weights(config.initial_std)
 
     def begin(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> TrunkState:
         """Run prompt and separator through the blocks."""
@@ -248,11 +282,14 @@ class CrossBlock(nn.Module):
         key, value = self.key_value(prompt_BPD).unflatten(-1, (2, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
         return key, value
 
-    def forward(self, x_BLD: torch.Tensor, prompt: KeysValues, bias_B11P: torch.Tensor) -> torch.Tensor:
-        """Map the history to the same shape; `bias_B11P` hides prompt places."""
-        query = self.query(self.norm_attention(x_BLD)).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+    def forward(
+        self, x_ND: torch.Tensor, places: Places, prompt: KeysValues, bias_B11P: torch.Tensor
+    ) -> torch.Tensor:
+        """Map packed places of the history to the same shape; `bias_B11P` hides prompt places."""
+        query_BLD = places.unpack(self.query(self.norm_attention(x_ND)))
+        query = query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
         mixed = F.scaled_dot_product_attention(query, *prompt, attn_mask=bias_B11P)
-        attended = self.attention_out(mixed.transpose(1, 2).flatten(2)) + x_BLD
+        attended = self.attention_out(places.pack(mixed.transpose(1, 2).flatten(2))) + x_ND
         hidden = F.gelu(self.widen(self.norm_feed_forward(attended))) * self.gate(attended)
         return self.narrow(hidden) + attended
 
@@ -274,12 +311,13 @@ class SelfBlock(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(
-        self, x_BLD: torch.Tensor, past: KeysValues, bias_B1LS: torch.Tensor
+        self, x_ND: torch.Tensor, places: Places, past: KeysValues, bias_B1LS: torch.Tensor
     ) -> tuple[torch.Tensor, KeysValues]:
         """Map new places to the same shape.
 
         Args:
-            x_BLD: New places.
+            x_ND: New places, packed.
+            places: Where they stand.
             past: Keys and values of the places before them.
             bias_B1LS: Hides the future and masked places.
 
@@ -287,13 +325,13 @@ class SelfBlock(nn.Module):
             Outputs, and keys and values of all places.
         """
         # (B, L, 3·D) -> (3, B, H, L, K)
-        packed = self.query_key_value(x_BLD).unflatten(-1, (3, self.num_heads, -1))
+        packed = places.unpack(self.query_key_value(x_ND)).unflatten(-1, (3, self.num_heads, -1))
         query, key, value = packed.permute(2, 0, 3, 1, 4)
         key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
         dropout = self.attention_dropout if self.training else 0.0
         mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias_B1LS, dropout_p=dropout)
-        attended = self.dropout(self.attention_out(mixed.transpose(1, 2).flatten(2)))
-        attended = self.norm_attention(x_BLD + attended)
+        attended = self.dropout(self.attention_out(places.pack(mixed.transpose(1, 2).flatten(2))))
+        attended = self.norm_attention(x_ND + attended)
         hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
         return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
 
