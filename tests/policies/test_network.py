@@ -1,0 +1,42 @@
+"""Building networks, and the ranges in which actions are spoken of."""
+
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa: E402
+from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+
+
+def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first, second, other = (build_network(small_sizes, seed=seed) for seed in (0, 0, 1))
+    assert torch.equal(torch.rand(3), expected)
+    for name, weight in first.state_dict().items():
+        assert torch.equal(weight, second.state_dict()[name])
+    assert not torch.equal(first.prompt.words.weight, other.prompt.words.weight)
+
+
+def test_unit_range_undoes_itself_and_clips():
+    actions = torch.tensor([[0.3, -0.4, 0.0, 0.0, 0.6, 0.8, 0.7, 0.5, 0.0, 0.0, 0.0, 1.0]])
+    torch.testing.assert_close(from_unit_range(to_unit_range(actions)), actions)
+    outside = from_unit_range(torch.full((1, 12), 2.0))
+    assert outside[0, :2].tolist() == [0.75, 0.5]
+
+
+def test_yaw_bins_are_centred_on_whole_steps():
+    turns = torch.deg2rad(torch.tensor([0.0, 2.4, 2.6, -2.6, 180.0, -180.0, 357.6]))
+    assert yaw_bin(turns, 72).tolist() == [0, 0, 1, 71, 36, 36, 0]
+
+
+def test_images_and_trunk_of_different_widths_are_refused():
+    sizes = preset("nano")
+    with pytest.raises(ConfigError, match="make them equal"):
+        replace(sizes, trunk=replace(sizes.trunk, width=64))
