@@ -10,7 +10,9 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
+from openvima.training.dataset import make_batch, read_examples  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -40,3 +42,22 @@ def test_images_and_trunk_of_different_widths_are_refused():
     sizes = preset("nano")
     with pytest.raises(ConfigError, match="make them equal"):
         replace(sizes, trunk=replace(sizes.trunk, width=64))
+
+
+@pytest.mark.parametrize("name", ["nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano"])
+def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
+    network = build_network(preset(name), seed=0).eval()
+    examples = read_examples(demonstrations, Reader.of(network.config.images), validation_share=0.0, seed=0)
+    batch = make_batch(examples.training)
+
+    def loss() -> torch.Tensor:
+        features = network.encode_images(examples.images)
+        memory = network.encode_prompts(batch.prompts, features)
+        inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
+        return network.head.loss(inputs, batch.targets)[0]
+
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = loss()
+    torch.testing.assert_close(mixed.float(), loss(), rtol=0.05, atol=0.05)
+    mixed.backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())

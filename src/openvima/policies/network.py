@@ -247,7 +247,7 @@ class PolicyNetwork(nn.Module):
             mask_BL.gather(1, order_BP),
             kept_BL.gather(1, order_BP),
         )
-        outputs_BLD = torch.zeros_like(sequence_BLD).scatter(1, places_BPD, read_BPD)
+        outputs_BLD = read_BPD.new_zeros(sequence_BLD.shape).scatter(1, places_BPD, read_BPD)
         return outputs_BLD.view(batch, steps, slots + 1, -1)[:, :, 1:], state
 
     def _appearance(self, features_BTVNF: torch.Tensor, masks_BTVN: torch.Tensor) -> torch.Tensor:
