@@ -25,9 +25,11 @@ class Size:
         image_layers: Layers of the image encoder.
         image_heads: Heads of the image encoder.
         hidden_width: Hidden width of the action heads.
+        resampler_layers: Self layers of VIMA-Flamingo's resampler, and how often they are run through.
         prompt: The prompt encoder.
         action_width: Width of the features of each part of a past action.
         dropout: Share of values dropped in training.
+        initial_std: Standard deviation of the trunk's fresh weights.
     """
 
     width: int
@@ -37,9 +39,11 @@ class Size:
     image_width: int = 768
     image_layers: int = 4
     image_heads: int = 24
+    resampler_layers: int = 4
     hidden_width: int = 512
     action_width: int = 256
     dropout: float = 0.1
+    initial_std: float = 0.02
 
     @property
     def head(self) -> BinsConfig:
@@ -69,8 +73,10 @@ def _nano() -> Size:
         image_width=96,
         image_layers=2,
         image_heads=4,
+        resampler_layers=2,
         hidden_width=256,
         action_width=64,
+        initial_std=0.05,  # as much signal gets through as at width 768; with 0.02 it nearly dies out
     )
 
 

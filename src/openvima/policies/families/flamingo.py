@@ -17,10 +17,18 @@ from openvima.policies.layers.trunk import DecoderConfig
 def flamingo(size: Size) -> PolicyConfig:
     """Return VIMA-Flamingo in a size."""
     frame = frame_transformer(size, class_token=False)
+    resampler = ResamplerConfig(
+        num_blocks=size.resampler_layers,
+        num_layers=size.resampler_layers,
+        dropout=size.dropout,
+        initial_std=size.initial_std,
+    )
     return PolicyConfig(
-        images=FrameEncoderConfig(frame, "resampled", ResamplerConfig(dropout=size.dropout)),
+        images=FrameEncoderConfig(frame, "resampled", resampler),
         prompt=size.prompt,
-        trunk=DecoderConfig(size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout),
+        trunk=DecoderConfig(
+            size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout, size.initial_std
+        ),
         head=size.head,
         action_width=size.action_width,
     )

@@ -17,7 +17,7 @@ def gpt(size: Size) -> PolicyConfig:
     return PolicyConfig(
         images=FrameEncoderConfig(frame_transformer(size, class_token=True), "class"),
         prompt=size.prompt,
-        trunk=PrefixConfig(size.width, 2 * size.num_layers, size.num_heads, size.dropout),
+        trunk=PrefixConfig(size.width, 2 * size.num_layers, size.num_heads, size.dropout, size.initial_std),
         head=size.head,
         action_width=size.action_width,
     )

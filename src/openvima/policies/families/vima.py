@@ -19,7 +19,9 @@ def vima(size: Size) -> PolicyConfig:
     return PolicyConfig(
         images=ObjectEncoderConfig(crop, box_width=size.image_width, width=size.width),
         prompt=size.prompt,
-        trunk=DecoderConfig(size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout),
+        trunk=DecoderConfig(
+            size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout, size.initial_std
+        ),
         head=size.head,
         action_width=size.action_width,
     )

@@ -22,6 +22,7 @@ class ResamplerConfig:
         num_layers: Self layers.
         num_heads: Heads of each layer.
         dropout: Share of attention weights dropped in training.
+        initial_std: Standard deviation of fresh weights.
     """
 
     num_latents: int = 4
@@ -29,6 +30,7 @@ class ResamplerConfig:
     num_layers: int = 4
     num_heads: int = 8
     dropout: float = 0.1
+    initial_std: float = 0.02
 
 
 class Resampler(nn.Module):
@@ -37,12 +39,12 @@ class Resampler(nn.Module):
     def __init__(self, config: ResamplerConfig, width: int) -> None:
         super().__init__()
         self.num_blocks = config.num_blocks
-        self.latents = nn.Parameter(torch.randn(config.num_latents, width) * 0.02)
+        self.latents = nn.Parameter(torch.randn(config.num_latents, width) * config.initial_std)
         self.cross_layer = ResamplerLayer(width, config, looks_elsewhere=True)
         self.self_layers = nn.ModuleList(ResamplerLayer(width, config) for _ in range(config.num_layers))
         for module in self.modules():
             if isinstance(module, nn.Linear):
-                nn.init.normal_(module.weight, std=0.02)
+                nn.init.normal_(module.weight, std=config.initial_std)
                 nn.init.zeros_(module.bias)
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
