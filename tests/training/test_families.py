@@ -1,0 +1,75 @@
+"""Each member of the family from demonstrations to actions, on the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.scene import Action  # noqa: E402
+from openvima.training.schedule import step_seed  # noqa: E402
+from openvima.training.stages import Cloning  # noqa: E402
+
+STEPS = 3
+
+
+def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
+    words = ["train", "--data", data, "--out", out, "--preset", preset, "--steps", STEPS, "--batch", 3]
+    return main([str(word) for word in (*words, "--checkpoint-every", 1, *options)])
+
+
+@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt"])
+def test_a_run_can_be_interrupted_and_gives_a_policy_that_acts(family, data, tmp_path, monkeypatch) -> None:
+    preset, whole, torn = f"{family}-nano", tmp_path / "whole", tmp_path / "torn"
+    assert run_train(data, whole, preset) == 0
+    backward = Cloning.backward
+
+    def interrupted(self: Cloning, step: int) -> dict[str, float]:
+        if step == 2:
+            raise KeyboardInterrupt
+        return backward(self, step)
+
+    monkeypatch.setattr(Cloning, "backward", interrupted)
+    assert run_train(data, torn, preset) == 130
+    monkeypatch.undo()
+    assert run_train(data, torn, preset) == 0
+    last = f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors"
+    expected, actual = load_file(whole / last), load_file(torn / last)
+    assert expected.keys() == actual.keys()
+    assert all(torch.equal(tensor, actual[name]) for name, tensor in expected.items())
+
+    policy, env = load_policy(str(torn)), TabletopEnv("rotate")
+    observation, _ = env.reset(seed=0)
+    policy.reset([env.prompt])
+    (action,) = policy.act([observation])
+    assert action is not None
+    Action.from_arrays(action)
+
+
+def test_without_an_appearance_embedding_there_is_no_matching_and_the_images_are_learnt(
+    data, tmp_path
+) -> None:
+    assert run_train(data, tmp_path, "gpt-nano") == 0
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]["pretraining_steps"] == 0
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert {line["name"] for line in lines} == {"2-cloning"}
+    metrics = {name for line in lines for name in line}
+    assert {"accuracy", "component_accuracy", "pose1_rotation_accuracy"} <= metrics
+    fresh = build_network(presets.preset("gpt-nano"), seed=step_seed(0, "weights", 0)).state_dict()
+    trained = load_file(tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors")
+    images = [name for name in fresh if name.startswith("images.")]
+    assert all(not torch.equal(fresh[name], trained[name]) for name in images)
+
+
+def test_an_unknown_preset_is_wrong_usage_and_leaves_no_run_folder(data, tmp_path, capsys) -> None:
+    assert run_train(data, tmp_path / "run", "gato-nanno") != 0
+    assert "Did you mean 'gato-nano'?" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
