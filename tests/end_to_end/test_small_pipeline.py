@@ -23,7 +23,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
 
     def sizes():
         nano = presets.nano()
-        return replace(nano, objects=replace(nano.objects, crop=ConvConfig(width=4, output_width=16)))
+        return replace(nano, images=replace(nano.images, crop=ConvConfig(width=4, output_width=16)))
 
     monkeypatch.setitem(presets.PRESETS, "tiny", sizes)
     return "tiny"
