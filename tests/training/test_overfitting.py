@@ -25,7 +25,7 @@ DEMONSTRATIONS = {
     "visual_manipulation": 6,
     "manipulate_old_neighbor": 4,
 }  # the last in two steps
-MAX_STEPS = 90
+MAX_STEPS = 140
 WARMUP_STEPS = 25
 LEARNING_RATE = 1e-3
 # The classifiers start near zero. While they learn how often each bin is right, which says nothing about the
