@@ -194,3 +194,12 @@ def test_the_hub_is_not_asked_for_a_folder_that_is_here(hub, policy, tmp_path, m
     policy.save_pretrained(HUB_ID)
     load_policy(HUB_ID)
     assert not hub.asked
+
+
+def test_a_folder_named_like_a_preset_is_not_mistaken_for_it(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nano").mkdir()
+    with pytest.raises(PolicyError, match=r"'nano' is a preset.*write \./nano for the folder"):
+        load_policy("nano")
+    with pytest.raises(CheckpointError):
+        load_policy("./nano")

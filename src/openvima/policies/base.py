@@ -107,12 +107,18 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
     Raises:
         UnknownPolicyError: It is neither a name, nor a folder or file, nor like an id on the Hub.
         CheckpointError: The folder or file holds no checkpoint that can be read, or the Hub does not give it.
-        PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given.
+        PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given; or
+            a preset and a folder have that name.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
     if name_or_run == "random":
         return RandomPolicy(seed)
     if name_or_run == "untrained" or name_or_run in PRESETS:
+        if Path(name_or_run).is_dir():
+            raise PolicyError(
+                f"{name_or_run!r} is a preset, with fresh weights, and a folder here; write ./{name_or_run} "
+                "for the folder, or work elsewhere for the preset."
+            )
         require_torch(f"policy {name_or_run!r}")
         from openvima.policies.acting import NetworkPolicy
         from openvima.policies.network import build_network
