@@ -8,8 +8,9 @@ import pytest
 from frequencies import assert_uniform
 from openvima.catalog import object_spec, pool
 from openvima.errors import ConfigError
-from openvima.scene import AtPose, ObjectImage, Outcome, Placement, Pose, Problem, SceneImage
-from openvima.tasks import advance, begin, sample_episode, task_spec
+from openvima.scene import AtPose, ObjectImage, Placement, Pose, Problem, SceneImage
+from openvima.tasks import sample_episode, task_spec
+from playing import played
 
 TASK = "follow_motion"
 NUM_EPISODES = 2000
@@ -50,16 +51,6 @@ def targets(problem: Problem) -> list[Pose]:
 def point_of(pose: Pose) -> int:
     (index,) = (n for n, point in enumerate(POINTS) if pose.planar_distance(point) < 1e-9)
     return index
-
-
-def played(problem: Problem, *moves: dict[int, Pose]) -> list[Outcome]:
-    """Outcome after each step."""
-    progress, scene, outcomes = begin(problem), problem.scene, []
-    for move in moves:
-        scene = scene.with_poses(move)
-        progress, outcome = advance(problem, progress, scene)
-        outcomes.append(outcome)
-    return outcomes
 
 
 def test_walks_are_uniform(problems: list[Problem]) -> None:

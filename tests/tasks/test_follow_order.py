@@ -10,9 +10,10 @@ from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import Assets, pool
 from openvima.env import TabletopEnv
 from openvima.errors import ConfigError
-from openvima.scene import AtPose, Outcome, Placement, Pose, Problem, SceneImage
-from openvima.tasks import advance, begin, sample_episode, task_spec
+from openvima.scene import AtPose, Placement, Pose, Problem, SceneImage
+from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.follow_order import all_stackings
+from playing import played
 
 TASK = "follow_order"
 NUM_EPISODES = 2000
@@ -40,16 +41,6 @@ def frames(problem: Problem) -> list[tuple[Placement, ...]]:
 def moves(problem: Problem) -> list[dict[int, Pose]]:
     """What each step has to do."""
     return [{goal.object_id: goal.target} for goal in problem.goals if isinstance(goal, AtPose)]
-
-
-def played(problem: Problem, *moves: dict[int, Pose]) -> list[Outcome]:
-    """Outcome after each step."""
-    progress, scene, outcomes = begin(problem), problem.scene, []
-    for move in moves:
-        scene = scene.with_poses(move)
-        progress, outcome = advance(problem, progress, scene)
-        outcomes.append(outcome)
-    return outcomes
 
 
 def stacks(frame: tuple[Placement, ...], row: tuple[float, ...]) -> list[list[str]]:

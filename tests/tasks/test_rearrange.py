@@ -5,9 +5,10 @@ import pytest
 from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, pool
 from openvima.errors import ConfigError, OracleError
-from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem, SceneImage
-from openvima.tasks import Progress, advance, begin, oracle_action, sample_episode, stream, task_spec
+from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
+from openvima.tasks import advance, begin, oracle_action, sample_episode, stream, task_spec
 from openvima.tasks.table import is_in_the_way
+from playing import judged, pictured
 
 TASK = "rearrange"
 NUM_EPISODES = 2500
@@ -26,12 +27,6 @@ def distractor_of(problem: Problem) -> Placement | None:
     assert isinstance(constraint, DistractorsApart) and constraint.at_end
     ids = constraint.object_ids
     return problem.scene[ids[0]] if ids else None
-
-
-def pictured(problem: Problem) -> tuple[Placement, ...]:
-    ((name, image),) = problem.prompt.images
-    assert name == "scene" and isinstance(image, SceneImage)
-    return image.scene.placements
 
 
 @pytest.fixture(scope="module")
@@ -138,16 +133,6 @@ def test_the_picture_shows_the_objects_at_their_targets_and_no_distractor(proble
 
 def test_the_prompt_is_the_published_sentence(problems: list[Problem]) -> None:
     assert {p.prompt.text for p in problems} == {"Rearrange to this {scene}."} == {task_spec(TASK).template}
-
-
-def judged(problem: Problem, *steps: dict[int, Pose]) -> tuple[Progress, Outcome]:
-    """How the problem stands after steps that move objects to these poses and leave the others."""
-    progress, outcome, scene = begin(problem), Outcome(), problem.scene
-    for step in steps:
-        assert not outcome.is_over, outcome.reason
-        scene = scene.with_poses(step)
-        progress, outcome = advance(problem, progress, scene)
-    return progress, outcome
 
 
 def ids(problem: Problem) -> tuple[int, int]:

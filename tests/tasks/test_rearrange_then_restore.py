@@ -10,6 +10,7 @@ from openvima.catalog import Assets, pool
 from openvima.errors import ConfigError
 from openvima.scene import AtPose, Outcome, Placement, Pose, Problem, in_workspace
 from openvima.tasks import Progress, TableSampler, advance, begin, oracle_action, sample_episode, task_spec
+from playing import judged
 
 TASK = "rearrange_then_restore"
 FAR_AWAY = Pose.planar(0.9, 0.0)
@@ -21,16 +22,6 @@ def goals_of(problem: Problem) -> tuple[list[AtPose], list[AtPose]]:
     num_arranged = problem.stages[0]
     assert sum(problem.stages) == len(goals) == len(problem.goals)
     return goals[:num_arranged], goals[num_arranged:]
-
-
-def judged(problem: Problem, *steps: dict[int, Pose]) -> tuple[Progress, Outcome]:
-    """How the problem stands after steps that move objects to these poses and leave the others."""
-    progress, outcome, scene = begin(problem), Outcome(), problem.scene
-    for step in steps:
-        assert not outcome.is_over, outcome.reason
-        scene = scene.with_poses(step)
-        progress, outcome = advance(problem, progress, scene)
-    return progress, outcome
 
 
 def single(*, conflict: bool, **options: object) -> tuple[Problem, Placement, Pose, Placement]:

@@ -9,8 +9,9 @@ import pytest
 from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, pool
 from openvima.errors import ConfigError
-from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem, SceneImage
+from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
 from openvima.tasks import TableSampler, advance, begin, sample_episode, task_spec
+from playing import pictured
 
 TASK = "scene_understanding"
 NUM_EPISODES = 2000
@@ -25,12 +26,6 @@ def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     assert isinstance(constraint, DistractorsApart) and not constraint.at_end
     scene = problem.scene
     return scene[goal.object_id], scene[goal.relative_to], [scene[i] for i in constraint.object_ids]
-
-
-def pictured(problem: Problem) -> tuple[Placement, ...]:
-    ((name, image),) = problem.prompt.images
-    assert name == "scene" and isinstance(image, SceneImage)
-    return image.scene.placements
 
 
 @pytest.fixture(scope="module")

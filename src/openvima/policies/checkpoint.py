@@ -26,6 +26,7 @@ from openvima.policies.base import (
     find_checkpoint,
 )
 from openvima.policies.config import PolicyConfig
+from openvima.policies.differences import described, listed
 from openvima.policies.network import PolicyNetwork, outline_network
 from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
@@ -82,7 +83,7 @@ def write_checkpoint(
     dtype: torch.dtype = torch.float32,
 ) -> None:
     """Write the files of a checkpoint into a folder that is still being filled; see `save_checkpoint`."""
-    precision = _described(dtype)
+    precision = described(dtype)
     if precision not in _PRECISIONS:
         raise CheckpointError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
     tensors = {
@@ -211,14 +212,14 @@ def _check(
     """Compare weights with what a network takes; by default in its own precision."""
     expected = network.state_dict()
     problems = _other_size(tensors, expected)
-    problems += _listed("missing", [name for name in expected if name not in tensors])
-    problems += _listed("unexpected", [name for name in tensors if name not in expected])
+    problems += listed("missing", [name for name in expected if name not in tensors], most=_SHOWN)
+    problems += listed("unexpected", [name for name in tensors if name not in expected], most=_SHOWN)
     differing = []
     for name, wanted in expected.items():
         want = (dtype or wanted.dtype, tuple(wanted.shape))
         if name in tensors and (have := (tensors[name].dtype, tuple(tensors[name].shape))) != want:
-            differing.append(f"{name} is {_described(*have)} instead of {_described(*want)}")
-    problems += _listed("wrong", differing)
+            differing.append(f"{name} is {described(*have)} instead of {described(*want)}")
+    problems += listed("wrong", differing, most=_SHOWN)
     if problems:
         raise CheckpointError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
@@ -267,15 +268,3 @@ def _refuse_to_delete(folder: Path) -> None:
             f"{folder} holds other files than a checkpoint ({', '.join(sorted(others)[:_SHOWN])}), which "
             "would be lost; give another folder."
         )
-
-
-def _listed(what: str, names: list[str]) -> list[str]:
-    if not names:
-        return []
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return [f"{what}: {', '.join(names[:_SHOWN])}{more}"]
-
-
-def _described(dtype: torch.dtype, shape: tuple[int, ...] | None = None) -> str:
-    name = str(dtype).removeprefix("torch.")
-    return name if shape is None else f"{name} {shape}"

@@ -5,7 +5,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from openvima.errors import UnknownPolicyError, unknown_name
-from openvima.policies.tokenizer import vocabulary_size
 
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
@@ -18,20 +17,18 @@ SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 def nano() -> "PolicyConfig":
     """2.2 M parameters: small enough to train on two cores within minutes. It points."""
     from openvima.policies.config import PolicyConfig
+    from openvima.policies.families.common import size
     from openvima.policies.heads.pointing import PointingConfig
     from openvima.policies.layers.conv_encoder import ConvConfig
     from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-    from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-    from openvima.policies.layers.text_encoder import TextEncoderConfig
     from openvima.policies.layers.trunk import DecoderConfig
 
     crop = ConvConfig(width=32, output_width=128)
-    text = TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256)
     return PolicyConfig(
         images=ObjectEncoderConfig(
             crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
         ),
-        prompt=PromptEncoderConfig(text, image_width=128, vocabulary_size=vocabulary_size()),
+        prompt=size("nano").prompt,
         trunk=DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4),
         head=PointingConfig(),
         action_width=64,

@@ -3,9 +3,13 @@
 from dataclasses import dataclass
 
 from openvima.errors import UnknownPolicyError, unknown_name
+from openvima.policies.config import PolicyConfig
 from openvima.policies.heads.bins import BinsConfig
+from openvima.policies.layers.frame_encoder import FrameEncoderConfig
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
 from openvima.policies.layers.text_encoder import TextEncoderConfig
+from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig
 from openvima.policies.tokenizer import vocabulary_size
 
 T5_VOCABULARY_SIZE = 32128
@@ -45,10 +49,24 @@ class Size:
     dropout: float = 0.1
     initial_std: float = 0.02
 
-    @property
-    def head(self) -> BinsConfig:
-        """The action head, which all members share."""
-        return BinsConfig(self.hidden_width)
+    def decoder(self) -> DecoderConfig:
+        """Return the trunk with cross-attention to the prompt."""
+        heads = self.num_heads
+        return DecoderConfig(self.width, self.num_layers, heads, heads, self.dropout, self.initial_std)
+
+    def prefix(self) -> PrefixConfig:
+        """Return the trunk that has the prompt before the history.
+
+        It has twice the layers, since a cross block of the decoder counts as one.
+        """
+        return PrefixConfig(self.width, 2 * self.num_layers, self.num_heads, self.dropout, self.initial_std)
+
+    def member(
+        self, images: ObjectEncoderConfig | FrameEncoderConfig, trunk: DecoderConfig | PrefixConfig
+    ) -> PolicyConfig:
+        """Complete what a member has of its own with what all share."""
+        head = BinsConfig(self.hidden_width)
+        return PolicyConfig(images, self.prompt, trunk, head, self.action_width)
 
 
 def _published(width: int, num_layers: int) -> Size:

@@ -11,7 +11,6 @@ from openvima.policies.families.common import Size
 from openvima.policies.families.frames import frame_transformer
 from openvima.policies.layers.frame_encoder import FrameEncoderConfig
 from openvima.policies.layers.resampler import ResamplerConfig
-from openvima.policies.layers.trunk import DecoderConfig
 
 
 def flamingo(size: Size) -> PolicyConfig:
@@ -23,12 +22,4 @@ def flamingo(size: Size) -> PolicyConfig:
         dropout=size.dropout,
         initial_std=size.initial_std,
     )
-    return PolicyConfig(
-        images=FrameEncoderConfig(frame, "resampled", resampler),
-        prompt=size.prompt,
-        trunk=DecoderConfig(
-            size.width, size.num_layers, size.num_heads, size.num_heads, size.dropout, size.initial_std
-        ),
-        head=size.head,
-        action_width=size.action_width,
-    )
+    return size.member(FrameEncoderConfig(frame, "resampled", resampler), size.decoder())

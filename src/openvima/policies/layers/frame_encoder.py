@@ -11,10 +11,9 @@ import torch
 from torch import nn
 
 from openvima.errors import ConfigError
+from openvima.policies.layers.object_encoder import NUM_VIEWS
 from openvima.policies.layers.resampler import Resampler, ResamplerConfig
 from openvima.policies.layers.vit import VisionTransformer, VitConfig
-
-NUM_VIEWS = 2
 
 
 @dataclass(frozen=True, slots=True)

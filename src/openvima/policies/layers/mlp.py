@@ -1,4 +1,4 @@
-"""Stacks of linear layers with ReLU between them."""
+"""Stacks of linear layers with ReLU between them, and how layers start."""
 
 from collections.abc import Sequence
 
@@ -22,6 +22,15 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU()]
     return nn.Sequential(*layers[:-1])
+
+
+def normal_weights(module: nn.Module, std: float) -> None:
+    """Draw all matrices and tables of a module anew, normal with this standard deviation; biases become 0."""
+    for part in module.modules():
+        if isinstance(part, nn.Linear | nn.Embedding):
+            nn.init.normal_(part.weight, std=std)
+        if isinstance(part, nn.Linear) and part.bias is not None:
+            nn.init.zeros_(part.bias)
 
 
 def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:

@@ -11,6 +11,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from openvima.policies.layers.mlp import normal_weights
+
 
 @dataclass(frozen=True, slots=True)
 class ResamplerConfig:
@@ -42,10 +44,7 @@ class Resampler(nn.Module):
         self.latents = nn.Parameter(torch.randn(config.num_latents, width) * config.initial_std)
         self.cross_layer = ResamplerLayer(width, config, looks_elsewhere=True)
         self.self_layers = nn.ModuleList(ResamplerLayer(width, config) for _ in range(config.num_layers))
-        for module in self.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.normal_(module.weight, std=config.initial_std)
-                nn.init.zeros_(module.bias)
+        normal_weights(self, config.initial_std)
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
         """Sum up patches, shape (..., P, D), in latents, shape (..., M, D)."""

@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from openvima.errors import ConfigError, PolicyError
 from openvima.policies.layers.linear import Linear
+from openvima.policies.layers.mlp import normal_weights
 
 MAX_PLACES = 512  # of the history; with a prefix, of prompt and history together
 MAX_PROMPT_PLACES = 256
@@ -207,13 +208,6 @@ class Trunk(nn.Module):
             mask_BP,
         )
 
-    def _init_weights(self, std: float) -> None:
-        for module in self.modules():
-            if isinstance(module, nn.Linear | nn.Embedding):
-                nn.init.normal_(module.weight, std=std)
-            if isinstance(module, nn.Linear) and module.bias is not None:
-                nn.init.zeros_(module.bias)
-
 
 class Decoder(Trunk):
     """Alternates `CrossBlock` and `SelfBlock` over the history; the prompt stays as it is."""
@@ -222,7 +216,7 @@ class Decoder(Trunk):
         super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
         self.prompt_positions = nn.Embedding(MAX_PROMPT_PLACES, config.width)
         self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
-        self._init_weights(config.initial_std)
+        normal_weights(self, config.initial_std)
 
     def begin(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> TrunkState:
         """Compute the keys and values of the prompt for every cross block."""
@@ -246,7 +240,7 @@ class PrefixTrunk(Trunk):
     def __init__(self, config: PrefixConfig) -> None:
         super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
         self.separator = nn.Parameter(torch.zeros(config.width))
-        self._init_weights(config.initial_std)
+        normal_weights(self, config.initial_std)
 
     def begin(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> TrunkState:
         """Run prompt and separator through the blocks."""

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from openvima.errors import CheckpointError
+from openvima.policies.differences import described, listed
 from openvima.policies.network import PolicyNetwork, outline_network
 from openvima.policies.published.config import config_from_published
 from openvima.policies.published.names import from_published, is_dead, to_published, without_prefix
@@ -93,7 +94,7 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
         not isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
     ):
         keys = list(map(str, values)) if isinstance(values, Mapping) else []
-        found = _listed("the keys", keys) or [f"a {type(values).__name__}"]
+        found = listed("the keys", keys, most=_SHOWN) or [f"a {type(values).__name__}"]
         raise CheckpointError(
             f"{file} holds {found[0]}; a published checkpoint holds the mappings state_dict and cfg. "
             "Weights alone do not tell the number of heads."
@@ -110,25 +111,15 @@ def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> N
     expected = to_published(network)
     given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_dead(name)}
     wrong = [
-        f"{name} is {_described(given[name])} instead of {_described(wanted)}"
+        f"{name} is {described(given[name].dtype, given[name].shape)} instead of "
+        f"{described(wanted.dtype, wanted.shape)}"
         for name, wanted in expected.items()
         if name in given and (given[name].shape != wanted.shape or not given[name].is_floating_point())
     ]
     problems = [
-        *_listed("missing", [name for name in expected if name not in given]),
-        *_listed("unexpected", [name for name in given if name not in expected]),
-        *_listed("wrong", wrong),
+        *listed("missing", [name for name in expected if name not in given], most=_SHOWN),
+        *listed("unexpected", [name for name in given if name not in expected], most=_SHOWN),
+        *listed("wrong", wrong, most=_SHOWN),
     ]
     if problems:
         raise CheckpointError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")
-
-
-def _listed(what: str, names: list[str]) -> list[str]:
-    if not names:
-        return []
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return [f"{what}: {', '.join(names[:_SHOWN])}{more}"]
-
-
-def _described(tensor: torch.Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
