@@ -11,8 +11,8 @@ import re
 import numpy as np
 
 from openvima.evaluation import score
+from openvima.perception.objects import observe, observe_prompt_image
 from openvima.policies import RandomPolicy
-from openvima.policies.perception import observe, observe_prompt_image
 from openvima.scene import Action
 
 COLOURS = 6  # levels of red, green and blue that are told apart

@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 import openvima
+from openvima.perception.objects import ObjectViews, observe, whole_frames
 from openvima.policies import preset
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
 from openvima.policies.heads.bins import NUM_BINS, encode_bins
 from openvima.policies.inputs import WORD, Reader
 from openvima.policies.layers.trunk import PrefixConfig
-from openvima.policies.perception import ObjectViews, observe, whole_frames
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.scene import PromptImage, RenderedPrompt
 

@@ -20,6 +20,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from openvima.perception.objects import ObjectViews, see_nothing
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
 from openvima.policies.heads.bins import BinsHead, decode_bins
 from openvima.policies.inputs import (
@@ -33,7 +34,6 @@ from openvima.policies.inputs import (
     batch_prompts,
 )
 from openvima.policies.network import Memory, PolicyNetwork, outline_network
-from openvima.policies.perception import ObjectViews, see_nothing
 from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS

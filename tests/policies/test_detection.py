@@ -7,8 +7,7 @@ import pytest
 
 from openvima.env import TabletopEnv
 from openvima.errors import DetectionError, PolicyError, ShapeError
-from openvima.policies.detection import DetectedObjects, Detections
-from openvima.policies.perception import (
+from openvima.perception.objects import (
     FRONT,
     GROUND_TRUTH,
     TOP,
@@ -17,6 +16,7 @@ from openvima.policies.perception import (
     observe,
     observe_prompt_image,
 )
+from openvima.policies.detection import DetectedObjects, Detections
 from openvima.scene import ObjectRecord, PromptImage
 from openvima.tasks import list_tasks
 

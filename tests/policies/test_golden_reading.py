@@ -22,9 +22,9 @@ from tests.policies.golden import (
     tiny_network,
 )
 
+from openvima.perception.objects import ObjectViews
 from openvima.policies.inputs import PromptInput, StepInput
 from openvima.policies.network import PolicyNetwork
-from openvima.policies.perception import ObjectViews
 
 NAMES = ("vima_tiny", "gato_tiny", "flamingo_tiny", "gpt_tiny")
 

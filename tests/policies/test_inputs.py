@@ -8,12 +8,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
+from openvima.perception.objects import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
-from openvima.policies.perception import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
 VIEWS = ("front", "top")

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("torch")
 
+from openvima.perception.objects import ObjectViews, see_nothing
 from openvima.policies.inputs import WORD, Reader
-from openvima.policies.perception import ObjectViews, see_nothing
 from openvima.scene import PromptImage, RenderedPrompt
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from openvima.errors import PolicyError
+from openvima.perception.objects import ObjectFinder
 from openvima.policies.base import Policy, prompt_number
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
 from openvima.policies.inputs import (
@@ -21,7 +22,6 @@ from openvima.policies.inputs import (
 )
 from openvima.policies.layers.trunk import TrunkState
 from openvima.policies.network import Memory, PolicyNetwork
-from openvima.policies.perception import ObjectFinder
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from openvima.errors import DetectionError, PolicyError, ShapeError
-from openvima.policies.perception import (
+from openvima.perception.objects import (
     FRONT,
     MIN_PIXELS,
     TOP,

@@ -16,11 +16,8 @@ import numpy as np
 import torch
 
 from openvima.errors import PolicyError, PromptError, ShapeError
-from openvima.policies.kernels import CROP_SIZE
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.trunk import MAX_PLACES
-from openvima.policies.perception import (
+from openvima.perception.kernels import CROP_SIZE
+from openvima.perception.objects import (
     GROUND_TRUTH,
     PUBLISHED_ORDER,
     ObjectFinder,
@@ -29,6 +26,9 @@ from openvima.policies.perception import (
     part_of,
     whole_frames,
 )
+from openvima.policies.layers.frame_encoder import FrameEncoderConfig
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.layers.trunk import MAX_PLACES
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt

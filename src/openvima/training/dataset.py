@@ -12,6 +12,7 @@ import torch
 
 from openvima.data.records import Demonstration
 from openvima.errors import DatasetError
+from openvima.perception.objects import ObjectViews, crop_box
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, ActionTargets
 from openvima.policies.inputs import (
     HistoryBatch,
@@ -23,7 +24,6 @@ from openvima.policies.inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.policies.perception import ObjectViews, crop_box
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import Action
 from openvima.training.schedule import step_seed

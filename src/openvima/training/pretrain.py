@@ -14,8 +14,8 @@ from torch.nn import functional as F
 
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
+from openvima.perception.objects import observe_prompt_image, see_objects
 from openvima.policies.layers.object_encoder import ObjectEncoder
-from openvima.policies.perception import observe_prompt_image, see_objects
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from openvima.errors import PolicyError, ShapeError
-from openvima.policies.kernels import (
+from openvima.perception.kernels import (
     CROP_SIZE,
     halve_frame,
     most_interior_pixel,

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openvima.env import TabletopEnv
 from openvima.errors import PolicyError, ShapeError
-from openvima.policies.perception import (
+from openvima.perception.objects import (
     FRONT,
     TOP,
     GroundTruth,
@@ -187,8 +188,10 @@ def test_prompt_images_keep_the_order_of_their_records_and_drop_what_is_hidden()
     assert observe_prompt_image(image).ids.tolist() == [3, 2]
 
 
-def test_real_observations_have_boxes_of_exactly_the_segmented_pixels(starts) -> None:
-    for env, observation in starts:
+def test_real_observations_have_boxes_of_exactly_the_segmented_pixels() -> None:
+    for seed, task in enumerate(("visual_manipulation", "rotate", "sweep_without_exceeding")):
+        env = TabletopEnv(task)
+        observation, _ = env.reset(seed=seed)
         objects = observe(observation)
         assert set(objects.ids) <= {p.id for p in env.scene.placements}
         for slot, object_id in enumerate(objects.ids):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.policies.perception import ObjectViews, see_objects
+from openvima.perception.objects import ObjectViews, see_objects
 
 GOLDEN = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model" / "preprocess.npz"
 pytestmark = pytest.mark.skipif(not GOLDEN.is_file(), reason=f"no golden data at {GOLDEN}")
