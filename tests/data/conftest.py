@@ -58,6 +58,7 @@ def _made_up(seed: int = 0, *, num_steps: int = 2, num_images: int = 2) -> Demon
         actions=tuple(Action.planar((0.3, 0.1), (0.6, -0.2), 0.1 * (k + 1)) for k in range(num_steps)),
         pick_ids=tuple(range(5, 5 + num_steps)),
         place_ids=(-1,) * num_steps,
+        objects=tuple(ObjectRecord(p.id, p.object, p.texture) for p in first.placements),
         joint_paths=tuple(rng.random((length, 6), dtype=np.float32) for length in range(num_steps)),
         scenes=tuple(scenes),
         outcome=Outcome(success=True, reason="all goals are met"),

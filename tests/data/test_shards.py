@@ -75,7 +75,7 @@ def test_columns_of_all_rows_are_read_without_the_images(
 ) -> None:
     with ShardWriter(tmp_path / "a.arrow", info) as writer:
         writer.write(made_up(3), [Skipped(2, "failed", "object 5 left the workspace")])
-    columns = Shard(tmp_path / "a.arrow").columns(["seed", "skipped"])
+    columns = Shard(tmp_path / "a.arrow").table(["seed", "skipped"]).to_pylist()
     entry = {"seed": 2, "kind": "failed", "reason": "object 5 left the workspace"}
     assert columns == [{"seed": 3, "skipped": [entry]}]
 

@@ -14,7 +14,7 @@ VERBS = {
     "tasks": "list the tasks: prompt, tool, levels, steps",
     "demo": "film the oracle or a policy at work on one task",
     "generate": "write demonstrations with the oracle",
-    "data": "look into a folder of demonstrations",
+    "data": "look into demonstrations, check, convert, divide or export them",
     "assets": "show all objects and textures, or import those of the original benchmark",
     "policies": "list the named networks and their sizes, or convert published files",
     "train": "train a policy on demonstrations",

@@ -1,6 +1,7 @@
 """Demonstrations to record batches and back."""
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -9,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.data.records import Demonstration
-from openvima.data.schema import COLUMNS, IMAGE_SHAPE, JOINTS, POSE, RGB, SCHEMA_VERSION, SEGM, VIEWS
-from openvima.errors import ShardError
+from openvima.data.schema import CODECS, COLUMNS, IMAGE_SHAPE, JOINTS, POSE, RGB, SCHEMA_VERSION, SEGM, VIEWS
+from openvima.errors import ShardError, unknown_name
 from openvima.scene import (
     ACTION_SHAPES,
     Action,
@@ -53,12 +54,17 @@ class ShardInfo:
         level: "train" or "L1" to "L4".
         domain: Domain of the seeds.
         number: Which shard of the task, from 0.
-        shard_size: Episodes in a full shard.
+        shard_size: Episodes in a full shard; 0 where shards grow with their number.
         first_seed: First seed of the whole data set.
         assets: Name of the asset pack.
         versions: Package name to version.
         compat: Whether the original benchmark was followed also where it is odd.
         difficulty: "easy", "medium" or "hard".
+        compression: Codec of the buffers, "lz4" or "zstd".
+        images: Whether images are stored; without, they are drawn anew on reading.
+
+    Raises:
+        ShardError: There is no such codec.
     """
 
     task: str
@@ -71,6 +77,12 @@ class ShardInfo:
     versions: dict[str, str]
     compat: bool = False
     difficulty: str = "easy"
+    compression: str = "lz4"
+    images: bool = True
+
+    def __post_init__(self) -> None:
+        if self.compression not in CODECS:
+            raise ShardError(unknown_name("compression", self.compression, CODECS))
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
@@ -83,23 +95,29 @@ class ShardInfo:
         """Read the entry of a file's schema.
 
         Raises:
-            ShardError: There is none, or it is of another version.
+            ShardError: There is none, it is damaged, or of another version.
         """
-        fields = json.loads((metadata or {}).get(_METADATA_KEY, b"{}"))
-        written_as = fields.pop("schema", None)
-        if written_as is None:
-            raise ShardError("it is an Arrow file, but holds no demonstrations of this package.")
-        if written_as != SCHEMA_VERSION:
-            raise ShardError(f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}.")
-        return ShardInfo(**fields)
+        try:
+            fields = json.loads((metadata or {}).get(_METADATA_KEY, b"{}"))
+            written_as = fields.pop("schema", None)
+            if written_as is None:
+                raise ShardError("it is an Arrow file, but holds no demonstrations of this package.")
+            if written_as != SCHEMA_VERSION:
+                raise ShardError(f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}.")
+            return ShardInfo(**fields)
+        except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, TypeError) as error:
+            raise ShardError(f"what it says of itself is damaged ({error}).") from None
 
 
-def encode(demo: Demonstration, skipped: Sequence[Skipped] = ()) -> pa.RecordBatch:
+def encode(
+    demo: Demonstration, skipped: Sequence[Skipped] = (), *, with_images: bool = True
+) -> pa.RecordBatch:
     """Make one row of a demonstration.
 
     Args:
         demo: The demonstration.
         skipped: Seeds tried just before it in vain.
+        with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
 
     Returns:
         A record batch of one row with the columns of `schema.COLUMNS`.
@@ -119,7 +137,7 @@ def encode(demo: Demonstration, skipped: Sequence[Skipped] = ()) -> pa.RecordBat
         "failure": demo.outcome.failure,
         "reason": demo.outcome.reason,
         "end_effector": demo.end_effector,
-        "objects": [_object(placement) for placement in demo.scenes[0].placements],
+        "objects": _objects(demo),
         "poses": _rows(POSE, [_pose_row(p.pose) for scene in demo.scenes for p in scene.placements]),
         **{key: [getattr(action, key) for action in demo.actions] for key in ACTION_SHAPES},
         "pick_ids": list(demo.pick_ids),
@@ -128,11 +146,12 @@ def encode(demo: Demonstration, skipped: Sequence[Skipped] = ()) -> pa.RecordBat
         "prompt": demo.prompt.text,
         "prompt_images": [_prompt_image(image) for image in images],
     }
+    drawn, seen = (images, slice(None)) if with_images else ([], slice(0))
     for view in VIEWS:
-        values[f"prompt_rgb_{view}"] = _rows(RGB, [np.moveaxis(image.rgb[view], 0, -1) for image in images])
-        values[f"prompt_segm_{view}"] = _rows(SEGM, [image.segm[view] for image in images])
-        values[f"rgb_{view}"] = _rows(RGB, np.moveaxis(demo.rgb[view], 1, -1))
-        values[f"segm_{view}"] = _rows(SEGM, demo.segm[view])
+        values[f"prompt_rgb_{view}"] = _rows(RGB, [np.moveaxis(image.rgb[view], 0, -1) for image in drawn])
+        values[f"prompt_segm_{view}"] = _rows(SEGM, [image.segm[view] for image in drawn])
+        values[f"rgb_{view}"] = _rows(RGB, np.moveaxis(demo.rgb[view][seen], 1, -1))
+        values[f"segm_{view}"] = _rows(SEGM, demo.segm[view][seen])
     return pa.record_batch([_column(field, values[field.name]) for field in COLUMNS], schema=COLUMNS)
 
 
@@ -164,6 +183,7 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
         pick_ids=tuple(row["pick_ids"].as_py()),
         place_ids=tuple(row["place_ids"].as_py()),
         joint_paths=tuple(_array(path.values, (-1, 6)) for path in row["joint_paths"]),
+        objects=_decode_records(batch),
         scenes=_decode_scenes(batch),
         outcome=Outcome(row["success"].as_py(), row["failure"].as_py(), row["reason"].as_py()),
         assets=info.assets,
@@ -200,15 +220,18 @@ def _list_type(dtype: pa.DataType) -> pa.ListType:
     return pa.list_(pa.field("item", dtype, nullable=False))
 
 
-def _object(placement: Placement) -> dict[str, object]:
-    return {
-        "id": placement.id,
-        "object": placement.object,
-        "texture": placement.texture,
-        "size": placement.size,
-        "scale": placement.scale,
-        "fixed": placement.fixed,
-    }
+def _objects(demo: Demonstration) -> list[dict[str, object]]:
+    if not demo.scenes:
+        unknown = {"size": (math.nan,) * 3, "scale": (math.nan,) * 3, "fixed": False}
+        return [{**_record(record), **unknown} for record in demo.objects]
+    return [
+        {**_record(record), "size": placement.size, "scale": placement.scale, "fixed": placement.fixed}
+        for record, placement in zip(demo.objects, demo.scenes[0].placements, strict=True)
+    ]
+
+
+def _record(record: ObjectRecord) -> dict[str, object]:
+    return {"id": record.object_id, "object": record.object, "texture": record.texture}
 
 
 def _pose_row(pose: Pose) -> tuple[float, ...]:
@@ -216,8 +239,7 @@ def _pose_row(pose: Pose) -> tuple[float, ...]:
 
 
 def _prompt_image(image: PromptImage) -> dict[str, object]:
-    records = [{"id": o.object_id, "object": o.object, "texture": o.texture} for o in image.objects]
-    return {"name": image.name, "kind": image.kind, "objects": records}
+    return {"name": image.name, "kind": image.kind, "objects": [_record(o) for o in image.objects]}
 
 
 def _array(items: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
@@ -251,6 +273,11 @@ def _decode_actions(batch: pa.RecordBatch) -> tuple[Action, ...]:
     return tuple(
         Action(**{key: tuple(values[step]) for key, values in columns.items()}) for step in range(num_steps)
     )
+
+
+def _decode_records(batch: pa.RecordBatch) -> tuple[ObjectRecord, ...]:
+    entries = batch.column("objects")[0].as_py()
+    return tuple(ObjectRecord(entry["id"], entry["object"], entry["texture"]) for entry in entries)
 
 
 def _decode_scenes(batch: pa.RecordBatch) -> tuple[Scene, ...]:

@@ -7,15 +7,13 @@ from pathlib import Path
 
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo, SkipKind, Skipped
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, index_bytes, manifest_bytes
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.reader import Shard
 from openvima.data.records import Demonstration, package_versions, rollout_oracle
-from openvima.data.schema import INDEX_COLUMNS
 from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.env import TabletopEnv
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
-from openvima.files import write_whole
 from openvima.processes import in_processes
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -238,10 +236,6 @@ def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
 
 def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
     """Write index and manifest of a folder whose shards are all there."""
-    rows = []
-    for block in blocks:
-        for row, columns in enumerate(Shard(block.path).columns(INDEX_COLUMNS)):
-            rows.append({**columns, "shard": block.path.name, "row": row})
     settings = {
         "tasks": list(config.resolved_tasks()),
         "level": config.level,
@@ -253,9 +247,13 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         "compat": config.setup.compat,
         "difficulty": config.setup.difficulty,
     }
-    write_whole(config.out / INDEX_NAME, index_bytes(rows))
-    manifest = manifest_bytes(rows, config=settings, versions=blocks[0].info.versions)
-    write_whole(config.out / MANIFEST_NAME, manifest)
+    finish_folder(
+        config.out,
+        [block.path for block in blocks],
+        command="openvima generate",
+        config=settings,
+        versions=blocks[0].info.versions,
+    )
 
 
 @lru_cache(maxsize=4)

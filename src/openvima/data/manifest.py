@@ -1,16 +1,20 @@
-"""What lies beside the shards: the index of episodes, and the manifest with counts and versions."""
+"""What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin."""
 
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima.data.schema import SCHEMA_VERSION
+from openvima.files import write_whole
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
@@ -29,64 +33,130 @@ INDEX_SCHEMA = pa.schema(
         pa.field("content_hash", pa.string(), nullable=False),
     ]
 )
+# What the index and the counts need of each shard.
+_COLUMNS = [name for name in INDEX_SCHEMA.names if name not in ("shard", "row")] + ["redraws", "skipped"]
 
-Row = Mapping[str, Any]  # Any: one column, one type
+
+@dataclass(slots=True)
+class _TaskCounts:
+    """Episodes kept of a task, seeds tried for them, and what became of the others."""
+
+    episodes: int = 0
+    steps: int = 0
+    redraws: int = 0
+    skipped: Counter = field(default_factory=Counter)
+
+    def record(self) -> dict[str, object]:
+        num_tried = self.episodes + self.skipped.total()
+        return {
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "seeds_tried": num_tried,
+            "success_rate": round(self.episodes / num_tried, 6),
+            "redraws": self.redraws,
+            "skipped": dict(sorted(self.skipped.items())),
+        }
 
 
-def index_bytes(rows: Sequence[Row]) -> bytes:
-    """Compose `index.parquet`.
+def finish_folder(
+    folder: Path,
+    shards: Sequence[Path],
+    *,
+    command: str,
+    config: Mapping[str, Any],  # Any: JSON
+    versions: Mapping[str, str],
+    licence: str = LICENCE,
+    report: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the index and the manifest of a folder whose shards are all there.
 
     Args:
-        rows: One an episode, with at least the columns of `INDEX_SCHEMA`, in the order of the data set.
-    """
-    entries = [{name: row[name] for name in INDEX_SCHEMA.names} for row in rows]
-    sink = BytesIO()
-    pq.write_table(pa.Table.from_pylist(entries, schema=INDEX_SCHEMA), sink, compression="zstd")
-    return sink.getvalue()
-
-
-def manifest_bytes(rows: Sequence[Row], *, config: Mapping[str, Any], versions: Mapping[str, str]) -> bytes:
-    """Compose `dataset.json`.
-
-    Args:
-        rows: One an episode, with the columns of the index, "redraws" and "skipped".
-        config: The settings that decide the content.
+        folder: The folder.
+        shards: All its shards, in the order of the data set.
+        command: What made the folder, such as "openvima generate".
+        config: The settings that decide the content; nothing that depends on time or machine.
         versions: Package name to version.
+        licence: Of the demonstrations.
+        report: Called with shards done and shards in all.
+
+    Raises:
+        ShardError: A shard is damaged.
     """
+    parts, entries, tasks = [], {}, {}
+    for number, path in enumerate(shards):
+        table = _read_rows(path)
+        parts.append(_index_part(table, path.name))
+        _count(table, tasks)
+        steps = _sum(table, "steps")
+        entries[path.name] = {"episodes": table.num_rows, "steps": steps, **fingerprint(path)}
+        if report is not None:
+            report(number + 1, len(shards))
+    index = pa.concat_tables(parts) if parts else INDEX_SCHEMA.empty_table()
+    sink = BytesIO()
+    pq.write_table(index.combine_chunks(), sink, compression="zstd")
     manifest = {
         "schema": SCHEMA_VERSION,
-        "command": "openvima generate",
+        "command": command,
         "config": dict(config),
         "versions": dict(versions),
-        "licence": LICENCE,
-        "content_hash": _joint_hash(rows),
+        "licence": licence,
+        "content_hash": joint_hash(index.column("content_hash")),
         "counts": {
-            "episodes": len(rows),
-            "steps": sum(row["steps"] for row in rows),
-            "shards": len({row["shard"] for row in rows}),
+            "episodes": index.num_rows,
+            "steps": sum(entry["steps"] for entry in entries.values()),
+            "shards": len(entries),
+            "bytes": sum(entry["bytes"] for entry in entries.values()),
         },
-        "tasks": {
-            task: _task_counts([row for row in rows if row["task"] == task])
-            for task in sorted({row["task"] for row in rows})
-        },
+        "tasks": {task: tasks[task].record() for task in sorted(tasks)},
+        "index": {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()},
+        "shards": entries,
     }
-    return (json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False) + "\n").encode()
+    write_whole(folder / INDEX_NAME, sink.getvalue())
+    text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
+    write_whole(folder / MANIFEST_NAME, text + "\n")
 
 
-def _joint_hash(rows: Sequence[Row]) -> str:
-    joined = "".join(row["content_hash"] for row in rows)
-    return hashlib.sha256(joined.encode()).hexdigest()[:32]
+def fingerprint(path: Path) -> dict[str, Any]:  # Any: a number and a text
+    """Return the size and the SHA-256 of a file, as the manifest holds them: `bytes` and `sha256`."""
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"bytes": file.tell(), "sha256": digest}
 
 
-def _task_counts(rows: Sequence[Row]) -> dict[str, object]:
-    """Episodes kept, seeds tried for them, and what became of the others."""
-    skipped = Counter(entry["kind"] for row in rows for entry in row["skipped"])
-    num_tried = len(rows) + skipped.total()
-    return {
-        "episodes": len(rows),
-        "steps": sum(row["steps"] for row in rows),
-        "seeds_tried": num_tried,
-        "success_rate": round(len(rows) / num_tried, 6),
-        "redraws": sum(row["redraws"] for row in rows),
-        "skipped": dict(sorted(skipped.items())),
+def joint_hash(content_hashes: pa.ChunkedArray) -> str:
+    """Return 32 hexadecimal digits that stand for all episodes in their order."""
+    digest = hashlib.sha256()
+    for chunk in content_hashes.chunks:
+        digest.update("".join(chunk.to_pylist()).encode())
+    return digest.hexdigest()[:32]
+
+
+def _read_rows(path: Path) -> pa.Table:
+    from openvima.data.reader import Shard  # which reads manifests
+
+    return Shard(path).table(_COLUMNS)
+
+
+def _index_part(table: pa.Table, name: str) -> pa.Table:
+    columns = {
+        **{column: table.column(column) for column in table.column_names},
+        "shard": pa.array([name] * table.num_rows, pa.string()),
+        "row": pa.array(range(table.num_rows), pa.int32()),
     }
+    return pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
+
+
+def _count(table: pa.Table, tasks: dict[str, _TaskCounts]) -> None:
+    names = np.array(table.column("task").to_pylist())
+    for task in sorted(set(names.tolist())):
+        rows = table.filter(names == task)
+        counts = tasks.setdefault(task, _TaskCounts())
+        counts.episodes += rows.num_rows
+        counts.steps += _sum(rows, "steps")
+        counts.redraws += _sum(rows, "redraws")
+        for skipped in rows.column("skipped").to_pylist():
+            counts.skipped.update(entry["kind"] for entry in skipped)
+
+
+def _sum(table: pa.Table, column: str) -> int:
+    return int(table.column(column).to_numpy().sum())

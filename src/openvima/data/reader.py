@@ -47,18 +47,15 @@ class Shard:
         except (pa.ArrowInvalid, OSError) as error:
             raise ShardError(_damaged(self.path, f"record {row} of {len(self)}", error)) from None
 
-    def columns(self, names: Sequence[str]) -> list[dict[str, Any]]:  # Any: one column, one type
+    def table(self, names: Sequence[str]) -> pa.Table:
         """Read some columns of all rows, without touching the others.
 
         Args:
             names: Columns of `schema.COLUMNS`.
-
-        Returns:
-            One dictionary a row.
         """
         reader = _opened(self.path, [COLUMNS.get_field_index(name) for name in names])
         try:
-            return reader.read_all().select(list(names)).to_pylist()
+            return reader.read_all().select(list(names))
         except (pa.ArrowInvalid, OSError) as error:
             raise ShardError(_damaged(self.path, "its records", error)) from None
 
@@ -93,10 +90,12 @@ class Dataset:
                 f"{self.manifest['counts']['episodes']}; delete both; {_REPAIR}."
             )
         self.index = index if self.tasks is None else _of_tasks(index, self.tasks, self.path)
-        self._shard_names = self.index.column("shard").to_pylist()
-        self._rows = self.index.column("row").to_pylist()
+        names = self.index.column("shard").combine_chunks().dictionary_encode()
+        self._names = names.dictionary.to_pylist()
+        self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
+        self._rows = self.index.column("row").to_numpy()
         self._shards: dict[str, Shard] = {}
-        _check_shards(self.path, sorted(set(self._shard_names)))
+        _check_shards(self.path, sorted(self._names))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -104,7 +103,7 @@ class Dataset:
     def __getitem__(self, episode_index: int) -> Demonstration:
         if not -len(self) <= episode_index < len(self):
             raise IndexError(f"episode {episode_index} of {len(self)}; count from 0 to {len(self) - 1}.")
-        return self._shard(self._shard_names[episode_index])[self._rows[episode_index]]
+        return self._shard(self._names[self._name_of[episode_index]])[int(self._rows[episode_index])]
 
     def __iter__(self) -> Iterator[Demonstration]:
         return (self[episode_index] for episode_index in range(len(self)))

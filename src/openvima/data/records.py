@@ -16,6 +16,7 @@ from openvima.scene import (
     END_EFFECTORS,
     Action,
     EndEffector,
+    ObjectRecord,
     Outcome,
     RenderedPrompt,
     Scene,
@@ -45,10 +46,14 @@ class Demonstration:
         place_ids: Id of the object relative to which it is placed; -1 where it is tied
             to the table itself.
         joint_paths: Waypoints of the arm for each action, shape (W, 6), float32, radians.
-        scenes: Where all objects were, T + 1 scenes.
+        objects: All objects of the scene.
+        scenes: Where they were, T + 1 scenes.
         outcome: How the episode ended.
         assets: Name of the asset pack.
         versions: Package name to version, of all packages that decide bytes.
+
+    Demonstrations from elsewhere may lack what nobody recorded: `joint_paths` and `scenes` are then empty,
+    and `pick_ids` and `place_ids` hold `schema.UNKNOWN_ID`.
     """
 
     task: str
@@ -65,6 +70,7 @@ class Demonstration:
     pick_ids: tuple[int, ...]
     place_ids: tuple[int, ...]
     joint_paths: tuple[np.ndarray, ...]
+    objects: tuple[ObjectRecord, ...]
     scenes: tuple[Scene, ...]
     outcome: Outcome
     assets: str
@@ -135,6 +141,7 @@ def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
         pick_ids=tuple(decision.pick_id for decision in decisions),
         place_ids=tuple(decision.place_id for decision in decisions),
         joint_paths=tuple(paths),
+        objects=tuple(ObjectRecord(p.id, p.object, p.texture) for p in scenes[0].placements),
         scenes=tuple(scenes),
         outcome=env.outcome,
         assets=env.assets.name,
@@ -184,7 +191,8 @@ def _summary(demo: Demonstration) -> dict:
         ],
         "end_effector": demo.end_effector,
         "ids": [demo.pick_ids, demo.place_ids],
-        "objects": [[p.id, p.object, p.texture, p.size, p.fixed, p.scale] for p in demo.scenes[0].placements],
+        "objects": [[o.object_id, o.object, o.texture] for o in demo.objects],
+        "placements": [[p.size, p.fixed, p.scale] for scene in demo.scenes[:1] for p in scene.placements],
         "outcome": [demo.outcome.success, demo.outcome.failure, demo.outcome.reason],
         "assets": demo.assets,
     }

@@ -2,13 +2,16 @@
 
 Images are raw bytes (rows, columns, channels); Arrow compresses the buffers. Lists over steps have T + 1
 entries for what is seen (before the first step and after each) and T for what is done. Shapes that Arrow does
-not know are written beside the columns, under the key "shape".
+not know are written beside the columns, under the key "shape". Lists are empty where nothing is known: poses
+and joint paths of imported demonstrations, images where they are redrawn on reading.
 """
 
 import pyarrow as pa
 
-SCHEMA_VERSION = 1  # grows whenever a column changes its name, type or meaning
+SCHEMA_VERSION = 2  # grows whenever a column changes its name, type or meaning
 VIEWS = ("front", "top")
+CODECS = ("lz4", "zstd")
+UNKNOWN_ID = -2  # an object that nobody recorded
 IMAGE_SHAPE = (128, 256)
 _NUM_PIXELS = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
 
@@ -82,15 +85,4 @@ COLUMNS = pa.schema(
         *(_field(f"rgb_{view}", _list(RGB), _RGB_SHAPE) for view in VIEWS),
         *(_field(f"segm_{view}", _list(SEGM), _SEGM_SHAPE) for view in VIEWS),
     ]
-)
-INDEX_COLUMNS = (
-    "task",
-    "level",
-    "domain",
-    "seed",
-    "steps",
-    "redraws",
-    "content_hash",
-    "skipped",
-    "end_effector",
 )

@@ -12,7 +12,7 @@ from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
 from openvima.files import whole_file
 
-COMPRESSION_LEVEL = 3  # zstd; higher ones are much slower for a few per cent
+COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few per cent
 
 
 class ShardWriter:
@@ -28,8 +28,9 @@ class ShardWriter:
 
     def __init__(self, path: Path, info: ShardInfo) -> None:
         self.path = path
+        self._info = info
         self._schema = COLUMNS.with_metadata(info.to_metadata())
-        codec = pa.Codec("zstd", compression_level=COMPRESSION_LEVEL)
+        codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
         file = self._closing.enter_context(whole_file(path))
@@ -42,7 +43,8 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self._writer.write_batch(encode(demo, skipped).replace_schema_metadata(self._schema.metadata))
+        batch = encode(demo, skipped, with_images=self._info.images)
+        self._writer.write_batch(batch.replace_schema_metadata(self._schema.metadata))
 
     def __enter__(self) -> "ShardWriter":
         return self

@@ -1,4 +1,4 @@
-"""`openvima data`: look into a folder of demonstrations."""
+"""`openvima data info`: what a folder of demonstrations holds."""
 
 import json
 from pathlib import Path
@@ -45,6 +45,3 @@ def _overview(folder: Path, manifest: dict[str, Any]) -> str:  # Any: JSON
             f"{entry['success_rate']:>16.1%}{entry['redraws']:>9}"
         )
     return "\n".join(lines)
-
-
-COMMANDS = {"info": info}
