@@ -83,6 +83,10 @@ class DatasetError(OpenVimaError, ValueError):
     """A data folder is incomplete, of another version or does not fit the command."""
 
 
+class MemberError(OpenVimaError, ValueError):
+    """An episode of the published data set is damaged, incomplete, or holds what it must not."""
+
+
 class PromptError(OpenVimaError, ValueError):
     """A prompt whose placeholders and images do not match, or that a policy cannot read."""
 
