@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from openvima.data.checksums import Span, measure
 from openvima.data.schema import SCHEMA_VERSION
 from openvima.files import write_whole
 
@@ -31,10 +32,14 @@ INDEX_SCHEMA = pa.schema(
         pa.field("shard", pa.string(), nullable=False),
         pa.field("row", pa.int32(), nullable=False),
         pa.field("content_hash", pa.string(), nullable=False),
+        pa.field("offset", pa.int64(), nullable=False),  # of the record's first byte in its shard
+        pa.field("num_bytes", pa.int32(), nullable=False),
+        pa.field("crc32", pa.uint32(), nullable=False),  # of these bytes
     ]
 )
+_NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 # What the index and the counts need of each shard.
-_COLUMNS = [name for name in INDEX_SCHEMA.names if name not in ("shard", "row")] + ["redraws", "skipped"]
+_COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] + ["redraws", "skipped"]
 
 
 @dataclass(slots=True)
@@ -85,10 +90,11 @@ def finish_folder(
     parts, entries, tasks = [], {}, {}
     for number, path in enumerate(shards):
         table = _read_rows(path)
-        parts.append(_index_part(table, path.name))
+        frame, spans = measure(path)
+        parts.append(_index_part(table, path.name, spans))
         _count(table, tasks)
-        steps = _sum(table, "steps")
-        entries[path.name] = {"episodes": table.num_rows, "steps": steps, **fingerprint(path)}
+        counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
+        entries[path.name] = {**counts, **fingerprint(path), **frame.to_entry()}
         if report is not None:
             report(number + 1, len(shards))
     index = pa.concat_tables(parts) if parts else INDEX_SCHEMA.empty_table()
@@ -111,9 +117,16 @@ def finish_folder(
         "index": {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()},
         "shards": entries,
     }
+    manifest["checksum"] = manifest_checksum(manifest)
     write_whole(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
     write_whole(folder / MANIFEST_NAME, text + "\n")
+
+
+def manifest_checksum(manifest: Mapping[str, Any]) -> str:  # Any: JSON
+    """Return the SHA-256 of a manifest's entries but its own checksum, whatever their order and layout."""
+    entries = {key: value for key, value in manifest.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
 
 
 def fingerprint(path: Path) -> dict[str, Any]:  # Any: a number and a text
@@ -137,11 +150,14 @@ def _read_rows(path: Path) -> pa.Table:
     return Shard(path).table(_COLUMNS)
 
 
-def _index_part(table: pa.Table, name: str) -> pa.Table:
+def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
     columns = {
         **{column: table.column(column) for column in table.column_names},
         "shard": pa.array([name] * table.num_rows, pa.string()),
         "row": pa.array(range(table.num_rows), pa.int32()),
+        "offset": pa.array([span.offset for span in spans], pa.int64()),
+        "num_bytes": pa.array([span.num_bytes for span in spans], pa.int32()),
+        "crc32": pa.array([span.crc32 for span in spans], pa.uint32()),
     }
     return pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
 

@@ -1,0 +1,132 @@
+"""Checksums of the parts of a shard, so that damage is found before anything is made of its bytes.
+
+A shard is a head (magic bytes and schema), records one after the other, and a tail (the footer that says
+where they are). The index holds a CRC-32 of each record, the manifest one of head and tail together: Arrow
+then never sees a damaged byte, on which it may fail in odd ways, and a flipped pixel does not go unnoticed.
+"""
+
+import itertools
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from openvima.errors import ShardError
+
+_MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Where a record lies in its file, and what its bytes add up to.
+
+    Args:
+        offset: First byte.
+        num_bytes: Length.
+        crc32: CRC-32 of its bytes.
+    """
+
+    offset: int
+    num_bytes: int
+    crc32: int
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What lies around the records.
+
+    Args:
+        file_bytes: Size of the whole file.
+        head_bytes: Bytes before the first record.
+        tail_bytes: Bytes after the last one.
+        crc32: CRC-32 of head and tail.
+    """
+
+    file_bytes: int
+    head_bytes: int
+    tail_bytes: int
+    crc32: int
+
+    def to_entry(self) -> dict[str, int]:
+        """Return what the manifest holds of a shard's frame."""
+        return {
+            "bytes": self.file_bytes,
+            "head_bytes": self.head_bytes,
+            "tail_bytes": self.tail_bytes,
+            "frame_crc32": self.crc32,
+        }
+
+    @staticmethod
+    def from_entry(entry: Mapping[str, Any]) -> "Frame":  # Any: numbers and texts
+        """Read a shard's entry in the manifest."""
+        return Frame(entry["bytes"], entry["head_bytes"], entry["tail_bytes"], entry["frame_crc32"])
+
+
+def mapped(path: Path) -> memoryview:
+    """Map a file into memory; its bytes are read when they are touched."""
+    with pa.memory_map(str(path)) as file:  # the buffer keeps the mapping
+        return memoryview(file.read_buffer())
+
+
+def measure(path: Path) -> tuple[Frame, list[Span]]:
+    """Find the parts of a whole shard and their checksums.
+
+    Raises:
+        ShardError: It is no chain of records.
+    """
+    content = mapped(path)
+    try:
+        head, *ends = _message_ends(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise ShardError(f"{path}: {str(error).splitlines()[0]}") from None
+    spans = [
+        Span(start, end - start, zlib.crc32(content[start:end]))
+        for start, end in itertools.pairwise([head, *ends])
+    ]
+    tail = len(content) - (ends[-1] if ends else head)
+    return Frame(len(content), head, tail, _frame_crc32(content, head, tail)), spans
+
+
+def check_frame(content: memoryview, frame: Frame) -> None:
+    """Check what lies around the records.
+
+    Raises:
+        ShardError: It is not what the manifest says.
+    """
+    if len(content) != frame.file_bytes:
+        raise ShardError(f"it has {len(content):,} of {frame.file_bytes:,} bytes")
+    if _frame_crc32(content, frame.head_bytes, frame.tail_bytes) != frame.crc32:
+        raise ShardError("the checksum of its schema and footer is wrong")
+
+
+def check_span(content: memoryview, span: Span) -> None:
+    """Check the bytes of a record.
+
+    Raises:
+        ShardError: They are not what the index says.
+    """
+    if zlib.crc32(content[span.offset : span.offset + span.num_bytes]) != span.crc32:
+        raise ShardError("its checksum is wrong")
+
+
+def _frame_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
+    return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
+
+
+def _message_ends(path: Path) -> list[int]:
+    """Where the schema ends, and each record."""
+    ends = []
+    with pa.memory_map(str(path)) as file:
+        file.seek(_MAGIC_BYTES)
+        while True:
+            try:
+                pa.ipc.read_message(file)
+            except EOFError:  # the mark after the last record
+                break
+            ends.append(file.tell())
+    if not ends:
+        raise pa.ArrowInvalid("it ends before its schema")
+    return ends
