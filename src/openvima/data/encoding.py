@@ -163,10 +163,12 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
         info: What the file says about all its rows.
 
     Returns:
-        The demonstration; its images are writable copies.
+        The demonstration; its images are writable copies. Where the file stores none, its dictionaries of
+        images are empty until `redrawing.redrawn` fills them.
     """
-    rgb = {view: np.moveaxis(_images(batch, f"rgb_{view}", 3), -1, 1) for view in VIEWS}
-    segm = {view: _images(batch, f"segm_{view}") for view in VIEWS}
+    views = VIEWS if info.images else ()
+    rgb = {view: np.moveaxis(_images(batch, f"rgb_{view}", 3), -1, 1) for view in views}
+    segm = {view: _images(batch, f"segm_{view}") for view in views}
     row = {name: batch.column(name)[0] for name in batch.schema.names}
     return Demonstration(
         task=row["task"].as_py(),
@@ -175,7 +177,7 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
         seed=row["seed"].as_py(),
         num_redraws=row["redraws"].as_py(),
         max_steps=row["max_steps"].as_py(),
-        prompt=_decode_prompt(batch),
+        prompt=_decode_prompt(batch, views),
         rgb=rgb,
         segm=segm,
         end_effector=row["end_effector"].as_py(),
@@ -252,16 +254,16 @@ def _images(batch: pa.RecordBatch, column: str, num_channels: int = 0) -> np.nda
     return _array(batch.column(column)[0].values, (-1, *IMAGE_SHAPE, *channels))
 
 
-def _decode_prompt(batch: pa.RecordBatch) -> RenderedPrompt:
-    rgb = {view: np.moveaxis(_images(batch, f"prompt_rgb_{view}", 3), -1, 1) for view in VIEWS}
-    segm = {view: _images(batch, f"prompt_segm_{view}") for view in VIEWS}
+def _decode_prompt(batch: pa.RecordBatch, views: Sequence[str]) -> RenderedPrompt:
+    rgb = {view: np.moveaxis(_images(batch, f"prompt_rgb_{view}", 3), -1, 1) for view in views}
+    segm = {view: _images(batch, f"prompt_segm_{view}") for view in views}
     images = {}
     for index, entry in enumerate(batch.column("prompt_images")[0].as_py()):
         images[entry["name"]] = PromptImage(
             name=entry["name"],
             kind=entry["kind"],
-            rgb={view: rgb[view][index] for view in VIEWS},
-            segm={view: segm[view][index] for view in VIEWS},
+            rgb={view: rgb[view][index] for view in views},
+            segm={view: segm[view][index] for view in views},
             objects=tuple(ObjectRecord(o["id"], o["object"], o["texture"]) for o in entry["objects"]),
         )
     return RenderedPrompt(batch.column("prompt")[0].as_py(), images)

@@ -43,7 +43,14 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        batch = encode(demo, skipped, with_images=self._info.images)
+        self.copy(encode(demo, skipped, with_images=self._info.images))
+
+    def copy(self, batch: pa.RecordBatch) -> None:
+        """Append one episode as another shard holds it.
+
+        Args:
+            batch: The row, as `Shard.batch` gives it.
+        """
         self._writer.write_batch(batch.replace_schema_metadata(self._schema.metadata))
 
     def __enter__(self) -> "ShardWriter":
