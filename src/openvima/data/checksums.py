@@ -33,6 +33,11 @@ class Span:
     num_bytes: int
     crc32: int
 
+    def fault_in(self, content: memoryview) -> str:
+        """Say what is wrong with the record in a file's content; nothing if it is as it was."""
+        record = content[self.offset : self.offset + self.num_bytes]
+        return "" if zlib.crc32(record) == self.crc32 else "its checksum is wrong"
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -58,6 +63,13 @@ class Frame:
             "tail_bytes": self.tail_bytes,
             "frame_crc32": self.crc32,
         }
+
+    def fault_in(self, content: memoryview) -> str:
+        """Say what is wrong around the records in a file's content; nothing if all is as it was."""
+        if len(content) != self.file_bytes:
+            return f"it has {len(content):,} of {self.file_bytes:,} bytes"
+        is_same = _frame_crc32(content, self.head_bytes, self.tail_bytes) == self.crc32
+        return "" if is_same else "the checksum of its schema and footer is wrong"
 
     @staticmethod
     def from_entry(entry: Mapping[str, Any]) -> "Frame":  # Any: numbers and texts
@@ -88,28 +100,6 @@ def measure(path: Path) -> tuple[Frame, list[Span]]:
     ]
     tail = len(content) - (ends[-1] if ends else head)
     return Frame(len(content), head, tail, _frame_crc32(content, head, tail)), spans
-
-
-def check_frame(content: memoryview, frame: Frame) -> None:
-    """Check what lies around the records.
-
-    Raises:
-        ShardError: It is not what the manifest says.
-    """
-    if len(content) != frame.file_bytes:
-        raise ShardError(f"it has {len(content):,} of {frame.file_bytes:,} bytes")
-    if _frame_crc32(content, frame.head_bytes, frame.tail_bytes) != frame.crc32:
-        raise ShardError("the checksum of its schema and footer is wrong")
-
-
-def check_span(content: memoryview, span: Span) -> None:
-    """Check the bytes of a record.
-
-    Raises:
-        ShardError: They are not what the index says.
-    """
-    if zlib.crc32(content[span.offset : span.offset + span.num_bytes]) != span.crc32:
-        raise ShardError("its checksum is wrong")
 
 
 def _frame_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:

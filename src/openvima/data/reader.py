@@ -1,5 +1,6 @@
 """Reading demonstrations: single shards, and whole folders by episode."""
 
+import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from io import BytesIO
@@ -9,27 +10,36 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from openvima.data.checksums import Frame, Span, mapped
 from openvima.data.encoding import ShardInfo, decode
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, manifest_checksum
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError, ShardError, unknown_name
 
-_REPAIR = "repeating its `openvima generate` command writes what is missing"
+# What Arrow raises when it is given damaged bytes.
+_ODD_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
 
 
 class Shard:
     """One file of demonstrations; rows are read on demand.
 
+    Damage that keeps Arrow from reading is an error in any case. Changed pixels and numbers are noticed where
+    checksums are given, as `Dataset` does, and by `openvima data verify`.
+
     Args:
         path: The file.
+        frame: Checksum of all that surrounds the records, as the folder's manifest holds it.
 
     Raises:
-        ShardError: It is missing, truncated, or no shard of this package.
+        ShardError: It is missing, truncated, damaged, or no shard of this package.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, frame: Frame | None = None) -> None:
         self.path = path
+        self._content = _mapped(path)
+        if frame is not None and (fault := frame.fault_in(self._content)):
+            raise ShardError(_damaged(path, "it", fault))
         self._reader = _opened(path)
         try:
             self.info = ShardInfo.from_metadata(self._reader.schema.metadata)
@@ -42,10 +52,45 @@ class Shard:
         return self._reader.num_record_batches
 
     def __getitem__(self, row: int) -> Demonstration:
+        batch = self.batch(row)
         try:
-            return decode(self._reader.get_batch(row), self.info)
-        except (pa.ArrowInvalid, OSError) as error:
-            raise ShardError(_damaged(self.path, f"record {row} of {len(self)}", error)) from None
+            demo = decode(batch, self.info)
+        except _ODD_ERRORS as error:
+            raise self._row_error(row, error) from None
+        if self.info.images:
+            return demo
+        from openvima.data.redrawing import redrawn  # with which the renderer comes
+
+        try:
+            return redrawn(demo, self.info, batch.column("content_hash")[0].as_py())
+        except ShardError as error:
+            raise ShardError(f"{self.path}, record {row}: {error}") from None
+
+    def batch(self, row: int) -> pa.RecordBatch:
+        """Read one row as it is stored.
+
+        Raises:
+            ShardError: It is damaged.
+        """
+        try:
+            batch = self._reader.get_batch(row)
+            batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
+        except _ODD_ERRORS as error:
+            raise self._row_error(row, error) from None
+        return batch
+
+    def check(self, row: int, span: Span) -> None:
+        """Compare the bytes of a row with their checksum, before anything is made of them.
+
+        Args:
+            row: The row.
+            span: Where the index says that it lies.
+
+        Raises:
+            ShardError: They are damaged.
+        """
+        if fault := span.fault_in(self._content):
+            raise self._row_error(row, fault)
 
     def table(self, names: Sequence[str]) -> pa.Table:
         """Read some columns of all rows, without touching the others.
@@ -56,8 +101,11 @@ class Shard:
         reader = _opened(self.path, [COLUMNS.get_field_index(name) for name in names])
         try:
             return reader.read_all().select(list(names))
-        except (pa.ArrowInvalid, OSError) as error:
+        except _ODD_ERRORS as error:
             raise ShardError(_damaged(self.path, "its records", error)) from None
+
+    def _row_error(self, row: int, error: Exception | str) -> ShardError:
+        return ShardError(_damaged(self.path, f"record {row} of {len(self)}", error))
 
 
 class Dataset:
@@ -83,17 +131,13 @@ class Dataset:
         self.path = Path(path)
         self.tasks = None if tasks is None else tuple(tasks)
         self.manifest = read_manifest(self.path)
-        index = _read_index(self.path)
-        if index.num_rows != self.manifest["counts"]["episodes"]:
-            raise DatasetError(
-                f"{self.path / INDEX_NAME} lists {index.num_rows} episodes, {MANIFEST_NAME} "
-                f"{self.manifest['counts']['episodes']}; delete both; {_REPAIR}."
-            )
+        index = _read_index(self.path, self.manifest)
         self.index = index if self.tasks is None else _of_tasks(index, self.tasks, self.path)
         names = self.index.column("shard").combine_chunks().dictionary_encode()
         self._names = names.dictionary.to_pylist()
         self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
         self._rows = self.index.column("row").to_numpy()
+        self._spans = [self.index.column(name).to_numpy() for name in ("offset", "num_bytes", "crc32")]
         self._shards: dict[str, Shard] = {}
         _check_shards(self.path, sorted(self._names))
 
@@ -103,17 +147,27 @@ class Dataset:
     def __getitem__(self, episode_index: int) -> Demonstration:
         if not -len(self) <= episode_index < len(self):
             raise IndexError(f"episode {episode_index} of {len(self)}; count from 0 to {len(self) - 1}.")
-        return self._shard(self._names[self._name_of[episode_index]])[int(self._rows[episode_index])]
+        shard, row = self._shard(self._names[self._name_of[episode_index]]), int(self._rows[episode_index])
+        shard.check(row, Span(*(int(numbers[episode_index]) for numbers in self._spans)))
+        return shard[row]
 
     def __iter__(self) -> Iterator[Demonstration]:
         return (self[episode_index] for episode_index in range(len(self)))
+
+    def locate(self, episode_index: int) -> tuple[str, int]:
+        """Return the shard's file name and the row in it where an episode is."""
+        return self._names[self._name_of[episode_index]], int(self._rows[episode_index])
+
+    def shard_names(self) -> list[str]:
+        """Return the file names of all shards that hold episodes of this data set."""
+        return list(self._names)
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return _reopened, (self.path, self.tasks)
 
     def _shard(self, name: str) -> Shard:
         if name not in self._shards:
-            self._shards[name] = Shard(self.path / name)
+            self._shards[name] = Shard(self.path / name, Frame.from_entry(self.manifest["shards"][name]))
         return self._shards[name]
 
 
@@ -132,11 +186,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         raise DatasetError(f"{folder} {fault} ({MANIFEST_NAME} is missing).")
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        written_as = manifest["schema"]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
-        raise DatasetError(f"{path} is damaged; {_REPAIR}.") from None
+        written_as, checksum = manifest["schema"], manifest.get("checksum")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise DatasetError(f"{path} is damaged (it is no JSON of ours). {_remedy(folder)}") from None
     if written_as != SCHEMA_VERSION:
         raise DatasetError(f"{path} has schema {written_as}; this package reads {SCHEMA_VERSION}.")
+    if checksum != manifest_checksum(manifest):
+        raise DatasetError(f"{path} is damaged or was edited (its checksum is wrong). {_remedy(folder)}")
     return manifest
 
 
@@ -144,29 +200,41 @@ def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
     return Dataset(path, tasks=tasks)
 
 
+def _mapped(path: Path) -> memoryview:
+    try:
+        return mapped(path)
+    except FileNotFoundError:
+        raise ShardError(f"there is no file {path}. {_remedy(path.parent)}") from None
+    except _ODD_ERRORS as error:
+        raise ShardError(_damaged(path, "it", error)) from None
+
+
 def _opened(path: Path, columns: list[int] | None = None) -> pa.RecordBatchFileReader:
     options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=columns)
     try:
         return pa.ipc.open_file(pa.memory_map(str(path)), options=options)
-    except FileNotFoundError:
-        raise ShardError(f"there is no file {path}; {_REPAIR}.") from None
-    except (pa.ArrowInvalid, OSError) as error:
+    except _ODD_ERRORS as error:
         raise ShardError(_damaged(path, "it", error)) from None
 
 
-def _damaged(path: Path, what: str, error: Exception) -> str:
-    reason = str(error).splitlines()[0]
-    return f"{path}: {what} cannot be read, so it is truncated or no shard ({reason}). Delete it; {_REPAIR}."
+def _damaged(path: Path, what: str, error: Exception | str) -> str:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return f"{path}: {what} is truncated, damaged or no shard ({reason}). {_remedy(path.parent)}"
 
 
-def _read_index(folder: Path) -> pa.Table:
+def _remedy(folder: Path) -> str:
+    return f"`openvima data verify {folder} --repair` makes it anew, or keeps what is whole."
+
+
+def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:  # Any: JSON
     path = folder / INDEX_NAME
     try:
-        return pq.read_table(BytesIO(path.read_bytes()), use_threads=False)
+        content = path.read_bytes()
     except FileNotFoundError:
-        raise DatasetError(f"{path} is missing; {_REPAIR}.") from None
-    except (pa.ArrowInvalid, OSError):
-        raise DatasetError(f"{path} is damaged; {_REPAIR}.") from None
+        raise DatasetError(f"{path} is missing. {_remedy(folder)}") from None
+    if hashlib.sha256(content).hexdigest() != manifest["index"]["sha256"]:
+        raise DatasetError(f"{path} is damaged (its checksum is wrong). {_remedy(folder)}")
+    return pq.read_table(BytesIO(content), use_threads=False)
 
 
 def _of_tasks(index: pa.Table, tasks: Sequence[str], folder: Path) -> pa.Table:
@@ -181,5 +249,5 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         raise DatasetError(
-            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}; {_REPAIR}."
+            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {_remedy(folder)}"
         )
