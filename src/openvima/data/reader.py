@@ -145,14 +145,16 @@ class Dataset:
         return len(self._rows)
 
     def __getitem__(self, episode_index: int) -> Demonstration:
-        if not -len(self) <= episode_index < len(self):
-            raise IndexError(f"episode {episode_index} of {len(self)}; count from 0 to {len(self) - 1}.")
-        shard, row = self._shard(self._names[self._name_of[episode_index]]), int(self._rows[episode_index])
-        shard.check(row, Span(*(int(numbers[episode_index]) for numbers in self._spans)))
+        shard, row = self._checked(episode_index)
         return shard[row]
 
     def __iter__(self) -> Iterator[Demonstration]:
         return (self[episode_index] for episode_index in range(len(self)))
+
+    def batch(self, episode_index: int) -> pa.RecordBatch:
+        """Read one episode as it is stored: a row with the columns of `schema.COLUMNS`."""
+        shard, row = self._checked(episode_index)
+        return shard.batch(row)
 
     def locate(self, episode_index: int) -> tuple[str, int]:
         """Return the shard's file name and the row in it where an episode is."""
@@ -162,13 +164,27 @@ class Dataset:
         """Return the file names of all shards that hold episodes of this data set."""
         return list(self._names)
 
-    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
-        return _reopened, (self.path, self.tasks)
+    def shard(self, name: str) -> Shard:
+        """Return an open shard.
 
-    def _shard(self, name: str) -> Shard:
+        Args:
+            name: Its file name.
+        """
         if name not in self._shards:
             self._shards[name] = Shard(self.path / name, Frame.from_entry(self.manifest["shards"][name]))
         return self._shards[name]
+
+    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+        return _reopened, (self.path, self.tasks)
+
+    def _checked(self, episode_index: int) -> tuple[Shard, int]:
+        """The shard and row of an episode whose bytes are what the index says."""
+        if not -len(self) <= episode_index < len(self):
+            raise IndexError(f"episode {episode_index} of {len(self)}; count from 0 to {len(self) - 1}.")
+        name, row = self.locate(episode_index)
+        shard = self.shard(name)
+        shard.check(row, Span(*(int(numbers[episode_index]) for numbers in self._spans)))
+        return shard, row
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
