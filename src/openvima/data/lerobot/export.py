@@ -1,0 +1,158 @@
+"""Export of demonstrations to a LeRobotDataset v3.0: Parquet, MP4 and JSON that LeRobot opens as its own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from openvima import __version__
+from openvima.data.lerobot import layout
+from openvima.data.lerobot.features import FrameLayout
+from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat, import_av
+from openvima.data.lerobot.writer import LerobotWriter, write_json
+from openvima.data.reader import Dataset, Shard
+from openvima.errors import ConfigError, DatasetError
+from openvima.files import whole_folder
+
+RATES = (1, 2, 4, 8, 16, 32, 64)
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class LerobotConfig:
+    """What to export, and where to.
+
+    Args:
+        data: Folder of demonstrations.
+        out: Folder of the export.
+        tasks: Keep the episodes of these tasks only; None keeps all.
+        fps: Frames a second, a power of two: LeRobot finds frames by float32 seconds, and only then are all
+            exact, however long a video is. A frame is a step, which has no fixed duration of its own.
+        pixels: "yuv444p" keeps colours within 2 of 255 levels; "yuv420p" is what browsers and graphics cards
+            play, at half the resolution of colours.
+        data_file_mb: Limit of the Parquet files.
+        video_file_mb: Limit of the videos.
+        force: Replace what is at `out`.
+
+    Raises:
+        ConfigError: A value is not allowed, or `out` holds `data`.
+    """
+
+    data: Path
+    out: Path
+    tasks: tuple[str, ...] | None = None
+    fps: int = 1
+    pixels: PixelFormat = "yuv444p"
+    data_file_mb: int = layout.DATA_FILE_MB
+    video_file_mb: int = layout.VIDEO_FILE_MB
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.fps not in RATES:
+            problems.append(f"fps is {self.fps}; allowed are {', '.join(map(str, RATES))}.")
+        if self.pixels not in PIXEL_FORMATS:
+            problems.append(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
+        for name in ("data_file_mb", "video_file_mb"):
+            if getattr(self, name) < 1:
+                problems.append(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.data.resolve().is_relative_to(self.out.resolve()):
+            problems.append(f"{self.out} holds the demonstrations themselves; give another folder.")
+        if problems:
+            raise ConfigError(" ".join(problems))
+
+
+def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
+    """Export demonstrations to the LeRobotDataset v3.0 format.
+
+    The folder appears whole, or not at all. The same demonstrations, settings and versions of PyAV and
+    pyarrow give the same bytes.
+
+    Args:
+        config: What and where to.
+        report: Called as `report(episodes done, episodes in all, task)`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        DatasetError: There are no such demonstrations, or the folder has content and `force` is not set.
+        ShardError: A shard is damaged.
+        MissingExtraError: PyAV is not installed.
+    """
+    import_av()  # before the work begins
+    dataset = Dataset(config.data, tasks=config.tasks)
+    if not len(dataset):
+        raise DatasetError(f"{config.data} has no episodes to export.")
+    _check_out(config)
+    with whole_folder(config.out) as folder:
+        with LerobotWriter(
+            folder,
+            survey(dataset),
+            fps=config.fps,
+            pixels=config.pixels,
+            data_file_mb=config.data_file_mb,
+            video_file_mb=config.video_file_mb,
+        ) as writer:
+            for number, demo in enumerate(dataset, 1):
+                writer.write(demo)
+                if report:
+                    report(number, len(dataset), demo.task)
+        _write_source(folder, dataset, config)
+    return config.out
+
+
+def survey(dataset: Dataset) -> FrameLayout:
+    """Find what the frames of all episodes have in common, without reading images.
+
+    Args:
+        dataset: The demonstrations.
+    """
+    num_images, has_joints = 0, True
+    for name in dataset.index.column("shard").unique().to_pylist():
+        table = Shard(dataset.path / name).table(["prompt_images", "joint_paths", "steps"])
+        num_images = max(num_images, *_lengths(table["prompt_images"].combine_chunks()))
+        has_joints = has_joints and _has_joints(table)
+    return FrameLayout(num_images, has_joints)
+
+
+def _has_joints(table: pa.Table) -> bool:
+    """Whether there are waypoints of the arm for each step."""
+    waypoints = _lengths(table["joint_paths"].combine_chunks().flatten())
+    return np.count_nonzero(waypoints) == table["steps"].to_numpy().sum()
+
+
+def _lengths(lists: pa.ListArray) -> np.ndarray:
+    return lists.value_lengths().to_numpy()
+
+
+def _check_out(config: LerobotConfig) -> None:
+    out = config.out
+    is_taken = any(out.iterdir()) if out.is_dir() else out.exists()
+    if is_taken and not config.force:
+        raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
+
+
+def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig) -> None:
+    """Write where the episodes came from, which the format has no place for."""
+    manifest = dataset.manifest
+    source = {key: manifest[key] for key in ("command", "config", "content_hash", "licence", "versions")}
+    versions = {"openvima": __version__, "av": import_av().__version__, "pyarrow": pa.__version__}
+    settings = {"tasks": config.tasks, "fps": config.fps, "pixels": config.pixels}
+    write_json(
+        folder / layout.SOURCE_PATH,
+        {
+            "command": "openvima data export-lerobot",
+            "config": settings,
+            "versions": versions,
+            "source": source,
+        },
+    )
+    index = dataset.index.select(["task", "level", "seed", "content_hash"])
+    numbers = pa.array(range(index.num_rows), pa.int64())
+    index = index.add_column(0, "episode_index", numbers)
+    pq.write_table(index, folder / layout.SOURCE_EPISODES_PATH, compression="snappy")

@@ -1,0 +1,134 @@
+"""What a frame of the export holds: one frame a step, showing what the policy saw before its action."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from openvima.data.records import Demonstration
+from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.scene import ACTION_SHAPES, END_EFFECTORS
+
+JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+ACTION_NAMES = tuple(f"{key}.{axis}" for key, length in ACTION_SHAPES.items() for axis in "xyzw"[:length])
+
+# Columns that every LeRobot data set has, after its own.
+_COUNTERS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+_HEIGHT, _WIDTH = IMAGE_SHAPE
+
+Feature = dict[str, Any]  # Any: an entry of info.json
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLayout:
+    """What all frames of an export have in common.
+
+    Args:
+        num_prompt_images: The largest number of images in a prompt.
+        has_joints: Whether the arm's joints are known throughout; without them the state is the tool alone.
+    """
+
+    num_prompt_images: int
+    has_joints: bool
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the numbers of `observation.state`."""
+        return (*(JOINT_NAMES if self.has_joints else ()), "end_effector")
+
+    @property
+    def video_keys(self) -> tuple[str, ...]:
+        """Names of the image features: the views, then those of the first prompt image, and so on."""
+        prompts = (f"prompt_{n}_{view}" for n in range(self.num_prompt_images) for view in VIEWS)
+        return tuple(f"observation.images.{name}" for name in (*VIEWS, *prompts))
+
+    def value_features(self) -> dict[str, Feature]:
+        """Return the features that are columns of the tables, in order."""
+        return {
+            "observation.state": _feature("float32", self.state_names),
+            "action": _feature("float32", ACTION_NAMES),
+            "next.reward": _feature("float32"),
+            "next.done": _feature("bool"),
+            "next.success": _feature("bool"),
+            **{name: _feature(dtype) for name, dtype in _COUNTERS.items()},
+        }
+
+    def features(self, *, fps: int, pixels: str) -> dict[str, Feature]:
+        """Return all features as `info.json` lists them.
+
+        Args:
+            fps: Frames a second.
+            pixels: Pixel format of the videos.
+        """
+        video = {
+            "dtype": "video",
+            "shape": [_HEIGHT, _WIDTH, 3],
+            "names": ["height", "width", "channels"],
+            "info": {
+                "video.height": _HEIGHT,
+                "video.width": _WIDTH,
+                "video.codec": "h264",
+                "video.pix_fmt": pixels,
+                "video.is_depth_map": False,
+                "video.fps": fps,
+                "video.channels": 3,
+                "has_audio": False,
+            },
+        }
+        return {**dict.fromkeys(self.video_keys, video), **self.value_features()}
+
+    def values(self, demo: Demonstration) -> dict[str, np.ndarray]:
+        """Return what the frames of one episode hold besides images and counters.
+
+        Args:
+            demo: The episode, T steps.
+
+        Returns:
+            Arrays of T rows.
+        """
+        is_last = np.arange(demo.num_steps) == demo.num_steps - 1
+        success = is_last & demo.outcome.success
+        return {
+            "observation.state": self._states(demo),
+            "action": np.array([_action_row(demo, step) for step in range(demo.num_steps)], np.float32),
+            "next.reward": success.astype(np.float32),
+            "next.done": is_last,
+            "next.success": success,
+        }
+
+    def pictures(self, demo: Demonstration) -> dict[str, np.ndarray]:
+        """Return the pictures of one episode.
+
+        Args:
+            demo: The episode, T steps.
+
+        Returns:
+            Video key to uint8, shape (T or 1, 3, 128, 256); one picture stands for all T frames. Black where
+            the prompt has fewer images than others.
+        """
+        shown = {f"observation.images.{view}": demo.rgb[view][: demo.num_steps] for view in VIEWS}
+        for number, image in enumerate(demo.prompt.images.values()):
+            for view in VIEWS:
+                shown[f"observation.images.prompt_{number}_{view}"] = image.rgb[view][None]
+        black = np.zeros((1, 3, _HEIGHT, _WIDTH), np.uint8)
+        return {key: shown.get(key, black) for key in self.video_keys}
+
+    def _states(self, demo: Demonstration) -> np.ndarray:
+        tool = float(END_EFFECTORS.index(demo.end_effector))
+        if not self.has_joints:
+            return np.full((demo.num_steps, 1), tool, np.float32)
+        return np.array([(*path[0], tool) for path in demo.joint_paths], np.float32)
+
+
+def _feature(dtype: str, names: tuple[str, ...] = ()) -> Feature:
+    return {"dtype": dtype, "shape": [len(names) or 1], "names": list(names) or None}
+
+
+def _action_row(demo: Demonstration, step: int) -> list[float]:
+    return [number for key in ACTION_SHAPES for number in getattr(demo.actions[step], key)]
