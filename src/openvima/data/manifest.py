@@ -43,15 +43,23 @@ _COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] +
 
 
 @dataclass(slots=True)
-class _TaskCounts:
+class TaskCounts:
     """Episodes kept of a task, seeds tried for them, and what became of the others."""
 
     episodes: int = 0
     steps: int = 0
     redraws: int = 0
-    skipped: Counter = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def add(self, other: "TaskCounts") -> None:
+        """Add those of another shard."""
+        self.episodes += other.episodes
+        self.steps += other.steps
+        self.redraws += other.redraws
+        self.skipped.update(other.skipped)
 
     def record(self) -> dict[str, object]:
+        """Return what the manifest holds of a task."""
         num_tried = self.episodes + self.skipped.total()
         return {
             "episodes": self.episodes,
@@ -61,6 +69,23 @@ class _TaskCounts:
             "redraws": self.redraws,
             "skipped": dict(sorted(self.skipped.items())),
         }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShardSummary:
+    """What index and manifest hold of a shard.
+
+    Args:
+        name: Of the file.
+        entry: Its entry in the manifest: counts, size and checksums.
+        index: Its part of the index.
+        tasks: Name to counts of each task that has episodes in it.
+    """
+
+    name: str
+    entry: dict[str, Any]  # Any: JSON
+    index: pa.Table
+    tasks: dict[str, TaskCounts]
 
 
 def finish_folder(
@@ -87,40 +112,68 @@ def finish_folder(
     Raises:
         ShardError: A shard is damaged.
     """
-    parts, entries, tasks = [], {}, {}
+    summaries = []
     for number, path in enumerate(shards):
-        table = _read_rows(path)
-        frame, spans = measure(path)
-        parts.append(_index_part(table, path.name, spans))
-        _count(table, tasks)
-        counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
-        entries[path.name] = {**counts, **fingerprint(path), **frame.to_entry()}
+        summaries.append(summarise(path))
         if report is not None:
             report(number + 1, len(shards))
-    index = pa.concat_tables(parts) if parts else INDEX_SCHEMA.empty_table()
+    origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
+    index, manifest = compose(summaries, origin)
     sink = BytesIO()
-    pq.write_table(index.combine_chunks(), sink, compression="zstd")
-    manifest = {
-        "schema": SCHEMA_VERSION,
-        "command": command,
-        "config": dict(config),
-        "versions": dict(versions),
-        "licence": licence,
-        "content_hash": joint_hash(index.column("content_hash")),
-        "counts": {
-            "episodes": index.num_rows,
-            "steps": sum(entry["steps"] for entry in entries.values()),
-            "shards": len(entries),
-            "bytes": sum(entry["bytes"] for entry in entries.values()),
-        },
-        "tasks": {task: tasks[task].record() for task in sorted(tasks)},
-        "index": {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()},
-        "shards": entries,
-    }
+    pq.write_table(index, sink, compression="zstd")
+    manifest["index"] = {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()}
     manifest["checksum"] = manifest_checksum(manifest)
     write_whole(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
     write_whole(folder / MANIFEST_NAME, text + "\n")
+
+
+def summarise(path: Path) -> ShardSummary:
+    """Read what index and manifest hold of a shard.
+
+    Raises:
+        ShardError: It is damaged.
+    """
+    from openvima.data.reader import Shard  # which reads manifests
+
+    table = Shard(path).table(_COLUMNS)
+    frame, spans = measure(path)
+    counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
+    entry = {**counts, **fingerprint(path), **frame.to_entry()}
+    return ShardSummary(path.name, entry, _index_part(table, path.name, spans), _counts(table))
+
+
+def compose(
+    summaries: Sequence[ShardSummary], origin: Mapping[str, Any]
+) -> tuple[pa.Table, dict[str, Any]]:  # Any: JSON
+    """Put index and manifest together.
+
+    Args:
+        summaries: Of all shards, in the order of the data set.
+        origin: `command`, `config`, `versions` and `licence`.
+
+    Returns:
+        The index, and the manifest without the checksums of the index and of itself.
+    """
+    index = pa.concat_tables([INDEX_SCHEMA.empty_table(), *(summary.index for summary in summaries)])
+    tasks: dict[str, TaskCounts] = {}
+    for summary in summaries:
+        for task, counts in summary.tasks.items():
+            tasks.setdefault(task, TaskCounts()).add(counts)
+    manifest = {
+        "schema": SCHEMA_VERSION,
+        **origin,
+        "content_hash": joint_hash(index.column("content_hash")),
+        "counts": {
+            "episodes": index.num_rows,
+            "steps": sum(summary.entry["steps"] for summary in summaries),
+            "shards": len(summaries),
+            "bytes": sum(summary.entry["bytes"] for summary in summaries),
+        },
+        "tasks": {task: tasks[task].record() for task in sorted(tasks)},
+        "shards": {summary.name: summary.entry for summary in summaries},
+    }
+    return index.combine_chunks(), manifest
 
 
 def manifest_checksum(manifest: Mapping[str, Any]) -> str:  # Any: JSON
@@ -144,12 +197,6 @@ def joint_hash(content_hashes: pa.ChunkedArray) -> str:
     return digest.hexdigest()[:32]
 
 
-def _read_rows(path: Path) -> pa.Table:
-    from openvima.data.reader import Shard  # which reads manifests
-
-    return Shard(path).table(_COLUMNS)
-
-
 def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
     columns = {
         **{column: table.column(column) for column in table.column_names},
@@ -162,16 +209,13 @@ def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
     return pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
 
 
-def _count(table: pa.Table, tasks: dict[str, _TaskCounts]) -> None:
-    names = np.array(table.column("task").to_pylist())
+def _counts(table: pa.Table) -> dict[str, TaskCounts]:
+    tasks, names = {}, np.array(table.column("task").to_pylist())
     for task in sorted(set(names.tolist())):
         rows = table.filter(names == task)
-        counts = tasks.setdefault(task, _TaskCounts())
-        counts.episodes += rows.num_rows
-        counts.steps += _sum(rows, "steps")
-        counts.redraws += _sum(rows, "redraws")
-        for skipped in rows.column("skipped").to_pylist():
-            counts.skipped.update(entry["kind"] for entry in skipped)
+        skipped = Counter(entry["kind"] for row in rows.column("skipped").to_pylist() for entry in row)
+        tasks[task] = TaskCounts(rows.num_rows, _sum(rows, "steps"), _sum(rows, "redraws"), skipped)
+    return tasks
 
 
 def _sum(table: pa.Table, column: str) -> int:
