@@ -75,6 +75,10 @@ class WorkerError(OpenVimaError, RuntimeError):
     """A process that worked for this one died."""
 
 
+class StorageError(OpenVimaError, OSError):
+    """A folder cannot be written to, for example because its disk is full; whole files were kept."""
+
+
 class ShardError(OpenVimaError, ValueError):
     """A file of demonstrations is damaged, truncated or of another format."""
 

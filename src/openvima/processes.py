@@ -15,15 +15,18 @@ from typing import Any, Protocol
 from openvima.errors import WorkerError
 
 POLL_S = 0.2
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
 _counters: Any = None
 
+Counts = Sequence[Sequence[int]]
+"""The numbers that each job has last told to its `count`, one row a job; zeros before it begins."""
+
 
 class Job(Protocol):
-    """Work on one item, which calls `count` with the number of things done so far."""
+    """Work on one item, which calls `count` with the number of things done so far, or several such."""
 
-    def __call__(self, item: Any, count: Callable[[int], None], /) -> Any:  # Any: as the caller likes
+    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:  # Any: as the caller likes
         """Do it."""
 
 
@@ -45,24 +48,55 @@ def in_processes(
         WorkerError: A worker was killed from outside.
         Exception: Whatever a job raised; the other jobs are stopped.
     """
-    report = report or (lambda count: None)
+    watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
+    yield from in_watched_processes(job, items, num_workers, watch=watch)
+
+
+def in_watched_processes(
+    job: Job,
+    items: Sequence[Any],
+    num_workers: int,
+    *,
+    num_counts: int = 1,
+    watch: Callable[[Counts], None] | None = None,
+) -> Iterator[tuple[Any, Any]]:
+    """Apply a job to every item, and follow each of them.
+
+    Args:
+        job: As for `in_processes`; it calls `count` with `num_counts` numbers.
+        items: As for `in_processes`.
+        num_workers: As for `in_processes`.
+        num_counts: Numbers that a job tells.
+        watch: Called now and then with the numbers of all jobs, in the order of the items.
+
+    Yields:
+        An item and its result, as they finish.
+
+    Raises:
+        WorkerError: A worker was killed from outside.
+        Exception: Whatever a job raised; the other jobs are stopped.
+    """
+    watch = watch or (lambda counts: None)
     if num_workers == 1 or len(items) <= 1:
-        yield from _one_after_the_other(job, items, report)
+        yield from _one_after_the_other(job, items, num_counts, watch)
         return
     context = multiprocessing.get_context("spawn")
-    counters = context.RawArray("q", len(items))  # one slot a job: no lock that a killed worker could keep
+    # One row a job: no lock that a killed worker could keep.
+    counters = context.RawArray("q", len(items) * num_counts)
     others = set(multiprocessing.active_children())
     with one_thread_each():
         pool = ProcessPoolExecutor(
             min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
         )
         try:
-            pending = {pool.submit(_run_one, job, item, slot): item for slot, item in enumerate(items)}
+            pending = {
+                pool.submit(_run_one, job, item, slot, num_counts): item for slot, item in enumerate(items)
+            }
             while pending:
                 done, _ = wait(pending, timeout=POLL_S, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield pending.pop(future), future.result()
-                report(sum(counters))
+                watch(_rows(counters, num_counts))
         except BrokenProcessPool:
             raise WorkerError(
                 "a worker process was killed (often for lack of memory; --workers lowers the need). "
@@ -77,26 +111,23 @@ def in_processes(
 
 
 def _one_after_the_other(
-    job: Job, items: Sequence[Any], report: Callable[[int], None]
+    job: Job, items: Sequence[Any], num_counts: int, watch: Callable[[Counts], None]
 ) -> Iterator[tuple[Any, Any]]:
-    num_before = 0
-    for item in items:
-        last = 0
+    counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
+    for slot, item in enumerate(items):
 
-        def count(done: int, before: int = num_before) -> None:
-            nonlocal last
-            last = done
-            report(before + done)
+        def count(*numbers: int, slot: int = slot) -> None:
+            counts[slot] = numbers
+            watch(counts)
 
         yield item, job(item, count)
-        num_before += last
 
 
 @contextlib.contextmanager
 def one_thread_each() -> Iterator[None]:
     """Let processes that start inside the block use one thread each; it is read before our code is."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
@@ -153,8 +184,15 @@ def _die_with_parent() -> None:
     os._exit(1)
 
 
-def _run_one(job: Job, item: Any, slot: int) -> Any:  # Any: see `Job`
-    def count(done: int) -> None:
-        _counters[slot] = done
+def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: see `Job`
+    first = slot * num_counts
+
+    def count(*numbers: int) -> None:
+        _counters[first : first + num_counts] = numbers
 
     return job(item, count)
+
+
+def _rows(counters: Any, num_counts: int) -> Counts:  # Any: see `_counters`
+    flat = counters[:]
+    return [flat[first : first + num_counts] for first in range(0, len(flat), num_counts)]

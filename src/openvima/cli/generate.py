@@ -1,9 +1,12 @@
 """`openvima generate`: write demonstrations with the oracle."""
 
+import re
 import sys
 from pathlib import Path
+from typing import Literal
 
-from openvima.cli.progress import progress_bar
+from openvima.cli.progress import generation_table
+from openvima.errors import ConfigError
 
 
 def main(
@@ -12,9 +15,16 @@ def main(
     tasks: str = "all",
     episodes: int = 100,
     level: str = "train",
-    workers: int = 1,
+    workers: int | None = None,
     seed: int = 0,
     shard_size: int | None = None,
+    shard_range: str | None = None,
+    list_shards: bool = False,
+    engine: Literal["processes", "ray"] = "processes",
+    address: str | None = None,
+    compression: Literal["lz4", "zstd"] = "lz4",
+    images: bool = True,
+    keep_failed: bool = False,
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
@@ -22,8 +32,8 @@ def main(
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
 
-    The same settings give the same bytes, whatever the number of workers; repeating a command that was
-    interrupted continues it.
+    The same settings give the same bytes, whoever does the work; repeating a command that was interrupted
+    continues it, and asking for more episodes extends what is there.
 
     Example: openvima generate --tasks rotate,visual_manipulation --episodes 1000 --workers 2 --out demos
 
@@ -32,16 +42,27 @@ def main(
         tasks: Names of tasks with commas between them, or "all".
         episodes: Successful episodes of each task.
         level: Which objects and textures may occur: train, L1, L2, L3 or L4.
-        workers: Number of processes.
+        workers: Number of processes; by default one, or all processors of the Ray cluster at --address.
         seed: First seed.
-        shard_size: Episodes in a file; by default an eighth of them, but 4 to 1000. Give it to be able
-            to ask for more episodes later.
+        shard_size: Episodes in a file; by default files grow with their number, from 4 episodes to 1000.
+        shard_range: Write only these of the shards that --list-shards numbers, as a:b without b itself;
+            for job arrays. The data set is finished by whoever finds all shards there.
+        list_shards: Print the shards, one a line: number, file, episodes. Write nothing.
+        engine: processes of this machine, or ray.
+        address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
+        compression: Codec of the files: lz4, or zstd, which is smaller and slower.
+        images: Store images; without, they are drawn anew on reading.
+        keep_failed: Keep episodes that the oracle did not solve too, in the folder's "failed".
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
         difficulty: easy, as for all published results, medium or hard.
         force: Delete the data set that is in the folder.
+
+    Returns:
+        Exit status.
     """
-    from openvima.data import GenerateConfig, generate
+    from openvima.data import GenerateConfig, generate, plan
+    from openvima.data.resuming import is_finished
     from openvima.env import Setup
 
     config = GenerateConfig(
@@ -51,12 +72,32 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        workers=workers,
         setup=Setup(assets, compat, difficulty),
+        compression=compression,
+        images=images,
+        keep_failed=keep_failed,
+        workers=workers,
+        engine=engine,
+        address=address,
+        shard_range=None if shard_range is None else _range(shard_range),
         force=force,
     )
-    with progress_bar("demonstrations") as report:
+    if list_shards:
+        for number, block in enumerate(plan(config)):
+            print(f"{number}\t{block.path.name}\t{block.episodes}")
+        return 0
+    with generation_table() as report:
         folder = generate(config, report)
-    print(f"`openvima data info {folder}` shows what is there.", file=sys.stderr)
+    if is_finished(folder):
+        print(f"`openvima data info {folder}` shows what is there.", file=sys.stderr)
+    else:
+        print(f"{folder} is not finished yet: shards of other ranges are missing.", file=sys.stderr)
     print(folder)
     return 0
+
+
+def _range(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+):(\d+)", text)
+    if found is None:
+        raise ConfigError(f"shard_range is {text!r}; it must be a:b, two numbers from 0, such as 0:10.")
+    return int(found[1]), int(found[2])

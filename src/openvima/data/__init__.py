@@ -4,23 +4,39 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from openvima.data.generation import GenerateConfig, generate
+    from openvima.data.generation import generate
+    from openvima.data.planning import GenerateConfig, plan
     from openvima.data.reader import Dataset, Shard
     from openvima.data.records import Demonstration, rollout_oracle
+    from openvima.data.tally import GenerationProgress, TaskProgress
     from openvima.data.writer import ShardWriter
 
 # Reading needs no simulation, so each name brings only what it needs.
 _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
-    "GenerateConfig": "generation",
+    "GenerateConfig": "planning",
+    "GenerationProgress": "tally",
     "Shard": "reader",
     "ShardWriter": "writer",
+    "TaskProgress": "tally",
     "generate": "generation",
+    "plan": "planning",
     "rollout_oracle": "records",
 }
 
-__all__ = ["Dataset", "Demonstration", "GenerateConfig", "Shard", "ShardWriter", "generate", "rollout_oracle"]
+__all__ = [
+    "Dataset",
+    "Demonstration",
+    "GenerateConfig",
+    "GenerationProgress",
+    "Shard",
+    "ShardWriter",
+    "TaskProgress",
+    "generate",
+    "plan",
+    "rollout_oracle",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -1,116 +1,17 @@
-"""Writing data sets: oracle demonstrations by several processes, the same bytes whatever their number."""
+"""Writing data sets: oracle demonstrations by many processes, the same bytes whatever their number."""
 
+import errno
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import replace
 from pathlib import Path
 
-from openvima.catalog.packs import load_assets
-from openvima.data.encoding import ShardInfo, SkipKind, Skipped
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, finish_folder
-from openvima.data.reader import Shard
-from openvima.data.records import Demonstration, package_versions, rollout_oracle
-from openvima.data.writer import ShardWriter, remove_leftovers
-from openvima.env import TabletopEnv
-from openvima.env.setup import DEFAULT_SETUP, Setup
-from openvima.errors import ConfigError, DatasetError, OracleError, SamplingError
-from openvima.processes import in_processes
-from openvima.tasks import list_tasks, task_spec
-from openvima.tasks.seeding import MAX_SEED
-
-DOMAIN = "train"
-LARGEST_SHARD = 1000  # episodes, about 25 MB
-SMALLEST_SHARD = 4
-SHARDS_PER_TASK = 8  # of a small data set, so that several workers have something to do
-# A shard may try this many seeds for each episode that it needs, and some more; a task of which the oracle
-# solves so few needs repair rather than patience.
-SEEDS_PER_EPISODE = 4
-SPARE_SEEDS = 12
-MAX_EPISODES = 10**7  # of a task, in one folder
-MAX_WORKERS = 1024
-MAX_FIRST_SEED = MAX_SEED - 10**9  # leaves room for the seeds of all shards
-
-Report = Callable[[int, int, str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class GenerateConfig:
-    """What to generate, and where.
-
-    Args:
-        out: The folder.
-        tasks: Names of the tasks; ("all",) means all that the level has.
-        episodes: Successful episodes of each task.
-        level: "train" or "L1" to "L4".
-        start_seed: First seed.
-        shard_size: Episodes in a file; None chooses an eighth of `episodes`, but 4 … 1,000.
-        workers: Number of processes.
-        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
-        force: Delete a data set that is in the folder.
-    """
-
-    out: Path
-    tasks: tuple[str, ...] = ("all",)
-    episodes: int = 100
-    level: str = "train"
-    start_seed: int = 0
-    shard_size: int | None = None
-    workers: int = 1
-    setup: Setup = DEFAULT_SETUP
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        problems = [
-            f"{name} is {value}; it must lie within {least} … {most}."
-            for name, value, least, most in (
-                ("episodes", self.episodes, 1, MAX_EPISODES),
-                ("seed", self.start_seed, 0, MAX_FIRST_SEED),
-                ("shard_size", self.shard_size, 1, MAX_EPISODES),
-                ("workers", self.workers, 1, MAX_WORKERS),
-            )
-            if value is not None and not least <= value <= most
-        ]
-        if not self.tasks:
-            problems.append("tasks is empty; name some, or 'all'.")
-        if problems:
-            raise ConfigError(" ".join(problems))
-
-    def resolved_tasks(self) -> tuple[str, ...]:
-        """Return the names of the tasks, sorted.
-
-        Raises:
-            UnknownTaskError: There is no such task.
-            LevelError: A task is not defined at the level.
-        """
-        if self.tasks == ("all",):
-            return tuple(sorted(task for task in list_tasks() if self.level in task_spec(task).levels))
-        for task in self.tasks:
-            task_spec(task).pool(self.level)
-        return tuple(sorted(set(self.tasks)))
-
-    def resolved_shard_size(self) -> int:
-        """Return the number of episodes in a full shard."""
-        eighth = -(-self.episodes // SHARDS_PER_TASK)
-        return self.shard_size or min(LARGEST_SHARD, max(SMALLEST_SHARD, eighth))
-
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """One shard to be written: so many episodes out of a range of seeds of its own.
-
-    Args:
-        path: The file.
-        info: What all its rows have in common.
-        episodes: Number of successful episodes.
-        seeds: Seeds to try, in order.
-        setup: As in `GenerateConfig`.
-    """
-
-    path: Path
-    info: ShardInfo
-    episodes: int
-    seeds: range
-    setup: Setup
+from openvima.data.manifest import MANIFEST_NAME, finish_folder
+from openvima.data.planning import COMMAND, FAILED_FOLDER, Block, GenerateConfig, plan
+from openvima.data.resuming import check_folder, clear, is_done, is_finished, remove_leftovers
+from openvima.data.tally import NUM_COUNTS, Report, reporter
+from openvima.data.trials import write_block
+from openvima.errors import ConfigError, DatasetError, StorageError
+from openvima.processes import Counts, in_watched_processes
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
@@ -118,188 +19,113 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
 
     Args:
         config: What to generate.
-        report: Called with episodes done, episodes in all, and a note.
+        report: Called now and then with how far it is.
 
     Returns:
-        The folder: shards, `index.parquet` and `dataset.json`. Its bytes depend on the settings and versions
-        alone, not on the number of workers or on interruptions.
+        The folder: shards and, once all are there, `index.parquet` and `dataset.json`. Its bytes depend on
+        the settings and versions alone, not on who did the work, nor on interruptions.
 
     Raises:
         UnknownTaskError, LevelError, ConfigError: The settings do not fit.
-        DatasetError: The folder holds a data set of other settings or versions.
-        WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
+        MissingExtraError: Ray was asked for and is not installed.
+        DatasetError: The folder holds a data set of other settings or versions, or a larger one.
+        ShardError: A shard in the folder is damaged.
+        StorageError: The disk is full, or the folder cannot be written to.
+        WorkerError: A worker died.
         OracleError: The oracle solved too few episodes.
     """
+    if config.engine == "ray":  # its workers have other working directories
+        config = replace(config, out=config.out.absolute())
     blocks = plan(config)
+    own = _own(config, blocks)
     config.out.mkdir(parents=True, exist_ok=True)
     if config.force:
-        _clear(config.out)
-    _check_folder(config, blocks)
-    missing = [block for block in blocks if not _is_done(block)]
-    num_done = sum(block.episodes for block in blocks) - sum(block.episodes for block in missing)
+        clear(config.out)
+    check_folder(config, blocks)
+    remove_leftovers(config, own)
+    missing = [block for block in own if not is_done(block)]
+    missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
     try:
-        for _ in in_processes(
-            write_block, missing, config.workers, report=_shifted(report, num_done, blocks)
-        ):
-            pass  # a block's result is its file
+        _write(config, missing, reporter(report, own, missing))
+        _finish(config, blocks, own)
+    except BrokenPipeError:  # of `report`
+        raise
+    except OSError as error:
+        raise StorageError(_storage_message(config, blocks, error)) from error
     finally:
-        remove_leftovers(config.out)
-    if missing or not (config.out / MANIFEST_NAME).is_file():
-        finish(config, blocks)
+        remove_leftovers(config, own)
     return config.out
 
 
-def plan(config: GenerateConfig) -> list[Block]:
-    """Divide the work into blocks; the division depends on the settings alone."""
-    size, versions = config.resolved_shard_size(), package_versions()
-    stride = SEEDS_PER_EPISODE * size + SPARE_SEEDS
-    assets = load_assets(config.setup.assets).name
-    blocks = []
-    for task in config.resolved_tasks():
-        for number, start in enumerate(range(0, config.episodes, size)):
-            first = config.start_seed + number * stride
-            blocks.append(
-                Block(
-                    path=config.out / f"{task}-{config.level}-{number:05d}.arrow",
-                    info=ShardInfo(
-                        task=task,
-                        level=config.level,
-                        domain=DOMAIN,
-                        number=number,
-                        shard_size=size,
-                        first_seed=config.start_seed,
-                        assets=assets,
-                        versions=versions,
-                        compat=config.setup.compat,
-                        difficulty=config.setup.difficulty,
-                    ),
-                    episodes=min(size, config.episodes - start),
-                    seeds=range(first, first + stride),
-                    setup=config.setup,
-                )
-            )
-    return blocks
-
-
-def write_block(block: Block, count: Callable[[int], None]) -> None:
-    """Write one shard.
-
-    Args:
-        block: What to write.
-        count: Called with the number of episodes written so far.
+def _own(config: GenerateConfig, blocks: Sequence[Block]) -> Sequence[Block]:
+    """The blocks of this run.
 
     Raises:
-        OracleError: The oracle solved too few of the block's episodes.
+        ConfigError: The range of shards lies beyond the last one.
     """
-    with ShardWriter(block.path, block.info) as writer:
-        for number, (demo, skipped) in enumerate(demonstrations(block), start=1):
-            writer.write(demo, skipped)
-            count(number)
+    if config.shard_range is None:
+        return blocks
+    start, stop = config.shard_range
+    if start >= len(blocks):
+        raise ConfigError(
+            f"shard_range is {start}:{stop}, but there are {len(blocks)} shards, 0 … {len(blocks) - 1}."
+        )
+    return blocks[start:stop]
 
 
-def demonstrations(block: Block) -> Iterator[tuple[Demonstration, list[Skipped]]]:
-    """Yield the successful demonstrations of a block, each with the seeds tried in vain before it.
+def _write(config: GenerateConfig, missing: Sequence[Block], watch: Callable[[Counts], None]) -> None:
+    if not missing:
+        return
+    for folder in (config.out, config.out / FAILED_FOLDER):
+        (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
+    for _ in _engine(config, missing, watch):
+        pass  # a block's result is its file
 
-    Raises:
-        OracleError: The seeds ran out.
-    """
-    env = _env(block.info.task, block.info.level, block.setup)
-    num_found, skipped = 0, []
-    for seed in block.seeds:
-        demo = attempt(env, seed)
-        if isinstance(demo, Skipped):
-            skipped.append(demo)
-            continue
-        yield demo, skipped
-        num_found, skipped = num_found + 1, []
-        if num_found == block.episodes:
-            return
-    raise OracleError(
-        f"the oracle solved {num_found} of {len(block.seeds)} episodes of {block.info.task!r} at level "
-        f"{block.info.level}, {block.episodes} were needed; the last one failed: {skipped[-1].reason}."
+
+def _engine(
+    config: GenerateConfig, missing: Sequence[Block], watch: Callable[[Counts], None]
+) -> Iterator[tuple[Block, None]]:
+    if config.engine == "processes":
+        num_workers = config.workers or 1
+        return in_watched_processes(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
+    from openvima.cluster import on_cluster
+
+    num_workers = config.workers or (1 if config.address is None else None)
+    return on_cluster(
+        write_block, missing, num_workers, address=config.address, num_counts=NUM_COUNTS, watch=watch
     )
 
 
-def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
-    """Let the oracle play one episode; say why if that gives no demonstration."""
-    try:
-        demo = rollout_oracle(env, seed)
-    except SamplingError as error:
-        return Skipped(seed, "not_sampled", str(error))
-    except OracleError as error:
-        return Skipped(seed, "no_action", str(error))
-    if demo.outcome.success:
-        return demo
-    kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
-    return Skipped(seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
+def _finish(config: GenerateConfig, blocks: Sequence[Block], own: Sequence[Block]) -> None:
+    """Write index and manifest if all shards are there, also those of other runs.
+
+    Raises:
+        DatasetError: A shard of this run is not where it should be.
+    """
+    lost = [block.path for block in own if not block.path.is_file()]
+    if lost:
+        raise DatasetError(
+            f"{lost[0]} was written on another machine and is not to be seen on this one. "
+            "Give an --out that all machines of the cluster share."
+        )
+    if is_finished(config.out) or not all(block.path.is_file() for block in blocks):
+        return
+    if len(own) < len(blocks) and not all(is_done(block) for block in blocks):
+        return
+    versions, record = blocks[0].info.versions, config.record()
+    failed = [block.failed_path for block in blocks if block.failed_path and block.failed_path.is_file()]
+    if failed:
+        settings = {**record, "kept": FAILED_FOLDER}
+        finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
+    paths = [block.path for block in blocks]
+    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions)
 
 
-def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Write index and manifest of a folder whose shards are all there."""
-    settings = {
-        "tasks": list(config.resolved_tasks()),
-        "level": config.level,
-        "domain": DOMAIN,
-        "episodes": config.episodes,
-        "start_seed": config.start_seed,
-        "shard_size": config.resolved_shard_size(),
-        "assets": blocks[0].info.assets,
-        "compat": config.setup.compat,
-        "difficulty": config.setup.difficulty,
-    }
-    finish_folder(
-        config.out,
-        [block.path for block in blocks],
-        command="openvima generate",
-        config=settings,
-        versions=blocks[0].info.versions,
+def _storage_message(config: GenerateConfig, blocks: Sequence[Block], error: OSError) -> str:
+    num_there = sum(block.path.is_file() for block in blocks)
+    is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    remedy = "Make room" if is_full else "Make sure that it can be written to"
+    return (
+        f"cannot write to {config.out}: {error.strerror or error}. {num_there} of {len(blocks)} shards are "
+        f"whole and were kept. {remedy}; the same command then goes on from there."
     )
-
-
-@lru_cache(maxsize=4)
-def _env(task: str, level: str, setup: Setup) -> TabletopEnv:
-    return setup.make(task, level, domain=DOMAIN)
-
-
-def _is_done(block: Block) -> bool:
-    """A shard is done if its name exists, unless fewer episodes were asked for when it was written."""
-    return block.path.is_file() and len(Shard(block.path)) == block.episodes
-
-
-def _check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
-    """Refuse a folder whose shards do not belong to the data set that is asked for."""
-    wanted = {block.path.name: block for block in blocks}
-    for path in sorted(config.out.glob("*.arrow")):
-        block = wanted.get(path.name)
-        found = Shard(path)
-        problems = _differences(found.info, blocks[0].info)
-        if block is None and not problems:
-            problems = [f"it is not among the {len(blocks)} shards of {config.episodes} episodes a task"]
-        if block is not None and len(found) > block.episodes:
-            problems.append(f"it has {len(found)} episodes, asked for are {block.episodes}")
-        if problems:
-            raise DatasetError(
-                f"{path} belongs to another data set: {'; '.join(problems)}. "
-                "Give its settings, another --out, or --force to delete it."
-            )
-
-
-def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
-    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty")
-    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
-    pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
-    return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]
-
-
-def _clear(folder: Path) -> None:
-    for path in [folder / MANIFEST_NAME, folder / INDEX_NAME, *folder.glob("*.arrow")]:
-        path.unlink(missing_ok=True)
-    remove_leftovers(folder)
-
-
-def _shifted(report: Report | None, num_done: int, blocks: Sequence[Block]) -> Callable[[int], None]:
-    total = sum(block.episodes for block in blocks)
-    if report is None:
-        return lambda count: None
-    report(num_done, total, "")
-    return lambda count: report(num_done + count, total, "")

@@ -1,0 +1,248 @@
+"""What to generate, and its division into shards, which depends on the settings alone.
+
+Shards of a task are numbered. The size of a shard and its range of seeds follow from its number, so that a
+data set of more episodes begins with the very shards of a smaller one: asking for more extends it.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from openvima.catalog.packs import load_assets
+from openvima.data.encoding import ShardInfo
+from openvima.data.records import package_versions
+from openvima.data.schema import CODECS
+from openvima.env.setup import DEFAULT_SETUP, Setup
+from openvima.errors import ConfigError
+from openvima.tasks import list_tasks, task_spec
+from openvima.tasks.seeding import MAX_SEED
+
+Engine = Literal["processes", "ray"]
+Compression = Literal["lz4", "zstd"]
+
+COMMAND = "openvima generate"  # what manifests name as their maker
+DOMAIN = "train"
+FAILED_FOLDER = "failed"
+LARGEST_SHARD = 1000  # episodes, about 25 MB
+SMALLEST_SHARD = 4
+# So many shards of a size, then the size doubles: a small data set has work for several processes, and a
+# large one few files.
+SHARDS_OF_A_SIZE = 4
+# A shard may try this many seeds for each episode that it needs, and some more; a task of which the oracle
+# solves so few needs repair rather than patience.
+SEEDS_PER_EPISODE = 4
+SPARE_SEEDS = 12
+MAX_EPISODES = 10**7  # of a task, in one folder
+MAX_WORKERS = 1024
+MAX_FIRST_SEED = MAX_SEED - 10**9  # leaves room for the seeds of all shards
+
+
+@dataclass(frozen=True, slots=True)
+class GenerateConfig:
+    """What to generate, where, and how.
+
+    Args:
+        out: The folder.
+        tasks: Names of the tasks; ("all",) means all that the level has.
+        episodes: Successful episodes of each task.
+        level: "train" or "L1" to "L4".
+        start_seed: First seed.
+        shard_size: Episodes in a file; None lets files grow with their number, from 4 episodes to 1,000.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        compression: Codec of the files: "lz4", or "zstd", which is smaller and slower.
+        images: Store images; without, they are drawn anew on reading.
+        keep_failed: Keep the episodes that the oracle did not solve too, in the folder's `failed`.
+        workers: Number of processes; None means one, or on a Ray cluster at an address all that it offers.
+        engine: "processes" of this machine, or "ray".
+        address: Of a Ray cluster; None starts Ray on this machine for as long as it is needed.
+        shard_range: First and past-the-end position in `plan(config)` of the shards to write; None
+            means all of them.
+        force: Delete a data set that is in the folder.
+
+    Raises:
+        ConfigError: A number is out of its range, or settings contradict each other.
+    """
+
+    out: Path
+    tasks: tuple[str, ...] = ("all",)
+    episodes: int = 100
+    level: str = "train"
+    start_seed: int = 0
+    shard_size: int | None = None
+    setup: Setup = DEFAULT_SETUP
+    compression: Compression = "lz4"
+    images: bool = True
+    keep_failed: bool = False
+    workers: int | None = None
+    engine: Engine = "processes"
+    address: str | None = None
+    shard_range: tuple[int, int] | None = None
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value}; it must lie within {least} … {most}."
+            for name, value, least, most in (
+                ("episodes", self.episodes, 1, MAX_EPISODES),
+                ("seed", self.start_seed, 0, MAX_FIRST_SEED),
+                ("shard_size", self.shard_size, 1, MAX_EPISODES),
+                ("workers", self.workers, 1, MAX_WORKERS),
+            )
+            if value is not None and not least <= value <= most
+        ]
+        if not self.tasks:
+            problems.append("tasks is empty; name some, or 'all'.")
+        if problems := [*problems, *self._contradictions()]:
+            raise ConfigError(" ".join(problems))
+
+    def _contradictions(self) -> Iterator[str]:
+        if self.compression not in CODECS:
+            yield f"compression is {self.compression!r}; allowed are {' and '.join(CODECS)}."
+        if self.engine not in ("processes", "ray"):
+            yield f"engine is {self.engine!r}; allowed are processes and ray."
+        elif self.address is not None and self.engine != "ray":
+            yield f"address is {self.address!r}, but the engine is {self.engine!r}; only 'ray' takes one."
+        if self.shard_range is not None:
+            start, stop = self.shard_range
+            if not 0 <= start < stop:
+                yield f"shard_range is {start}:{stop}; it must be a:b with 0 ≤ a < b."
+            if self.force:
+                yield "force and shard_range exclude each other: each part would delete those before it."
+
+    def resolved_tasks(self) -> tuple[str, ...]:
+        """Return the names of the tasks, sorted.
+
+        Raises:
+            UnknownTaskError: There is no such task.
+            LevelError: A task is not defined at the level.
+        """
+        if self.tasks == ("all",):
+            return tuple(sorted(task for task in list_tasks() if self.level in task_spec(task).levels))
+        for task in self.tasks:
+            task_spec(task).pool(self.level)
+        return tuple(sorted(set(self.tasks)))
+
+    def record(self) -> dict[str, Any]:  # Any: JSON
+        """Return the settings that decide the content, as the manifest holds them: no path, no machine."""
+        return {
+            "tasks": list(self.resolved_tasks()),
+            "level": self.level,
+            "domain": DOMAIN,
+            "episodes": self.episodes,
+            "start_seed": self.start_seed,
+            "shard_size": self.shard_size or 0,
+            "compression": self.compression,
+            "images": self.images,
+            **self.setup.record(),
+        }
+
+    @staticmethod
+    def from_record(out: Path, record: Mapping[str, Any], **changes: Any) -> "GenerateConfig":  # Any: JSON
+        """Make the settings with which the content of a folder can be generated again.
+
+        Args:
+            out: The folder.
+            record: `config` of its manifest.
+            changes: Fields to set besides, such as `workers`.
+
+        Raises:
+            ConfigError: The record lacks a setting, or holds one that is not allowed.
+        """
+        try:
+            settings: dict[str, Any] = {
+                "tasks": tuple(record["tasks"]),
+                "shard_size": record["shard_size"] or None,
+                "setup": Setup(record["assets"], record["compat"], record["difficulty"]),
+                **{name: record[name] for name in ("level", "episodes", "start_seed")},
+                **{name: record[name] for name in ("compression", "images")},
+            }
+        except KeyError as error:
+            raise ConfigError(f"the settings recorded in {out} lack {error}.") from None
+        return GenerateConfig(**{**settings, "out": out, **changes})
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One shard to be written: so many episodes out of a range of seeds of its own.
+
+    Args:
+        path: The file.
+        info: What all its rows have in common.
+        episodes: Number of successful episodes.
+        seeds: Seeds to try, in order.
+        setup: As in `GenerateConfig`.
+        failed_path: File for the episodes that the oracle did not solve; None throws them away.
+    """
+
+    path: Path
+    info: ShardInfo
+    episodes: int
+    seeds: range
+    setup: Setup
+    failed_path: Path | None = None
+
+
+def plan(config: GenerateConfig) -> list[Block]:
+    """Divide the work into blocks.
+
+    Args:
+        config: What to generate; its `shard_range` is not applied.
+
+    Returns:
+        One block a shard, by task and number. They depend on what is asked for, not on who does it.
+    """
+    versions, assets = package_versions(), load_assets(config.setup.assets).name
+    blocks = []
+    for task in config.resolved_tasks():
+        for number, episodes, seeds in _division(config):
+            name = f"{task}-{config.level}-{number:05d}.arrow"
+            info = ShardInfo(
+                task=task,
+                level=config.level,
+                domain=DOMAIN,
+                number=number,
+                shard_size=config.shard_size or 0,
+                first_seed=config.start_seed,
+                assets=assets,
+                versions=versions,
+                compat=config.setup.compat,
+                difficulty=config.setup.difficulty,
+                compression=config.compression,
+                images=config.images,
+            )
+            failed = config.out / FAILED_FOLDER / name if config.keep_failed else None
+            blocks.append(Block(config.out / name, info, episodes, seeds, config.setup, failed))
+    return blocks
+
+
+def shard_episodes(number: int, shard_size: int | None = None) -> int:
+    """Return how many episodes a full shard holds.
+
+    Args:
+        number: Which shard of its task, from 0.
+        shard_size: Size of all shards; None lets them grow with their number.
+
+    Example:
+        >>> [shard_episodes(number) for number in (0, 3, 4, 8, 31, 32, 99)]
+        [4, 4, 8, 16, 512, 1000, 1000]
+    """
+    doublings = min(number // SHARDS_OF_A_SIZE, LARGEST_SHARD.bit_length())
+    return shard_size or min(LARGEST_SHARD, SMALLEST_SHARD << doublings)
+
+
+def _division(config: GenerateConfig) -> Iterator[tuple[int, int, range]]:
+    """Yield number, episodes and seeds of each shard of a task; the last may be smaller than a full one."""
+    first, num_left = config.start_seed, config.episodes
+    for number in itertools.count():
+        size = shard_episodes(number, config.shard_size)
+        episodes = min(size, num_left)
+        yield number, episodes, range(first, first + _num_seeds(episodes))
+        first, num_left = first + _num_seeds(size), num_left - size
+        if num_left <= 0:
+            return
+
+
+def _num_seeds(episodes: int) -> int:
+    return SEEDS_PER_EPISODE * episodes + SPARE_SEEDS

@@ -1,0 +1,90 @@
+"""What a folder already holds of the data set that is asked for, and what does not belong to it."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
+from openvima.data.planning import FAILED_FOLDER, Block, GenerateConfig
+from openvima.data.reader import Shard
+from openvima.errors import DatasetError
+
+FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
+
+
+def is_done(block: Block) -> bool:
+    """Say whether a block's shard needs no work.
+
+    A shard is whole if its name exists. It is written again if more episodes are asked for than when it was
+    written, or if its failed episodes are wanted now and were not kept.
+    """
+    if not block.path.is_file():
+        return False
+    shard = Shard(block.path)
+    if len(shard) != block.episodes:
+        return False
+    return block.failed_path is None or block.failed_path.is_file() or not _has_failed(shard)
+
+
+def is_finished(folder: Path) -> bool:
+    """Say whether a folder has its manifest and index, which are written last."""
+    return (folder / MANIFEST_NAME).is_file() and (folder / INDEX_NAME).is_file()
+
+
+def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Refuse a folder whose shards do not belong to the data set that is asked for.
+
+    Raises:
+        DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
+        ShardError: A shard is damaged.
+    """
+    wanted = {block.path.name: block for block in blocks}
+    for path in sorted(config.out.glob("*.arrow")):
+        shard = Shard(path)
+        problems = _differences(shard.info, blocks[0].info)
+        block = wanted.get(path.name)
+        if block is None and not problems:
+            problems = [f"it is not among the {len(blocks)} shards of {config.episodes} episodes a task"]
+        if block is not None and len(shard) > block.episodes:
+            problems.append(f"it has {len(shard)} episodes, asked for are {block.episodes}")
+        if problems:
+            raise DatasetError(
+                f"{path} belongs to another data set, or to a larger one: {'; '.join(problems)}. "
+                "Give its settings, another --out, or --force to delete it."
+            )
+    failed = config.out / FAILED_FOLDER
+    if not config.keep_failed and any(failed.glob("*.arrow")):
+        raise DatasetError(
+            f"{failed} holds the episodes that the oracle did not solve. "
+            "Give --keep-failed to keep it up to date, or delete it."
+        )
+
+
+def clear(folder: Path) -> None:
+    """Delete a data set, its failed episodes too; other files stay."""
+    for part in (folder, folder / FAILED_FOLDER):
+        for path in [part / MANIFEST_NAME, part / INDEX_NAME, *part.glob("*.arrow")]:
+            path.unlink(missing_ok=True)
+
+
+def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
+    """Delete what killed writers left of these blocks; those of others may still be at work."""
+    names = {block.path.name for block in blocks}
+    if config.shard_range is None:
+        names |= {MANIFEST_NAME, INDEX_NAME}
+    for folder in (config.out, config.out / FAILED_FOLDER):
+        for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
+            if file.name[1:].rsplit(".", 2)[0] in names:
+                file.unlink(missing_ok=True)
+
+
+def _has_failed(shard: Shard) -> bool:
+    rows = shard.table(["skipped"]).column("skipped").to_pylist()
+    return any(skipped["kind"] in FAILED_KINDS for row in rows for skipped in row)
+
+
+def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
+    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty", "compression")
+    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in (*names, "images")]
+    pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
+    return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]
