@@ -1,0 +1,243 @@
+"""Episodes in one zip archive, read where they lie.
+
+The published archive has about seven million members. The standard library would make an object of each,
+several gigabytes; here its directory is walked once and only the place of each episode's entries is kept.
+"""
+
+import hashlib
+import mmap
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from openvima.data.published.layout import MAX_EPISODE_BYTES, is_episode_file
+from openvima.errors import DatasetError, MemberError
+
+# Layouts from the specification of the format (APPNOTE 6.3.9): end record, its 64-bit form and the pointer to
+# that, entry of the directory, head of a member.
+_END = struct.Struct("<4s4H2LH")
+_END_64 = struct.Struct("<4sQ2H2L4Q")
+_POINTER_64 = struct.Struct("<4sLQL")
+_ENTRY = struct.Struct("<4s4B4H3L5H2L")
+_LENGTHS = struct.Struct("<3H")  # of name, extra fields and comment
+_LENGTHS_AT = 28
+_HEAD = struct.Struct("<4s2B4HL2L2H")
+_LONGEST_COMMENT = 0xFFFF
+_IN_EXTRA_2, _IN_EXTRA_4 = 0xFFFF, 0xFFFFFFFF  # "the number is too large for this field"
+_EXTRA_64 = 1
+_ENCRYPTED = 1
+_STORED, _DEFLATED = 0, 8
+
+_EPISODE = re.compile(rb"(?!__MACOSX/)(.*/)?([^/]+)/(\d+)/")
+
+# Byte ranges of the directory with an episode's entries; nearly always one.
+Place = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Member:
+    """One entry of the directory."""
+
+    name: str
+    offset: int
+    packed_bytes: int
+    num_bytes: int
+    checksum: int
+    method: int
+    is_encrypted: bool
+
+
+class ZipArchive:
+    """A zip archive that holds episodes in folders `…/TASK/ID/`.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: It is no whole zip archive.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open(path, "rb") as file:
+            self._start, self._end, self._shift = _directory(file, path)
+
+    def episodes(self) -> dict[str, Place]:
+        """Return the folders of all episodes, such as "vima_v6/rotate/000123", and where their entries are.
+
+        Raises:
+            DatasetError: The directory is damaged.
+        """
+        places: dict[bytes, list[tuple[int, int]]] = {}
+        for folder, start, end in self._runs():
+            places.setdefault(folder, []).append((start, end))
+        return {
+            folder.decode("utf-8", "replace").rstrip("/"): tuple(ranges) for folder, ranges in places.items()
+        }
+
+    def digest(self) -> str:
+        """Return 32 hexadecimal digits for the archive's directory, so for all names, sizes and checksums."""
+        digest, left = hashlib.sha256(), self._end - self._start
+        with open(self.path, "rb") as file:
+            file.seek(self._start)
+            while left > 0 and (piece := file.read(min(left, 2**20))):
+                digest.update(piece)
+                left -= len(piece)
+        return digest.hexdigest()[:32]
+
+    def files(self, place: Place) -> Mapping[str, bytes]:
+        """Read the files of an episode.
+
+        Args:
+            place: As `episodes` gives it.
+
+        Returns:
+            Path within the episode's folder, such as "rgb_top/0.jpg", to content.
+
+        Raises:
+            MemberError: A member is damaged or too large.
+        """
+        with open(self.path, "rb") as file:
+            members = {}
+            for start, end in place:
+                file.seek(start)
+                found = _members(file.read(end - start))
+                members |= {member.name: member for member in found if is_episode_file(member.name)}
+            total = sum(max(member.num_bytes, member.packed_bytes) for member in members.values())
+            if total > MAX_EPISODE_BYTES:
+                raise MemberError(f"it claims {total:,} bytes; episodes have at most {MAX_EPISODE_BYTES:,}.")
+            return {name: self._content(file, member) for name, member in members.items()}
+
+    def _runs(self) -> Iterator[tuple[bytes, int, int]]:
+        """Folder, start and end of each run of entries that lie in the same episode's folder."""
+        if self._start == self._end:
+            return
+        with open(self.path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            folder, run_start, position = None, self._start, self._start
+            while position < self._end:
+                try:
+                    name, extra, comment = _LENGTHS.unpack_from(content, position + _LENGTHS_AT)
+                except struct.error:
+                    raise DatasetError(
+                        f"{self.path}: its directory is damaged at byte {position:,}."
+                    ) from None
+                name_start = position + _ENTRY.size
+                if folder is None or content[name_start : name_start + len(folder)] != folder:
+                    if folder is not None:
+                        yield folder, run_start, position
+                    match = _EPISODE.match(content[name_start : name_start + name])
+                    folder, run_start = match and match.group(), position
+                position = name_start + name + extra + comment
+            if position != self._end:
+                raise DatasetError(f"{self.path}: its directory is damaged; copy or download it again.")
+            if folder is not None:
+                yield folder, run_start, position
+
+    def _content(self, file: BinaryIO, member: _Member) -> bytes:
+        if member.is_encrypted or member.method not in (_STORED, _DEFLATED):
+            how = "encrypted" if member.is_encrypted else f"packed by method {member.method}"
+            raise MemberError(f"{member.name} is {how}; only stored and deflated members are read.")
+        file.seek(member.offset + self._shift)
+        head = file.read(_HEAD.size)
+        if len(head) < _HEAD.size or not head.startswith(b"PK\3\4"):
+            raise MemberError(f"{member.name} is not where the archive's directory says.")
+        file.seek(sum(_HEAD.unpack(head)[-2:]), 1)  # name and extra fields again
+        packed = file.read(member.packed_bytes)
+        content = packed if member.method == _STORED else _inflated(packed, member)
+        if len(content) != member.num_bytes or zlib.crc32(content) != member.checksum:
+            raise MemberError(f"{member.name} is damaged: its checksum differs.")
+        return content
+
+
+def _inflated(packed: bytes, member: _Member) -> bytes:
+    """Unpack as many bytes as were promised, and no more."""
+    try:
+        return zlib.decompressobj(-zlib.MAX_WBITS).decompress(packed, member.num_bytes + 1)
+    except zlib.error:
+        raise MemberError(f"{member.name} is damaged: it cannot be unpacked.") from None
+
+
+def _directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
+    """Start and end of the directory, and how far everything lies behind where the archive says."""
+    size = file.seek(0, 2)
+    tail_start = max(0, size - _END.size - _LONGEST_COMMENT)
+    file.seek(tail_start)
+    tail = file.read()
+    at = tail.rfind(b"PK\5\6")
+    if at < 0 or at + _END.size > len(tail):
+        raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")
+    _, disk, first_disk, _, count, num_bytes, offset, _ = _END.unpack_from(tail, at)
+    end = tail_start + at
+    if _IN_EXTRA_2 in (disk, count) or _IN_EXTRA_4 in (num_bytes, offset):
+        end, num_bytes, offset = _end_64(file, end, path) or (end, num_bytes, offset)
+    elif disk or first_disk:
+        raise DatasetError(f"{path} is one of several parts of an archive; join them first.")
+    start = end - num_bytes
+    if start < offset:
+        raise DatasetError(f"{path} lacks bytes before its directory; copy or download it again.")
+    return start, end, start - offset
+
+
+def _end_64(file: BinaryIO, end: int, path: Path) -> tuple[int, int, int] | None:
+    """End, size and offset of the directory from the 64-bit end record; None if there is none."""
+    file.seek(max(0, end - _POINTER_64.size))
+    pointer = file.read(_POINTER_64.size)
+    if len(pointer) < _POINTER_64.size or not pointer.startswith(b"PK\6\7"):
+        return None
+    # It lies right before the pointer to it, also where the archive was put behind something else.
+    at = end - _POINTER_64.size - _END_64.size
+    file.seek(max(0, at))
+    record = file.read(_END_64.size)
+    if len(record) < _END_64.size or not record.startswith(b"PK\6\6"):
+        raise DatasetError(f"{path}: its end record is damaged.")
+    *_, num_bytes, offset = _END_64.unpack(record)
+    return at, num_bytes, offset
+
+
+def _members(directory: bytes) -> Iterator[_Member]:
+    """The files among some entries of the directory, named relative to their episode's folder."""
+    position = 0
+    while position < len(directory):
+        if len(directory) < position + _ENTRY.size or not directory.startswith(b"PK\1\2", position):
+            raise MemberError("the archive's directory is damaged here.")
+        fields = _ENTRY.unpack_from(directory, position)
+        flags, method, (checksum, packed, unpacked) = fields[5], fields[6], fields[9:12]
+        name_bytes, extra_bytes, comment_bytes, offset = *fields[12:15], fields[18]
+        position += _ENTRY.size
+        name = directory[position : position + name_bytes]
+        extra = directory[position + name_bytes : position + name_bytes + extra_bytes]
+        position += name_bytes + extra_bytes + comment_bytes
+        if name.endswith(b"/"):
+            continue
+        unpacked, packed, offset = _large_numbers(extra, (unpacked, packed, offset))
+        folder = _EPISODE.match(name)
+        yield _Member(
+            name=name[folder.end() if folder else 0 :].decode("utf-8", "replace"),
+            offset=offset,
+            packed_bytes=packed,
+            num_bytes=unpacked,
+            checksum=checksum,
+            method=method,
+            is_encrypted=bool(flags & _ENCRYPTED),
+        )
+
+
+def _large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Replace numbers that did not fit into four bytes by those of the 64-bit extra field."""
+    if _IN_EXTRA_4 not in numbers:
+        return numbers
+    position = 0
+    while position + 4 <= len(extra):
+        kind, length = struct.unpack_from("<2H", extra, position)
+        position += 4
+        if kind == _EXTRA_64:
+            field = extra[position : position + length]
+            large = iter(struct.unpack_from(f"<{len(field) // 8}Q", field))
+            size, packed, offset = (next(large, n) if n == _IN_EXTRA_4 else n for n in numbers)
+            return size, packed, offset
+        position += length
+    return numbers
