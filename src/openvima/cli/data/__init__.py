@@ -1,8 +1,16 @@
 """`openvima data`: look into demonstrations, check them, and make others of them."""
 
 from openvima.cli.data.info import info
+from openvima.cli.data.lerobot import export_lerobot
+from openvima.cli.data.subsets import merge, sample, split
+from openvima.cli.data.tokens import tokens
 
 # Subcommand → what runs it, in the order in which they are listed.
 COMMANDS = {
     "info": info,
+    "merge": merge,
+    "sample": sample,
+    "split": split,
+    "tokens": tokens,
+    "export-lerobot": export_lerobot,
 }

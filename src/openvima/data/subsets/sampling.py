@@ -1,0 +1,150 @@
+"""Data sets that are parts of another: a share of it, or a division of all of it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from openvima.data.manifest import finish_folder
+from openvima.data.reader import Dataset
+from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
+from openvima.data.subsets.folders import check_out, of_tasks, provenance
+from openvima.data.subsets.shards import NewShard, plan_shards, write_shard
+from openvima.errors import DatasetError
+from openvima.files import whole_folder
+from openvima.processes import in_processes
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class SubsetConfig:
+    """What to take from where, and how to write it.
+
+    Args:
+        source: The data set.
+        out: The folder to write.
+        tasks: Take the episodes of these tasks only; None takes all.
+        seed: Another one gives another choice.
+        compression: Codec of the new shards, "lz4" or "zstd"; None keeps that of the source.
+        workers: Number of processes.
+        force: Replace a data set that is in the folder.
+    """
+
+    source: Path
+    out: Path
+    tasks: tuple[str, ...] | None = None
+    seed: int = 0
+    compression: str | None = None
+    workers: int = 1
+    force: bool = False
+
+    def settings(self, dataset: Dataset) -> dict[str, Any]:  # Any: JSON
+        """Return what decides the content, without paths."""
+        return {
+            "source": provenance(dataset.manifest),
+            "tasks": None if self.tasks is None else sorted(self.tasks),
+            "seed": self.seed,
+            "compression": self.compression,
+        }
+
+
+def sample(config: SubsetConfig, share: float, *, report: Report | None = None) -> Path:
+    """Write a share of a data set, the same of each task.
+
+    A smaller share of the same data and seed is part of a larger one: the 1 % is part of the 10 %. Records
+    are copied, not made anew, so their content hashes stay; so do the notes on seeds tried in vain just
+    before them.
+
+    Args:
+        config: What to read and write.
+        share: Above 0, at most 1; of each task round(share × episodes), but at least one.
+        report: Called with episodes written, episodes in all, and a note.
+
+    Returns:
+        The folder; its bytes do not depend on the number of workers.
+
+    Raises:
+        DatasetError: The source is no finished data set, or the folder cannot be used.
+        ShardError: The source is damaged.
+        ConfigError: The share is out of range.
+    """
+    check_out(config.out, [config.source], force=config.force)
+    dataset = Dataset(config.source)
+    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(dataset, config.tasks)
+    settings = {**config.settings(dataset), "share": share}
+    with whole_folder(config.out) as folder:
+        _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
+    return config.out
+
+
+def split(config: SubsetConfig, parts: Parts, *, report: Report | None = None) -> Path:
+    """Divide a data set: each episode goes to exactly one part.
+
+    Which one follows from the episode and the seed alone, so it stays there when episodes are added. The
+    sizes of the parts therefore come close to the shares without meeting them.
+
+    Args:
+        config: What to read and write.
+        parts: Names and shares.
+        report: Called with episodes written, episodes in all, and a note.
+
+    Returns:
+        The folder; it holds one data set a part, named as the part.
+
+    Raises:
+        DatasetError: The source is no finished data set, a part would be empty, or the folder cannot be used.
+        ShardError: The source is damaged.
+    """
+    check_out(config.out, [config.source], force=config.force)
+    dataset = Dataset(config.source)
+    wanted = of_tasks(dataset, config.tasks)
+    chosen = {name: mask & wanted for name, mask in chosen_parts(dataset.index, parts, config.seed).items()}
+    empty = [name for name, mask in chosen.items() if not mask.any()]
+    if empty:
+        raise DatasetError(
+            f"of {wanted.sum()} episodes none would fall into part {', '.join(empty)}. "
+            "Give it a larger share, or another --seed."
+        )
+    settings = {**config.settings(dataset), "parts": dict(parts.shares)}
+    with whole_folder(config.out) as folder:
+        subsets = [
+            _Subset(folder / name, mask, "openvima data split", {**settings, "part": name})
+            for name, mask in chosen.items()
+        ]
+        _write(subsets, dataset, config, report)
+    return config.out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Subset:
+    """One data set to write: its folder, which episodes it has, and what its manifest says."""
+
+    folder: Path
+    mask: np.ndarray
+    command: str
+    settings: dict[str, Any]  # Any: JSON
+
+
+def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, report: Report | None) -> None:
+    plans: list[list[NewShard]] = []
+    for subset in subsets:
+        subset.folder.mkdir(exist_ok=True)
+        episodes = np.flatnonzero(subset.mask).tolist()
+        plans.append(plan_shards(dataset, episodes, subset.folder, config.compression))
+    shards = [shard for plan in plans for shard in plan]
+    total = sum(len(shard.episodes) for shard in shards)
+    count = None if report is None else (lambda done: report(done, total, ""))
+    for _ in in_processes(write_shard, shards, config.workers, report=count):
+        pass  # a shard's result is its file
+    for subset, plan in zip(subsets, plans, strict=True):
+        finish_folder(
+            subset.folder,
+            [shard.path for shard in plan],
+            command=subset.command,
+            config=subset.settings,
+            versions=dataset.manifest["versions"],
+            licence=dataset.manifest["licence"],
+        )

@@ -1,0 +1,327 @@
+"""Samples, divisions and unions of data sets: nothing lost, nothing twice, nothing changed."""
+
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from openvima.cli.main import main
+from openvima.data import Dataset, Demonstration, ShardWriter
+from openvima.data.encoding import ShardInfo, Skipped
+from openvima.data.manifest import finish_folder
+from openvima.data.subsets import MergeConfig, Parts, SubsetConfig, merge, parse_parts, sample, split
+from openvima.data.subsets.choosing import chosen_parts, chosen_sample
+from openvima.errors import ConfigError, DatasetError, ShardError
+
+MadeUp = Callable[..., Demonstration]
+WriteFolder = Callable[..., Path]
+HALVES = Parts({"a": 0.5, "b": 0.5})
+
+
+@pytest.fixture
+def write_folder(made_up: MadeUp, info: ShardInfo) -> WriteFolder:
+    """A function that writes a data set of two tasks, with shards of at most four episodes."""
+
+    def write(folder: Path, seeds: range = range(6), **settings: object) -> Path:
+        folder.mkdir(parents=True)
+        paths = []
+        for task in ("rotate", "stack"):
+            for number, start in enumerate(range(0, len(seeds), 4)):
+                own = replace(info, task=task, number=number, **settings)  # type: ignore[arg-type]
+                paths.append(folder / f"{task}-{own.level}-{number:05d}.arrow")
+                with ShardWriter(paths[-1], own) as writer:
+                    for seed in seeds[start : start + 4]:
+                        demo = replace(made_up(seed, num_steps=0, num_images=0), task=task, level=own.level)
+                        writer.write(demo, [Skipped(900 + seed, "failed", "it fell")])
+        config = {"seeds": [seeds.start, seeds.stop]}
+        finish_folder(folder, paths, command="openvima generate", config=config, versions=info.versions)
+        return folder
+
+    return write
+
+
+def index_of(num_episodes: int, tasks: tuple[str, ...] = ("rotate", "stack")) -> pa.Table:
+    rows = [(task, seed) for task in tasks for seed in range(num_episodes)]
+    return pa.table(
+        {
+            "task": [task for task, _ in rows],
+            "level": ["train"] * len(rows),
+            "domain": ["train"] * len(rows),
+            "seed": [seed for _, seed in rows],
+            "content_hash": [f"{task}{seed}" for task, seed in rows],
+        }
+    )
+
+
+def names(index: pa.Table, mask: np.ndarray) -> set[str]:
+    return set(index.filter(pa.array(mask)).column("content_hash").to_pylist())
+
+
+def episodes(folder: Path) -> list[tuple[str, str]]:
+    index = Dataset(folder).index
+    return sorted(
+        zip(index.column("task").to_pylist(), index.column("content_hash").to_pylist(), strict=True)
+    )
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+def test_smaller_samples_are_part_of_larger_ones() -> None:
+    index = index_of(2000)
+    chosen = [chosen_sample(index, share, 0) for share in (0.001, 0.01, 0.1, 1.0)]
+    assert [mask.sum() for mask in chosen] == [4, 40, 400, 4000]
+    for smaller, larger in itertools.pairwise(chosen):
+        assert not (smaller & ~larger).any()
+
+
+def test_each_task_keeps_its_proportion_and_at_least_one_episode() -> None:
+    index = pa.concat_tables([index_of(1000, ("rotate",)), index_of(30, ("stack",)), index_of(3, ("twist",))])
+    chosen = index.filter(pa.array(chosen_sample(index, 0.1, 0))).column("task").to_pylist()
+    assert {task: chosen.count(task) for task in set(chosen)} == {"rotate": 100, "stack": 3, "twist": 1}
+
+
+def test_choices_do_not_depend_on_the_order_of_episodes_but_on_the_seed() -> None:
+    index = index_of(300)
+    shuffled = index.take(np.random.default_rng(0).permutation(len(index)))
+    assert names(index, chosen_sample(index, 0.1, 0)) == names(shuffled, chosen_sample(shuffled, 0.1, 0))
+    assert names(index, chosen_sample(index, 0.1, 0)) != names(index, chosen_sample(index, 0.1, 1))
+
+
+def test_the_episodes_of_a_sample_are_these() -> None:
+    index = index_of(1000, ("rotate",))
+    chosen = index.filter(pa.array(chosen_sample(index, 0.003, 0))).column("seed").to_pylist()
+    assert chosen == [
+        90,
+        654,
+        808,
+    ]  # on every machine and in every version: published results name samples by seed
+
+
+def test_parts_are_disjoint_complete_and_nearly_of_their_shares() -> None:
+    index = index_of(5000)
+    chosen = chosen_parts(index, Parts({"training": 0.9, "validation": 0.07, "test": 0.03}), 0)
+    assert (sum(mask.astype(int) for mask in chosen.values()) == 1).all()
+    shares = [mask.mean() for mask in chosen.values()]
+    assert np.allclose(shares, (0.9, 0.07, 0.03), atol=0.01)
+
+
+def test_an_episode_stays_in_its_part_when_data_are_added() -> None:
+    small, large = index_of(100), index_of(1000)
+    before, after = (chosen_parts(index, HALVES, 0) for index in (small, large))
+    for part in before:
+        assert names(small, before[part]) <= names(large, after[part])
+
+
+def test_small_samples_lie_in_all_parts() -> None:
+    index = index_of(5000)
+    sampled = chosen_sample(index, 0.1, 0)
+    assert abs(chosen_parts(index, HALVES, 0)["a"][sampled].mean() - 0.5) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("training=0.9,validation=0.2", "add up to 1.1"),
+        ("training", "give names and shares"),
+        ("training=much", "give names and shares"),
+        ("a=0.5,a=0.5", "named twice"),
+        ("../a=0.5,b=0.5", "needs a name of letters"),
+        ("a=1.0", "between 0 and 1"),
+        ("a=nan,b=0.5", "between 0 and 1"),
+    ],
+)
+def test_parts_that_make_no_sense_are_refused(text: str, fault: str) -> None:
+    with pytest.raises(ConfigError, match=fault):
+        parse_parts(text)
+
+
+def test_a_sample_holds_the_records_unchanged(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    folder = sample(SubsetConfig(source, tmp_path / "half"), 0.5)
+    originals = {(demo.task, demo.seed): demo for demo in Dataset(source)}
+    copies = Dataset(folder)
+    assert [demo.task for demo in copies] == ["rotate"] * 3 + ["stack"] * 3
+    for demo in copies:
+        assert demo.content_hash() == originals[demo.task, demo.seed].content_hash()
+        assert demo.versions == originals[demo.task, demo.seed].versions
+    shard = copies.shard("rotate-train-00000.arrow")
+    skipped = shard.table(["seed", "skipped"]).to_pylist()
+    assert [row["skipped"][0]["seed"] - row["seed"] for row in skipped] == [900] * 3
+
+
+def test_a_manifest_names_the_source_by_its_content_alone(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    folder = sample(SubsetConfig(source, tmp_path / "half"), 0.5)
+    manifest, original = Dataset(folder).manifest, Dataset(source).manifest
+    assert manifest["command"] == "openvima data sample"
+    assert manifest["config"]["share"] == 0.5
+    assert manifest["config"]["source"]["content_hash"] == original["content_hash"]
+    assert manifest["config"]["source"]["config"] == original["config"]
+    assert str(tmp_path) not in json.dumps(manifest)
+
+
+def test_bytes_do_not_depend_on_workers(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    one = split(SubsetConfig(source, tmp_path / "one"), HALVES)
+    two = split(SubsetConfig(source, tmp_path / "two", workers=2), HALVES)
+    assert contents(one) == contents(two)
+
+
+def test_a_split_gives_each_episode_to_one_part(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    folder = split(SubsetConfig(source, tmp_path / "parts"), HALVES)
+    assert sorted(path.name for path in folder.iterdir()) == ["a", "b"]
+    assert sorted(episodes(folder / "a") + episodes(folder / "b")) == episodes(source)
+
+
+def test_a_part_without_episodes_is_refused(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos", range(2))
+    with pytest.raises(DatasetError, match="fall into part tiny"):
+        split(SubsetConfig(source, tmp_path / "parts"), Parts({"tiny": 0.0001, "rest": 0.9999}))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos"]
+
+
+def test_subsets_can_be_narrowed_to_tasks(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos")
+    folder = sample(SubsetConfig(source, tmp_path / "half", tasks=("stack",)), 0.5)
+    whole = sample(SubsetConfig(source, tmp_path / "both"), 0.5)
+    assert episodes(folder) == [entry for entry in episodes(whole) if entry[0] == "stack"]
+    with pytest.raises(DatasetError, match="Did you mean 'stack'"):
+        sample(SubsetConfig(source, tmp_path / "none", tasks=("stak",)), 0.5)
+
+
+def test_a_merge_copies_files_byte_for_byte_under_new_numbers(
+    tmp_path: Path, write_folder: WriteFolder
+) -> None:
+    first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", range(6, 9))
+    folder = merge(MergeConfig((first, second), tmp_path / "all"))
+    assert (folder / "stack-train-00002.arrow").read_bytes() == (
+        second / "stack-train-00000.arrow"
+    ).read_bytes()
+    assert episodes(folder) == sorted(episodes(first) + episodes(second))
+    assert [demo.seed for demo in Dataset(folder, tasks=["rotate"])] == list(range(9))
+    other = merge(MergeConfig((second, first), tmp_path / "again", workers=2))
+    assert contents(other) == contents(folder)
+
+
+def test_a_merge_keeps_what_each_source_says_of_itself(tmp_path: Path, write_folder: WriteFolder) -> None:
+    first = write_folder(tmp_path / "1", range(1))
+    second = write_folder(tmp_path / "2", range(1), compat=True, versions={"openvima": "7"}, level="L1")
+    folder = merge(MergeConfig((first, second), tmp_path / "all"))
+    dataset = Dataset(folder)
+    infos = [dataset.shard(name).info for name in dataset.shard_names()]
+    assert [(info.task, info.level, info.compat) for info in infos] == [
+        ("rotate", "L1", True),
+        ("rotate", "train", False),
+        ("stack", "L1", True),
+        ("stack", "train", False),
+    ]
+    assert dataset[0].versions == {"openvima": "7"}
+
+
+def test_episodes_that_repeat_others_are_refused_or_skipped(
+    tmp_path: Path, write_folder: WriteFolder
+) -> None:
+    first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", range(4, 9))
+    with pytest.raises(
+        DatasetError, match=r"4 of 22 episodes.*rotate train train seed 4 in .*1 and .*2; .*…"
+    ):
+        merge(MergeConfig((first, second), tmp_path / "all"))
+    folder = merge(MergeConfig((first, second), tmp_path / "all", duplicates="skip"))
+    assert episodes(folder) == sorted(set(episodes(first) + episodes(second)))
+    assert merge(MergeConfig((first, first), tmp_path / "same", duplicates="skip")).is_dir()
+    assert episodes(tmp_path / "same") == episodes(first)
+
+
+def test_equal_seeds_of_another_setup_are_no_duplicates(tmp_path: Path, write_folder: WriteFolder) -> None:
+    first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", difficulty="hard")
+    assert len(Dataset(merge(MergeConfig((first, second), tmp_path / "all")))) == 24
+
+
+@pytest.mark.parametrize("by_merging", [False, True])
+def test_another_compression_changes_files_but_not_content(
+    tmp_path: Path, write_folder: WriteFolder, by_merging: bool
+) -> None:
+    source = write_folder(tmp_path / "demos", range(3))
+    out = tmp_path / "zstd"
+    if by_merging:
+        merge(MergeConfig((source,), out, compression="zstd"))
+    else:
+        sample(SubsetConfig(source, out, compression="zstd"), 1.0)
+    dataset = Dataset(out)
+    assert {dataset.shard(name).info.compression for name in dataset.shard_names()} == {"zstd"}
+    assert dataset.manifest["content_hash"] == Dataset(source).manifest["content_hash"]
+    assert [demo.content_hash() for demo in dataset] == dataset.index.column("content_hash").to_pylist()
+
+
+def test_damage_of_a_source_is_noticed_and_nothing_is_left(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos", range(3))
+    shard = source / "stack-train-00000.arrow"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(ShardError, match=r"demos.stack-train-00000\.arrow"):
+        merge(MergeConfig((source,), tmp_path / "out"))
+    with pytest.raises(ShardError, match=r"demos.stack-train-00000\.arrow"):
+        sample(SubsetConfig(source, tmp_path / "out"), 1.0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["demos"]
+
+
+def test_a_folder_that_would_harm_a_source_is_refused(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "all" / "demos", range(1))
+    before = contents(source)
+    for out, fault in (
+        (source, "holds the source"),
+        (source.parent, "holds the source"),
+        (source / "in", "lies in"),
+    ):
+        with pytest.raises(DatasetError, match=fault):
+            sample(SubsetConfig(source, out, force=True), 1.0)
+        with pytest.raises(DatasetError, match=fault):
+            merge(MergeConfig((source,), out, force=True))
+    assert contents(source) == before
+
+
+def test_only_data_sets_are_replaced_and_only_on_demand(tmp_path: Path, write_folder: WriteFolder) -> None:
+    source = write_folder(tmp_path / "demos", range(2))
+    out = sample(SubsetConfig(source, tmp_path / "out"), 0.5)
+    before = contents(out)
+    with pytest.raises(DatasetError, match="not empty"):
+        sample(SubsetConfig(source, out), 1.0)
+    assert contents(out) == before
+    sample(SubsetConfig(source, out, force=True), 1.0)
+    assert episodes(out) == episodes(source)
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "letter.txt").write_text("dear")
+    with pytest.raises(DatasetError, match="holds other things"):
+        sample(SubsetConfig(source, home, force=True), 1.0)
+    assert contents(home) == {"letter.txt": b"dear"}
+
+
+def test_the_command_line_samples_splits_and_merges(
+    tmp_path: Path, write_folder: WriteFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_folder(tmp_path / "demos")
+    parts = tmp_path / "parts"
+    assert (
+        main(["data", "sample", str(source), str(tmp_path / "s"), "--share", "0.5", "--tasks", "rotate"]) == 0
+    )
+    assert main(["data", "split", str(source), str(parts), "--parts", "a=0.5,b=0.5"]) == 0
+    assert main(["data", "merge", str(parts / "a"), str(parts / "b"), str(tmp_path / "m")]) == 0
+    shown = [str(tmp_path / "s"), str(parts / "a"), str(parts / "b"), str(tmp_path / "m")]
+    assert capsys.readouterr().out.split() == shown
+    assert episodes(tmp_path / "m") == episodes(source)
+    assert main(["data", "merge", str(source)]) == 2
+    assert "at least two folders" in capsys.readouterr().err
+    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--share", "1.5"]) == 2
+    assert "share is 1.5" in capsys.readouterr().err
