@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from openvima.data.checksums import Span, measure
 from openvima.data.schema import SCHEMA_VERSION
+from openvima.errors import DatasetError
 from openvima.files import write_whole
 
 INDEX_NAME = "index.parquet"
@@ -37,6 +38,13 @@ INDEX_SCHEMA = pa.schema(
         pa.field("crc32", pa.uint32(), nullable=False),  # of these bytes
     ]
 )
+# What a manifest must hold, with the type of each; and what it must hold of each shard.
+_TYPES: dict[str, type] = {
+    **dict.fromkeys(("command", "licence", "content_hash"), str),
+    **dict.fromkeys(("config", "versions", "counts", "tasks", "index", "shards"), dict),
+}
+_SHARD_KEYS = ("episodes", "steps", "bytes", "sha256", "head_bytes", "tail_bytes", "frame_crc32")
+
 _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 # What the index and the counts need of each shard.
 _COLUMNS = [name for name in INDEX_SCHEMA.names if name not in _NOT_IN_SHARDS] + ["redraws", "skipped"]
@@ -180,6 +188,52 @@ def manifest_checksum(manifest: Mapping[str, Any]) -> str:  # Any: JSON
     """Return the SHA-256 of a manifest's entries but its own checksum, whatever their order and layout."""
     entries = {key: value for key, value in manifest.items() if key != "checksum"}
     return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
+
+
+def parse_manifest(content: bytes) -> dict[str, Any]:  # Any: JSON
+    """Read a manifest and compare it with its own checksum.
+
+    Raises:
+        DatasetError: It is damaged or of another version; the message is the bare cause.
+    """
+    try:
+        manifest = json.loads(content)
+        written_as, checksum = manifest["schema"], manifest.get("checksum")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise DatasetError("it is damaged (no manifest in JSON)") from None
+    if written_as != SCHEMA_VERSION:
+        raise DatasetError(f"it has schema {written_as}; this package reads {SCHEMA_VERSION}")
+    if checksum != manifest_checksum(manifest):
+        raise DatasetError("it is damaged or was edited (its checksum is wrong)")
+    if lacking := _lacking(manifest):
+        raise DatasetError(f"it lacks {', '.join(lacking)}, or has other things there")
+    return manifest
+
+
+def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:  # Any: JSON
+    """Read an index and compare it with its checksum in the manifest.
+
+    Raises:
+        DatasetError: It is damaged or has other columns; the message is the bare cause.
+    """
+    if hashlib.sha256(content).hexdigest() != manifest["index"].get("sha256"):
+        raise DatasetError("it is damaged (its checksum is wrong)")
+    try:
+        index = pq.read_table(BytesIO(content), use_threads=False)
+    except (pa.ArrowException, OSError) as error:
+        raise DatasetError(f"it is no Parquet file ({error})") from None
+    if not index.schema.equals(INDEX_SCHEMA):
+        raise DatasetError(f"it has other columns than schema version {SCHEMA_VERSION} asks for")
+    return index
+
+
+def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
+    """Name what a manifest lacks that something else than this package wrote."""
+    lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
+    if not lacking:
+        entries = manifest["shards"].items()
+        lacking = [f"{key} of {name}" for name, entry in entries for key in _SHARD_KEYS if key not in entry]
+    return lacking
 
 
 def fingerprint(path: Path) -> dict[str, Any]:  # Any: a number and a text

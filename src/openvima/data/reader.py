@@ -1,18 +1,14 @@
 """Reading demonstrations: single shards, and whole folders by episode."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from openvima.data.checksums import Frame, Span, mapped
 from openvima.data.encoding import ShardInfo, decode
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, manifest_checksum
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_index, parse_manifest
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS, SCHEMA_VERSION
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -201,15 +197,14 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         fault = "is not finished: repeat its `openvima generate` command" if begun else "holds no data set"
         raise DatasetError(f"{folder} {fault} ({MANIFEST_NAME} is missing).")
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        written_as, checksum = manifest["schema"], manifest.get("checksum")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise DatasetError(f"{path} is damaged (it is no JSON of ours). {_remedy(folder)}") from None
-    if written_as != SCHEMA_VERSION:
-        raise DatasetError(f"{path} has schema {written_as}; this package reads {SCHEMA_VERSION}.")
-    if checksum != manifest_checksum(manifest):
-        raise DatasetError(f"{path} is damaged or was edited (its checksum is wrong). {_remedy(folder)}")
-    return manifest
+        return parse_manifest(path.read_bytes())
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
+
+
+def remedy(folder: Path) -> str:
+    """Return a sentence that says what makes a damaged folder whole."""
+    return f"`openvima data verify {folder} --repair` makes it anew, or keeps what is whole."
 
 
 def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
@@ -220,7 +215,7 @@ def _mapped(path: Path) -> memoryview:
     try:
         return mapped(path)
     except FileNotFoundError:
-        raise ShardError(f"there is no file {path}. {_remedy(path.parent)}") from None
+        raise ShardError(f"there is no file {path}. {remedy(path.parent)}") from None
     except _ODD_ERRORS as error:
         raise ShardError(_damaged(path, "it", error)) from None
 
@@ -235,22 +230,17 @@ def _opened(path: Path, columns: list[int] | None = None) -> pa.RecordBatchFileR
 
 def _damaged(path: Path, what: str, error: Exception | str) -> str:
     reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return f"{path}: {what} is truncated, damaged or no shard ({reason}). {_remedy(path.parent)}"
-
-
-def _remedy(folder: Path) -> str:
-    return f"`openvima data verify {folder} --repair` makes it anew, or keeps what is whole."
+    return f"{path}: {what} is truncated, damaged or no shard ({reason}). {remedy(path.parent)}"
 
 
 def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:  # Any: JSON
     path = folder / INDEX_NAME
     try:
-        content = path.read_bytes()
+        return parse_index(path.read_bytes(), manifest)
     except FileNotFoundError:
-        raise DatasetError(f"{path} is missing. {_remedy(folder)}") from None
-    if hashlib.sha256(content).hexdigest() != manifest["index"]["sha256"]:
-        raise DatasetError(f"{path} is damaged (its checksum is wrong). {_remedy(folder)}")
-    return pq.read_table(BytesIO(content), use_threads=False)
+        raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
 
 
 def _of_tasks(index: pa.Table, tasks: Sequence[str], folder: Path) -> pa.Table:
@@ -265,5 +255,5 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         raise DatasetError(
-            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {_remedy(folder)}"
+            f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
         )
