@@ -1,30 +1,22 @@
-"""Demonstrations to record batches and back."""
+"""Demonstrations to record batches."""
 
 import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
 
+from openvima.data.columns import columns_of
 from openvima.data.records import Demonstration
-from openvima.data.schema import CODECS, COLUMNS, IMAGE_SHAPE, JOINTS, POSE, RGB, SCHEMA_VERSION, SEGM, VIEWS
+from openvima.data.schema import ARRAYS, CODECS, COLUMNS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
-from openvima.scene import (
-    ACTION_SHAPES,
-    Action,
-    ObjectRecord,
-    Outcome,
-    Placement,
-    Pose,
-    PromptImage,
-    RenderedPrompt,
-    Scene,
-)
 
 _METADATA_KEY = b"openvima"
+_JOINT_PATHS: pa.ListType = COLUMNS.field("joint_paths").type
+# All other columns, to be made at once: each call into Arrow costs some microseconds.
+_RECORDS = pa.struct([field for field in COLUMNS if field.name not in (*ARRAYS, "joint_paths")])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
 
@@ -122,184 +114,43 @@ def encode(
     Returns:
         A record batch of one row with the columns of `schema.COLUMNS`.
     """
-    images = list(demo.prompt.images.values())
-    values: dict[str, Any] = {  # Any: one column, one type
-        "task": demo.task,
-        "level": demo.level,
-        "domain": demo.domain,
-        "seed": demo.seed,
-        "steps": demo.num_steps,
-        "max_steps": demo.max_steps,
-        "redraws": demo.num_redraws,
-        "content_hash": demo.content_hash(),
+    columns = columns_of(demo)
+    records = {
+        **columns.records,
+        "content_hash": columns.content_hash(demo.assets),
         "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
-        "success": demo.outcome.success,
-        "failure": demo.outcome.failure,
-        "reason": demo.outcome.reason,
-        "end_effector": demo.end_effector,
-        "objects": _objects(demo),
-        "poses": _rows(POSE, [_pose_row(p.pose) for scene in demo.scenes for p in scene.placements]),
-        **{key: [getattr(action, key) for action in demo.actions] for key in ACTION_SHAPES},
-        "pick_ids": list(demo.pick_ids),
-        "place_ids": list(demo.place_ids),
-        "joint_paths": _nested_rows(demo.joint_paths),
-        "prompt": demo.prompt.text,
-        "prompt_images": [_prompt_image(image) for image in images],
     }
-    drawn, seen = (images, slice(None)) if with_images else ([], slice(0))
-    for view in VIEWS:
-        values[f"prompt_rgb_{view}"] = _rows(RGB, [np.moveaxis(image.rgb[view], 0, -1) for image in drawn])
-        values[f"prompt_segm_{view}"] = _rows(SEGM, [image.segm[view] for image in drawn])
-        values[f"rgb_{view}"] = _rows(RGB, np.moveaxis(demo.rgb[view][seen], 1, -1))
-        values[f"segm_{view}"] = _rows(SEGM, demo.segm[view][seen])
-    return pa.record_batch([_column(field, values[field.name]) for field in COLUMNS], schema=COLUMNS)
+    images = {name: array if with_images else array[:0] for name, array in columns.images.items()}
+    arrays = {**columns.arrays, **images}
+    cells: dict[str, pa.Array] = {
+        "joint_paths": _nested_cell(arrays.pop("joint_paths"), columns.path_lengths)
+    }
+    cells |= {name: _list_cell(array, COLUMNS.field(name).type) for name, array in arrays.items()}
+    plain = pa.array([records], type=_RECORDS).flatten()
+    cells |= {field.name: cell for field, cell in zip(_RECORDS, plain, strict=True)}
+    return pa.RecordBatch.from_arrays([cells[name] for name in COLUMNS.names], schema=COLUMNS)
 
 
-def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
-    """Make a demonstration of one row.
+def _list_cell(array: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
+    """A column of one row that lists arrays of one shape, without a copy."""
+    items = _fixed_lists(array, dtype.value_type)
+    return _lists(np.array([0, len(items)], np.int32), items, dtype)
 
-    Args:
-        batch: A record batch of one row, as `encode` gives it.
-        info: What the file says about all its rows.
 
-    Returns:
-        The demonstration; its images are writable copies. Where the file stores none, its dictionaries of
-        images are empty until `redrawing.redrawn` fills them.
-    """
-    views = VIEWS if info.images else ()
-    rgb = {view: np.moveaxis(_images(batch, f"rgb_{view}", 3), -1, 1) for view in views}
-    segm = {view: _images(batch, f"segm_{view}") for view in views}
-    row = {name: batch.column(name)[0] for name in batch.schema.names}
-    return Demonstration(
-        task=row["task"].as_py(),
-        level=row["level"].as_py(),
-        domain=row["domain"].as_py(),
-        seed=row["seed"].as_py(),
-        num_redraws=row["redraws"].as_py(),
-        max_steps=row["max_steps"].as_py(),
-        prompt=_decode_prompt(batch, views),
-        rgb=rgb,
-        segm=segm,
-        end_effector=row["end_effector"].as_py(),
-        actions=_decode_actions(batch),
-        pick_ids=tuple(row["pick_ids"].as_py()),
-        place_ids=tuple(row["place_ids"].as_py()),
-        joint_paths=tuple(_array(path.values, (-1, 6)) for path in row["joint_paths"]),
-        objects=_decode_records(batch),
-        scenes=_decode_scenes(batch),
-        outcome=Outcome(row["success"].as_py(), row["failure"].as_py(), row["reason"].as_py()),
-        assets=info.assets,
-        versions=dict(info.versions),
+def _nested_cell(array: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
+    """The column of joint paths of one row, without a copy."""
+    ends = np.cumsum([0, *lengths], dtype=np.int32)
+    steps = _JOINT_PATHS.value_type
+    paths = _lists(ends, _fixed_lists(array, steps.value_type), steps)
+    return _lists(np.array([0, len(lengths)], np.int32), paths, _JOINT_PATHS)
+
+
+def _lists(offsets: np.ndarray, items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
+    return pa.Array.from_buffers(
+        dtype, len(offsets) - 1, [None, pa.py_buffer(offsets)], null_count=0, children=[items]
     )
 
 
-def _column(field: pa.Field, value: object) -> pa.Array:
-    return value if isinstance(value, pa.Array) else pa.array([value], type=field.type)
-
-
-def _rows(dtype: pa.FixedSizeListType, rows: Iterable[object]) -> pa.ListArray:
-    """A column of one cell that lists arrays of the same length."""
-    stacked = np.ascontiguousarray(rows if isinstance(rows, np.ndarray) else list(rows))
-    flat = pa.array(stacked.reshape(-1).astype(dtype.value_type.to_pandas_dtype(), copy=False))
-    items = pa.FixedSizeListArray.from_arrays(flat, type=dtype)
-    return pa.ListArray.from_arrays(pa.array([0, len(items)], pa.int32()), items, type=_list_type(dtype))
-
-
-def _nested_rows(paths: Sequence[np.ndarray]) -> pa.ListArray:
-    """A column of one cell that lists, for each step, the waypoints of the arm."""
-    joined = np.concatenate([np.zeros((0, 6), np.float32), *paths])
-    waypoints = _rows(JOINTS, joined)
-    ends = np.cumsum([0, *(len(path) for path in paths)])
-    steps = pa.ListArray.from_arrays(
-        pa.array(ends, pa.int32()), waypoints.values, type=COLUMNS.field("joint_paths").type.value_type
-    )
-    return pa.ListArray.from_arrays(
-        pa.array([0, len(paths)], pa.int32()), steps, type=COLUMNS.field("joint_paths").type
-    )
-
-
-def _list_type(dtype: pa.DataType) -> pa.ListType:
-    return pa.list_(pa.field("item", dtype, nullable=False))
-
-
-def _objects(demo: Demonstration) -> list[dict[str, object]]:
-    if not demo.scenes:
-        unknown = {"size": (math.nan,) * 3, "scale": (math.nan,) * 3, "fixed": False}
-        return [{**_record(record), **unknown} for record in demo.objects]
-    return [
-        {**_record(record), "size": placement.size, "scale": placement.scale, "fixed": placement.fixed}
-        for record, placement in zip(demo.objects, demo.scenes[0].placements, strict=True)
-    ]
-
-
-def _record(record: ObjectRecord) -> dict[str, object]:
-    return {"id": record.object_id, "object": record.object, "texture": record.texture}
-
-
-def _pose_row(pose: Pose) -> tuple[float, ...]:
-    return (*pose.position, *pose.quaternion)
-
-
-def _prompt_image(image: PromptImage) -> dict[str, object]:
-    return {"name": image.name, "kind": image.kind, "objects": [_record(o) for o in image.objects]}
-
-
-def _array(items: pa.Array, shape: tuple[int, ...]) -> np.ndarray:
-    """A writable copy of a list of fixed-size lists."""
-    return np.array(items.flatten().to_numpy(zero_copy_only=True)).reshape(shape)
-
-
-def _images(batch: pa.RecordBatch, column: str, num_channels: int = 0) -> np.ndarray:
-    channels = (num_channels,) if num_channels else ()
-    return _array(batch.column(column)[0].values, (-1, *IMAGE_SHAPE, *channels))
-
-
-def _decode_prompt(batch: pa.RecordBatch, views: Sequence[str]) -> RenderedPrompt:
-    rgb = {view: np.moveaxis(_images(batch, f"prompt_rgb_{view}", 3), -1, 1) for view in views}
-    segm = {view: _images(batch, f"prompt_segm_{view}") for view in views}
-    images = {}
-    for index, entry in enumerate(batch.column("prompt_images")[0].as_py()):
-        images[entry["name"]] = PromptImage(
-            name=entry["name"],
-            kind=entry["kind"],
-            rgb={view: rgb[view][index] for view in views},
-            segm={view: segm[view][index] for view in views},
-            objects=tuple(ObjectRecord(o["id"], o["object"], o["texture"]) for o in entry["objects"]),
-        )
-    return RenderedPrompt(batch.column("prompt")[0].as_py(), images)
-
-
-def _decode_actions(batch: pa.RecordBatch) -> tuple[Action, ...]:
-    columns = {key: batch.column(key)[0].as_py() for key in ACTION_SHAPES}
-    num_steps = len(columns["pose0_position"])
-    return tuple(
-        Action(**{key: tuple(values[step]) for key, values in columns.items()}) for step in range(num_steps)
-    )
-
-
-def _decode_records(batch: pa.RecordBatch) -> tuple[ObjectRecord, ...]:
-    entries = batch.column("objects")[0].as_py()
-    return tuple(ObjectRecord(entry["id"], entry["object"], entry["texture"]) for entry in entries)
-
-
-def _decode_scenes(batch: pa.RecordBatch) -> tuple[Scene, ...]:
-    objects = batch.column("objects")[0].as_py()
-    poses = _array(batch.column("poses")[0].values, (-1, len(objects), 7)).tolist()
-    end_effector = batch.column("end_effector")[0].as_py()
-    return tuple(
-        Scene(tuple(_placement(o, row) for o, row in zip(objects, rows, strict=True)), end_effector)
-        for rows in poses
-    )
-
-
-def _placement(entry: dict, row: list[float]) -> Placement:
-    x, y, z, qx, qy, qz, qw = row
-    return Placement(
-        id=entry["id"],
-        object=entry["object"],
-        texture=entry["texture"],
-        size=tuple(entry["size"]),
-        pose=Pose((x, y, z), (qx, qy, qz, qw)),
-        fixed=entry["fixed"],
-        scale=tuple(entry["scale"]),
-    )
+def _fixed_lists(array: np.ndarray, dtype: pa.FixedSizeListType) -> pa.FixedSizeListArray:
+    flat = pa.Array.from_buffers(dtype.value_type, array.size, [None, pa.py_buffer(array)], null_count=0)
+    return pa.Array.from_buffers(dtype, array.size // dtype.list_size, [None], null_count=0, children=[flat])

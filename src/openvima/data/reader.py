@@ -7,7 +7,8 @@ from typing import Any
 import pyarrow as pa
 
 from openvima.data.checksums import Frame, Span, mapped
-from openvima.data.encoding import ShardInfo, decode
+from openvima.data.decoding import decode
+from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_index, parse_manifest
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS, SCHEMA_VERSION

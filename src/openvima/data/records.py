@@ -1,8 +1,5 @@
 """A demonstration: everything that one run of the oracle showed, did and led to."""
 
-import hashlib
-import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -11,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openvima import __version__
+from openvima.data.columns import columns_of
 from openvima.scene import (
-    ACTION_SHAPES,
     END_EFFECTORS,
     Action,
     EndEffector,
@@ -95,11 +92,7 @@ class Demonstration:
         Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
         versions of the packages do not count.
         """
-        digest = hashlib.sha256()
-        for part in _content(self):
-            digest.update(memoryview(part).nbytes.to_bytes(8, "little"))
-            digest.update(part)
-        return digest.hexdigest()[:32]
+        return columns_of(self).content_hash(self.assets)
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
@@ -162,42 +155,3 @@ def _versions() -> dict[str, str]:
 
 def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:
     return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}
-
-
-def _content(demo: Demonstration) -> Iterator[bytes | memoryview]:
-    """All content in a fixed order: texts and small numbers as JSON, arrays as little-endian bytes."""
-    yield json.dumps(_summary(demo), sort_keys=True).encode()
-    for view in sorted(demo.rgb):
-        yield from (_plain(demo.rgb[view], "u1"), _plain(demo.segm[view], "u1"))
-    for image in demo.prompt.images.values():
-        for view in sorted(image.rgb):
-            yield from (_plain(image.rgb[view], "u1"), _plain(image.segm[view], "u1"))
-    for action in demo.actions:
-        for key in ACTION_SHAPES:
-            yield _plain(np.array(getattr(action, key)), "<f4")
-    yield from (_plain(path, "<f4") for path in demo.joint_paths)
-    for scene in demo.scenes:
-        poses = [[*p.pose.position, *p.pose.quaternion] for p in scene.placements]
-        yield _plain(np.array(poses), "<f8")
-
-
-def _summary(demo: Demonstration) -> dict:
-    return {
-        "task": [demo.task, demo.level, demo.domain, demo.seed, demo.num_redraws, demo.max_steps],
-        "prompt": demo.prompt.text,
-        "images": [
-            [image.name, image.kind, [[o.object_id, o.object, o.texture] for o in image.objects]]
-            for image in demo.prompt.images.values()
-        ],
-        "end_effector": demo.end_effector,
-        "ids": [demo.pick_ids, demo.place_ids],
-        "objects": [[o.object_id, o.object, o.texture] for o in demo.objects],
-        "placements": [[p.size, p.fixed, p.scale] for scene in demo.scenes[:1] for p in scene.placements],
-        "outcome": [demo.outcome.success, demo.outcome.failure, demo.outcome.reason],
-        "assets": demo.assets,
-    }
-
-
-def _plain(array: np.ndarray, dtype: str) -> memoryview:
-    """The array's values in order, little-endian."""
-    return np.ascontiguousarray(array, dtype=dtype).reshape(-1).data

@@ -86,3 +86,14 @@ COLUMNS = pa.schema(
         *(_field(f"segm_{view}", _list(SEGM), _SEGM_SHAPE) for view in VIEWS),
     ]
 )
+
+# Columns that list arrays of one shape: their dtype and shape.
+ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "poses": ("<f8", (7,)),
+    "pose0_position": ("<f4", (2,)),
+    "pose0_rotation": ("<f4", (4,)),
+    "pose1_position": ("<f4", (2,)),
+    "pose1_rotation": ("<f4", (4,)),
+    **{f"{kind}rgb_{view}": ("u1", (*IMAGE_SHAPE, 3)) for kind in ("prompt_", "") for view in VIEWS},
+    **{f"{kind}segm_{view}": ("u1", IMAGE_SHAPE) for kind in ("prompt_", "") for view in VIEWS},
+}

@@ -1,0 +1,160 @@
+"""A demonstration as columns: texts, records and arrays in the layout in which shards store them."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xxhash
+
+from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.scene import ACTION_SHAPES, ObjectRecord
+
+if TYPE_CHECKING:
+    from openvima.data.records import Demonstration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """A demonstration, column by column; only "content_hash" and "skipped" are missing.
+
+    Args:
+        records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
+        arrays: Column name to numbers, little-endian: `poses` (T + 1, objects, 7), the four arrays of the
+            actions (T, 2) and (T, 4), and `joint_paths`, the waypoints of all steps after each other, (W, 6).
+        path_lengths: Number of waypoints of each step.
+        images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
+            and `segm_…` (N, 128, 256).
+    """
+
+    records: dict[str, Any]  # Any: texts, numbers, and lists and dictionaries of them
+    arrays: dict[str, np.ndarray]
+    path_lengths: list[int]
+    images: dict[str, np.ndarray]
+
+    def content_hash(self, assets: str) -> str:
+        """Return 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
+
+        Args:
+            assets: Name of the asset pack.
+        """
+        described = {**self.records, "assets": assets, "path_lengths": self.path_lengths}
+        digest = xxhash.xxh3_128(json.dumps(described, sort_keys=True).encode())
+        for array in (*self.arrays.values(), *self.images.values()):
+            digest.update(array.nbytes.to_bytes(8, "little"))
+            digest.update(array.reshape(-1).view(np.uint8).data)
+        return digest.hexdigest()
+
+
+def columns_of(demo: "Demonstration") -> Columns:
+    """Return the columns of a demonstration."""
+    return Columns(
+        records=_records(demo),
+        arrays=_arrays(demo),
+        path_lengths=[len(path) for path in demo.joint_paths],
+        images=_images(demo),
+    )
+
+
+def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+    """Return images with their colours last.
+
+    Args:
+        planes: N images of shape (3, 128, 256), uint8.
+
+    Returns:
+        Shape (N, 128, 256, 3), uint8, contiguous.
+    """
+    from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
+
+    joined = np.empty((len(planes), *IMAGE_SHAPE, 3), np.uint8)
+    for image, out in zip(planes, joined, strict=True):
+        join_colours(np.ascontiguousarray(image).reshape(3, -1), out.reshape(-1))
+    return joined
+
+
+def planes(pixels: np.ndarray) -> np.ndarray:
+    """Return images with their colours first, as observations have them.
+
+    Args:
+        pixels: Shape (N, 128, 256, 3), uint8, contiguous.
+
+    Returns:
+        A copy of shape (N, 3, 128, 256), uint8, contiguous.
+    """
+    from openvima.data.kernels import part_colours
+
+    parted = np.empty((len(pixels), 3, *IMAGE_SHAPE), np.uint8)
+    for image, out in zip(pixels, parted, strict=True):
+        part_colours(image.reshape(-1), out.reshape(3, -1))
+    return parted
+
+
+def _records(demo: "Demonstration") -> dict[str, Any]:  # Any: as in `Columns`
+    return {
+        "task": demo.task,
+        "level": demo.level,
+        "domain": demo.domain,
+        "seed": demo.seed,
+        "steps": demo.num_steps,
+        "max_steps": demo.max_steps,
+        "redraws": demo.num_redraws,
+        "success": demo.outcome.success,
+        "failure": demo.outcome.failure,
+        "reason": demo.outcome.reason,
+        "end_effector": demo.end_effector,
+        "objects": _objects(demo),
+        "pick_ids": list(demo.pick_ids),
+        "place_ids": list(demo.place_ids),
+        "prompt": demo.prompt.text,
+        "prompt_images": [
+            {"name": image.name, "kind": image.kind, "objects": [_record(shown) for shown in image.objects]}
+            for image in demo.prompt.images.values()
+        ],
+    }
+
+
+def _objects(demo: "Demonstration") -> list[dict[str, object]]:
+    records = [_record(record) for record in demo.objects]
+    if not demo.scenes:
+        unknown = [math.nan] * 3
+        return [{**record, "size": unknown, "scale": unknown, "fixed": False} for record in records]
+    return [
+        {**record, "size": _floats(p.size), "scale": _floats(p.scale), "fixed": p.fixed}
+        for record, p in zip(records, demo.scenes[0].placements, strict=True)
+    ]
+
+
+def _record(record: ObjectRecord) -> dict[str, object]:
+    return {"id": record.object_id, "object": record.object, "texture": record.texture}
+
+
+def _floats(values: Sequence[float]) -> list[float]:
+    return [float(value) for value in values]  # as text, 1 and 1.0 would differ
+
+
+def _arrays(demo: "Demonstration") -> dict[str, np.ndarray]:
+    poses = [[(*p.pose.position, *p.pose.quaternion) for p in scene.placements] for scene in demo.scenes]
+    arrays: dict[str, np.ndarray] = {
+        "poses": np.array(poses, "<f8").reshape(len(poses), len(demo.objects), 7)
+    }
+    for name, width in ACTION_SHAPES.items():
+        values = np.array([getattr(action, name) for action in demo.actions], "<f4")
+        arrays[name] = values.reshape(-1, width)
+    paths = [np.zeros((0, 6), "<f4"), *demo.joint_paths]
+    arrays["joint_paths"] = np.concatenate(paths).astype("<f4", copy=False)
+    return arrays
+
+
+def _images(demo: "Demonstration") -> dict[str, np.ndarray]:
+    shown = list(demo.prompt.images.values())
+    segm = {view: [image.segm[view] for image in shown] for view in VIEWS}
+    empty = np.zeros((0, *IMAGE_SHAPE), np.uint8)
+    return {
+        **{f"prompt_rgb_{view}": pixels([image.rgb[view] for image in shown]) for view in VIEWS},
+        **{f"prompt_segm_{view}": np.stack(segm[view]) if shown else empty for view in VIEWS},
+        **{f"rgb_{view}": pixels(demo.rgb[view]) for view in VIEWS},
+        **{f"segm_{view}": np.ascontiguousarray(demo.segm[view]) for view in VIEWS},
+    }
