@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 from openvima.data.lerobot.layout import FileNumber
 
 _COMPRESSION = "snappy"  # as LeRobot writes
+_FOOTER_BYTES = 400  # what a file's end holds for each column of a row group, generously
 
 
 class NumberedTable:
@@ -25,20 +26,20 @@ class NumberedTable:
         group_bytes: Size of a row group before compression.
     """
 
-    def __init__(self, folder: Path, pattern: str, *, limit_bytes: int, group_bytes: int = 2**20) -> None:
+    def __init__(self, folder: Path, pattern: str, *, limit_bytes: int, group_bytes: int = 2**22) -> None:
         self._folder, self._pattern = folder, pattern
         self._limit_bytes, self._group_bytes = limit_bytes, group_bytes
         self._number: FileNumber | None = None
         self._writer: pq.ParquetWriter | None = None
         self._file: pa.NativeFile | None = None
         self._waiting: list[pa.Table] = []
-        self._waiting_bytes = 0
+        self._waiting_bytes = self._footer_bytes = 0
 
     def place(self, num_bytes: int) -> FileNumber:
         """Return the number of the file that takes the next rows, whose size is `num_bytes`."""
         if self._number is None:
             return FileNumber()
-        written = self._file.tell() if self._file else 0
+        written = (self._file.tell() if self._file else 0) + self._footer_bytes
         is_full = written + self._waiting_bytes + num_bytes >= self._limit_bytes
         return self._number.next() if is_full else self._number
 
@@ -55,6 +56,8 @@ class NumberedTable:
         if number != self._number:
             self.close()
             self._number = number
+        if not self._waiting:
+            self._footer_bytes += _FOOTER_BYTES * rows.num_columns
         self._waiting.append(rows)
         self._waiting_bytes += rows.nbytes
         if self._waiting_bytes >= self._group_bytes:
@@ -68,6 +71,7 @@ class NumberedTable:
             self._writer.close()
             self._file.close()
             self._writer = self._file = None
+            self._footer_bytes = 0
 
     def __enter__(self) -> "NumberedTable":
         return self
