@@ -163,7 +163,8 @@ def write_zip(path: Path, episodes: dict[str, dict[str, bytes]], root: str = "vi
             for name, content in files.items():
                 write(f"{root}{folder}/{name}", content)
             write(f"__MACOSX/{root}{folder}/._obs.pkl", b"x")
-            write(f"{root}{folder.partition('/')[0]}/metadata.pkl", pickled({"n_steps_min": 1}))
+        for task in dict.fromkeys(folder.partition("/")[0] for folder in episodes):
+            write(f"{root}{task}/metadata.pkl", pickled({"n_steps_min": 1}))
     return path
 
 

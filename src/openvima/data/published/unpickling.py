@@ -109,6 +109,8 @@ def as_array(value: object) -> np.ndarray:
     try:
         _, shape, dtype, by_columns, content = value.state
         return _frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")
+    except MemberError:
+        raise
     except (TypeError, ValueError, OverflowError):
         raise MemberError("it has an array whose size, shape and type do not fit each other.") from None
 
@@ -124,6 +126,8 @@ def as_plain(value: object) -> object:
     try:
         dtype, content = value.args
         return _frombuffer(content, dtype).reshape(()).item()
+    except MemberError:
+        raise
     except (TypeError, ValueError):
         raise MemberError("it has a number whose size and type do not fit.") from None
 

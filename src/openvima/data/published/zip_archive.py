@@ -27,7 +27,7 @@ _LENGTHS = struct.Struct("<3H")  # of name, extra fields and comment
 _LENGTHS_AT = 28
 _HEAD = struct.Struct("<4s2B4HL2L2H")
 _LONGEST_COMMENT = 0xFFFF
-_IN_EXTRA_2, _IN_EXTRA_4 = 0xFFFF, 0xFFFFFFFF  # "the number is too large for this field"
+_IN_EXTRA = 0xFFFFFFFF  # "the number is too large for this field"
 _EXTRA_64 = 1
 _ENCRYPTED = 1
 _STORED, _DEFLATED = 0, 8
@@ -170,10 +170,11 @@ def _directory(file: BinaryIO, path: Path) -> tuple[int, int, int]:
     at = tail.rfind(b"PK\5\6")
     if at < 0 or at + _END.size > len(tail):
         raise DatasetError(f"{path} is no zip archive, or its end is missing (an interrupted download?).")
-    _, disk, first_disk, _, count, num_bytes, offset, _ = _END.unpack_from(tail, at)
+    _, disk, first_disk, _, _, num_bytes, offset, _ = _END.unpack_from(tail, at)
     end = tail_start + at
-    if _IN_EXTRA_2 in (disk, count) or _IN_EXTRA_4 in (num_bytes, offset):
-        end, num_bytes, offset = _end_64(file, end, path) or (end, num_bytes, offset)
+    large = _end_64(file, end, path)
+    if large is not None:
+        end, num_bytes, offset = large
     elif disk or first_disk:
         raise DatasetError(f"{path} is one of several parts of an archive; join them first.")
     start = end - num_bytes
@@ -228,7 +229,7 @@ def _members(directory: bytes) -> Iterator[_Member]:
 
 def _large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, int, int]:
     """Replace numbers that did not fit into four bytes by those of the 64-bit extra field."""
-    if _IN_EXTRA_4 not in numbers:
+    if _IN_EXTRA not in numbers:
         return numbers
     position = 0
     while position + 4 <= len(extra):
@@ -237,7 +238,7 @@ def _large_numbers(extra: bytes, numbers: tuple[int, int, int]) -> tuple[int, in
         if kind == _EXTRA_64:
             field = extra[position : position + length]
             large = iter(struct.unpack_from(f"<{len(field) // 8}Q", field))
-            size, packed, offset = (next(large, n) if n == _IN_EXTRA_4 else n for n in numbers)
+            size, packed, offset = (next(large, n) if n == _IN_EXTRA else n for n in numbers)
             return size, packed, offset
         position += length
     return numbers

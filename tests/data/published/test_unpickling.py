@@ -1,0 +1,298 @@
+"""Pickles are read as data: what they hold comes out, and nothing that they name is ever run."""
+
+import copyreg
+import functools
+import io
+import math
+import os
+import pickle
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import published_data
+from openvima.data.published.unpickling import MAX_OPERATIONS, Global, Record, as_array, as_plain, read_pickle
+from openvima.errors import MemberError
+
+PROTO = b"\x80\x04"
+SCALARS = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text()
+VALUES = st.recursive(
+    SCALARS | st.binary(),
+    lambda inner: (
+        st.lists(inner) | st.tuples(inner, inner) | st.dictionaries(st.text() | st.integers(), inner)
+    ),
+    max_leaves=15,
+)
+
+
+@given(VALUES, st.integers(3, 5))
+def test_plain_values_come_back(value: object, protocol: int) -> None:
+    assert read_pickle(pickle.dumps(value, protocol)) == value
+
+
+def test_what_occurs_twice_comes_back_twice() -> None:
+    inner = ["a", "b"]
+    first, second = read_pickle(pickle.dumps([inner, inner], 4))
+    assert first is second
+
+
+@pytest.mark.parametrize("dtype", ["|u1", "<i8", ">i2", "<f4", ">f8", "?", "<u4"])
+def test_arrays_come_back(dtype: str) -> None:
+    array = np.arange(24).astype(dtype).reshape(2, 3, 4)
+    for value in (array, np.asfortranarray(array), array[:0]):
+        for content in (pickle.dumps(value, 4), published_data.pickled(value)):
+            read = as_array(read_pickle(content))
+            assert read.dtype == array.dtype
+            assert np.array_equal(read, value)
+
+
+@pytest.mark.parametrize("number", [np.int64(-3), np.float32(0.5), np.bool_(True), np.uint8(9)])
+def test_numbers_of_numpy_come_back(number: np.generic) -> None:
+    value = as_plain(read_pickle(pickle.dumps(number, 4)))
+    assert value == number
+    assert type(value) is type(number.item())
+
+
+def test_objects_stay_records() -> None:
+    episode = published_data.MadeEpisode()
+    for generation in (published_data.PUBLISHED, published_data.TODAY):
+        home = f"{generation.package}.tasks.components.encyclopedia"
+        fields = read_pickle(published_data.pickled(episode.trajectory(generation)))
+        info = fields["obj_id_to_info"][5]
+        assert info["obj_size_range"].name == f"{home}.definitions.SizeRange"
+        assert info["obj_size_range"].args == ((0.1, 0.1, 0.02), (0.2, 0.1, 0.02))
+        assert info["obj_profile"].args == (-1,)
+        assert info["obj_replace_fn"].args == (Global(f"{home}.replace_fns._kit_obj_common"),)
+        assert info["obj_replace_fn"].state[2] == {"fname": "a.obj"}
+    old = read_pickle(published_data.pickled(episode.trajectory(published_data.PUBLISHED)))
+    assert [node.state["_val"] for node in old["modalities"].state["_content"]] == ["rgb", "segm"]
+    with pytest.raises(TypeError):
+        old["modalities"]()
+
+
+class Calls:
+    """Pickles as the call of a function."""
+
+    def __init__(self, function: Callable, *args: object) -> None:
+        self.call = function, args
+
+    def __reduce__(self) -> tuple:
+        return self.call
+
+
+def text(value: str) -> bytes:
+    return b"\x8c" + struct.pack("<B", len(value)) + value.encode()
+
+
+def named(module: str, name: str) -> bytes:
+    return text(module) + text(name) + b"\x93"
+
+
+def attack(touch: str) -> dict[str, bytes]:
+    """Pickles that run a command when `pickle` loads them."""
+    eat = f"__import__('os').system({touch!r})"
+    return {
+        "os.system": PROTO + named("os", "system") + text(touch) + b"\x85R.",
+        "a call by __reduce__": pickle.dumps(Calls(os.system, touch), 4),
+        "builtins.eval": pickle.dumps(Calls(eval, eat), 4),
+        "builtins.exec, old protocol": pickle.dumps(Calls(exec, eat), 2),
+        "oldest protocol": pickle.dumps(Calls(os.system, touch), 0),
+        "INST": b"(X" + struct.pack("<I", len(touch)) + touch.encode() + b"ios\nsystem\n.",
+        "OBJ": b"(cos\nsystem\nX" + struct.pack("<I", len(touch)) + touch.encode() + b"o.",
+        "GLOBAL": b"cos\nsystem\nX" + struct.pack("<I", len(touch)) + touch.encode() + b"\x85R.",
+        "NEWOBJ": PROTO + named("subprocess", "Popen") + text(touch) + b"}" + text("shell") + b"\x88s\x92.",
+        "getattr": PROTO
+        + named("builtins", "getattr") + named("os", "path") + text("os") + b"\x86R0"
+        + named("os", "system") + text(touch) + b"\x85R.",
+        "a dotted name": PROTO + named("shutil", "os.system") + text(touch) + b"\x85R.",
+        "functools.partial": pickle.dumps(Calls(functools.partial(os.system, touch)), 4),
+        "a call in an array": pickle.dumps(np.array([Calls(os.system, touch)], dtype=object), 4),
+        "a call as a key": PROTO + b"}" + named("os", "system") + text(touch) + b"\x85RK\x01s.",
+        "a call after the mark": PROTO + b"(" + named("os", "system") + text(touch) + b"\x85Rl.",
+        "a default that calls": PROTO
+        + named("collections", "defaultdict") + named("os", "getcwd") + b"\x85R0"
+        + named("os", "system") + text(touch) + b"\x85R.",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", sorted(attack("")))
+def test_hostile_pickles_are_refused_and_nothing_runs(kind: str, tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+    content = attack(f"touch {marker}")[kind]
+    with pytest.raises(MemberError, match=r"nothing was run|no pickle of data") as error:
+        read_pickle(content)
+    assert not marker.exists()
+    if kind != "NEWOBJ":  # the shell that it starts would outlive the test
+        pickle.loads(content)
+        assert marker.exists(), "this pickle is not hostile"
+    if kind in ("os.system", "builtins.eval"):
+        assert f"names {kind}," in str(error.value)
+
+
+def test_functions_that_other_code_has_registered_are_refused(tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+    content = PROTO + b"\x82\x07" + text(f"touch {marker}") + b"\x85R."
+    copyreg.add_extension("os", "system", 7)
+    try:
+        with pytest.raises(MemberError, match=r"EXT1.*nothing was run"):
+            read_pickle(content)
+        assert not marker.exists()
+        pickle.loads(content)
+        assert marker.exists(), "this pickle is not hostile"
+    finally:
+        copyreg.remove_extension("os", "system", 7)
+
+
+SIZE_RANGE = named("vimasim.tasks.components.encyclopedia.definitions", "SizeRange") + b")\x81"
+REPLACE = named("vimasim.tasks.components.encyclopedia.replace_fns", "_kit_obj_common")
+
+
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        (REPLACE + b")R", r"calls \S+\._kit_obj_common"),
+        (named("functools", "partial") + REPLACE + b"\x85R)R", "calls functools.partial"),
+        (SIZE_RANGE + b")R", "calls .*SizeRange"),
+        (named("typing", "Any") + b")R", "calls typing.Any"),
+        (named("numpy", "ndarray") + b"K\x05\x85R", "calls numpy.ndarray"),
+        (named("builtins", "list") + b")R", "calls builtins.list"),
+        (text("os") + b")R", "calls 'os'"),
+        (REPLACE + b"}" + text("__code__") + b"Nsb", "changes .*_kit_obj_common"),
+        (b"]" + b"}" + text("append") + b"Nsb", "changes a list"),
+        (named("numpy", "load"), "names numpy.load,"),
+        (named("functools", "partial.__class__"), "names functools.partial.__class__,"),
+        (named("numpy", "ndarray.tofile"), "names numpy.ndarray.tofile,"),
+        (
+            named("vimasim.tasks.components.encyclopedia.definitions", "os.system"),
+            "names vimasim.*os.system,",
+        ),
+        (named("builtins", "getattr"), "names builtins.getattr,"),
+        (b"Pid\n", "PERSID"),
+        (b"Nq\x00Q", "BINPERSID"),
+        (b"\x97", "NEXT_BUFFER"),
+        (b"\xff", "0xff"),
+        (SIZE_RANGE + b"(K\x01e", "fills .*SizeRange"),
+    ],
+)
+def test_what_no_published_file_does_is_refused(content: bytes, fault: str) -> None:
+    with pytest.raises(MemberError, match=fault):
+        read_pickle(PROTO + content + b".")
+
+
+def test_the_state_of_an_object_changes_nothing_but_its_record() -> None:
+    state = {"__class__": 1, "__setattr__": 2, "__dict__": 3, "name": "os.system", "args": (4,)}
+    content = pickle.dumps(state, 4).removeprefix(PROTO).removesuffix(b".")
+    record = read_pickle(PROTO + SIZE_RANGE + content + b"b.")
+    assert type(record) is Record
+    assert record.name.endswith("SizeRange")
+    assert record.args == ()
+    assert record.state == state
+
+
+def array_pickle(shape: object, dtype: str, content: object) -> bytes:
+    """A pickle of an array with a head that need not fit."""
+    sink = io.BytesIO()
+    pickler = pickle.Pickler(sink, 4)
+    pickler.dump((1, shape, Calls(np.dtype, dtype, False, True), False, content))
+    state = sink.getvalue().removeprefix(PROTO).removesuffix(b".")
+    made = (
+        named("numpy.core.multiarray", "_reconstruct") + named("numpy", "ndarray") + b"K\x00\x85C\x01b\x87R"
+    )
+    return PROTO + made + state + b"b."
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "content", "fault"),
+    [
+        ((10**12,), "u1", b"abc", "do not fit"),
+        ((10**30,), "u1", b"abc", "do not fit"),
+        ((-1, 5), "u1", b"abc", "do not fit"),
+        ((2.5,), "u1", b"ab", "do not fit"),
+        (("x",), "u1", b"ab", "do not fit"),
+        ((1,) * 100, "u1", b"a", "do not fit"),
+        ((1,), "O8", [None], "do not fit|only numbers"),
+        ((1,), "O8", b"12345678", "type 'O8'; only numbers"),
+        ((1,), "V8", b"12345678", "type 'V8'; only numbers"),
+        ((1,), "M8", b"12345678", "type 'M8'; only numbers"),
+        ((1,), "u1", "text", "do not fit"),
+        ((1,), "u1", [1], "do not fit"),
+        ((3,), "f8", b"abc", "do not fit"),
+    ],
+)
+def test_arrays_are_never_larger_than_their_bytes(
+    shape: object, dtype: str, content: object, fault: str
+) -> None:
+    value = read_pickle(array_pickle(shape, dtype, content))
+    with pytest.raises(MemberError, match=fault):
+        as_array(value)
+
+
+def test_other_things_are_no_arrays() -> None:
+    for value in (None, [], "x", {}, Record("numpy.core.multiarray._reconstruct", ())):
+        with pytest.raises(MemberError, match="where an array should be"):
+            as_array(value)
+    with pytest.raises(MemberError, match="do not fit"):
+        as_plain(Record("numpy.core.multiarray.scalar", (1, 2, 3)))
+
+
+def test_no_beginning_of_a_pickle_reads_as_whole() -> None:
+    content = published_data.pickled(published_data.MadeEpisode().actions(3))
+    for length in range(len(content)):
+        with pytest.raises(MemberError):
+            read_pickle(content[:length])
+
+
+@given(st.data())
+def test_damage_gives_a_value_or_an_error_that_says_so(data: st.DataObject) -> None:
+    whole = published_data.pickled(
+        {"a": [1, 2.5, None], "b": np.arange(4), "c": (True, b"bytes", "text" * 20)}
+    )
+    content = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 6))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        read_pickle(bytes(content))
+    except MemberError as error:
+        assert len(str(error)) < 400
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_give_a_value_or_an_error_that_says_so(content: bytes) -> None:
+    try:
+        read_pickle(content)
+    except MemberError as error:
+        assert len(str(error)) < 400
+
+
+def test_small_files_cannot_cost_much() -> None:
+    """Each keeps `pickle`, or a program that looks at the result, busy for hours, or fills the memory."""
+    nested = b")" + b"q\x00h\x00\x86" * 200  # a tuple with 2 to the 200 leaves, whose hash visits all
+    with pytest.raises(MemberError, match="a tuple as a key"):
+        read_pickle(PROTO + b"}" + nested + b"Ns.")
+    assert read_pickle(PROTO + b"]r\xff\xff\xff\xff.") == []  # a memo of 4 billion places
+    for claim in (
+        b"B\xff\xff\xff\x7f",
+        b"\x8e" + b"\xff" * 7 + b"\x7f",
+        b"X\xff\xff\xff\xff",
+        b"\x8d" + b"\xff" * 8,
+    ):
+        with pytest.raises(MemberError, match="ends too early"):
+            read_pickle(PROTO + claim + b"abc.")
+    with pytest.raises(MemberError, match="more than 100,000 instructions"):
+        read_pickle(PROTO + b"]" * (MAX_OPERATIONS + 5) + b".")
+    deep = read_pickle(PROTO + b"]" * 40_000 + b"a" * 39_999 + b".")
+    with pytest.raises(MemberError, match="it has a list where"):
+        as_array(deep)
+    del deep  # takes itself apart without recursion
+
+
+def test_an_endless_value_is_named_by_its_kind() -> None:
+    endless = read_pickle(PROTO + b"]q\x00h\x00a.")
+    with pytest.raises(MemberError, match="it has a list where"):
+        as_array(endless)
+    assert math.isclose(len(endless), 1)
