@@ -87,8 +87,8 @@ def planes(pixels: np.ndarray) -> np.ndarray:
     from openvima.data.kernels import part_colours
 
     parted = np.empty((len(pixels), 3, *IMAGE_SHAPE), np.uint8)
-    for image, out in zip(pixels, parted, strict=True):
-        part_colours(image.reshape(-1), out.reshape(3, -1))
+    num_pixels = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
+    part_colours(pixels.reshape(-1, 3 * num_pixels), parted.reshape(-1, 3, num_pixels))
     return parted
 
 

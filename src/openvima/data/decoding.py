@@ -77,7 +77,8 @@ def decode_columns(batch: pa.RecordBatch) -> dict[str, Any]:  # Any: one column,
     if batch.num_rows != 1:
         raise ValueError(f"a record has {batch.num_rows} rows, not 1")
     values: dict[str, Any] = {}
-    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+    for number, name in enumerate(batch.schema.names):
+        column = batch.column(number)
         if name in ARRAYS:
             values[name] = _array_in(column, *ARRAYS[name])
         elif name == "joint_paths":

@@ -18,11 +18,12 @@ def join_colours(planes, pixels):
 
 @njit(cache=True)
 def part_colours(pixels, planes):
-    """Copy pixels of three colours, (3 · P,), to red, green and blue planes, (3, P); both uint8, contiguous.
+    """Copy pixels of three colours, (N, 3 · P), to red, green and blue planes, (N, 3, P); both uint8.
 
     Plane by plane it makes 14 GB/s, all three at once only 3.
     """
-    for colour in range(3):
-        plane = planes[colour]
-        for pixel in range(planes.shape[1]):
-            plane[pixel] = pixels[3 * pixel + colour]
+    for image in range(planes.shape[0]):
+        for colour in range(3):
+            given, plane = pixels[image], planes[image, colour]
+            for pixel in range(planes.shape[2]):
+                plane[pixel] = given[3 * pixel + colour]

@@ -7,12 +7,14 @@ from typing import Any
 import pyarrow as pa
 
 from openvima.data.checksums import Frame, Span, mapped
-from openvima.data.decoding import decode
+from openvima.data.columns import columns_of, planes
+from openvima.data.decoding import actions_in, decode, decode_columns
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_index, parse_manifest
-from openvima.data.records import Demonstration
-from openvima.data.schema import COLUMNS, SCHEMA_VERSION
+from openvima.data.records import Demonstration, Step
+from openvima.data.schema import COLUMNS, IMAGES, SCHEMA_VERSION, VIEWS
 from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 
 # What Arrow raises when it is given damaged bytes.
 _ODD_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
@@ -37,7 +39,8 @@ class Shard:
         self._content = _mapped(path)
         if frame is not None and (fault := frame.fault_in(self._content)):
             raise ShardError(_damaged(path, "it", fault))
-        self._reader = _opened(path)
+        self._reader = _opened(path, self._content)
+        self._readers: dict[tuple[str, ...], pa.RecordBatchFileReader] = {}  # of some columns each
         try:
             self.info = ShardInfo.from_metadata(self._reader.schema.metadata)
         except ShardError as error:
@@ -63,14 +66,73 @@ class Shard:
         except ShardError as error:
             raise ShardError(f"{self.path}, record {row}: {error}") from None
 
+    def read(self, row: int, columns: Sequence[str]) -> dict[str, Any]:  # Any: one column, one type
+        """Read some columns of one row; nothing is decompressed for the others.
+
+        Args:
+            row: The row.
+            columns: Names out of `schema.COLUMNS`; docs/format.md lists them.
+
+        Returns:
+            Column name to value: an array for poses, actions and images (colours last, as they are stored), a
+            list of arrays for joint paths, and else texts, numbers, lists and dictionaries.
+
+        Raises:
+            DatasetError: There is no such column.
+            ShardError: The row is damaged.
+        """
+        needed = (*columns, "steps") if "poses" in columns else tuple(columns)
+        batch = self._batch(self._reader_of(needed), row)
+        try:
+            values = decode_columns(batch)
+        except _ODD_ERRORS as error:
+            raise self._row_error(row, error) from None
+        if not self.info.images and not IMAGES.isdisjoint(columns):
+            values |= columns_of(self[row]).images
+        return {name: values[name] for name in columns}
+
+    def step(self, row: int, step: int, *, views: Sequence[str] = VIEWS, segm: bool = True) -> Step:
+        """Read one step of one row.
+
+        Args:
+            row: The row.
+            step: Which one, from 0.
+            views: What of "front" and "top" to read.
+            segm: Whether to read segmentation too.
+
+        Raises:
+            IndexError: The episode has fewer steps.
+            DatasetError: There is no such view.
+            ShardError: The row is damaged.
+        """
+        for view in views:
+            if view not in VIEWS:
+                raise DatasetError(unknown_name("view", view, VIEWS))
+        kinds = ("rgb", "segm") if segm else ("rgb",)
+        images = [f"{kind}_{view}" for kind in kinds for view in views]
+        values = self.read(row, [*images, *ACTION_SHAPES, "end_effector"])
+        actions = actions_in(values)
+        if not 0 <= step < len(actions):
+            raise IndexError(f"step {step} of {len(actions)}; count from 0 to {len(actions) - 1}.")
+        observation: dict[str, Any] = {  # Any: as an environment's
+            "rgb": {view: planes(values[f"rgb_{view}"][step : step + 1])[0] for view in views},
+            "ee": END_EFFECTORS.index(values["end_effector"]),
+        }
+        if segm:
+            observation["segm"] = {view: values[f"segm_{view}"][step] for view in views}
+        return Step(observation, actions[step])
+
     def batch(self, row: int) -> pa.RecordBatch:
         """Read one row as it is stored.
 
         Raises:
             ShardError: It is damaged.
         """
+        return self._batch(self._reader, row)
+
+    def _batch(self, reader: pa.RecordBatchFileReader, row: int) -> pa.RecordBatch:
         try:
-            batch = self._reader.get_batch(row)
+            batch = reader.get_batch(row)
             batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
         except _ODD_ERRORS as error:
             raise self._row_error(row, error) from None
@@ -95,11 +157,21 @@ class Shard:
         Args:
             names: Columns of `schema.COLUMNS`.
         """
-        reader = _opened(self.path, [COLUMNS.get_field_index(name) for name in names])
         try:
-            return reader.read_all().select(list(names))
+            return self._reader_of(names).read_all().select(list(names))
         except _ODD_ERRORS as error:
             raise ShardError(_damaged(self.path, "its records", error)) from None
+
+    def _reader_of(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
+        """A reader to which the other columns do not exist."""
+        key = tuple(columns)
+        if key not in self._readers:
+            for name in columns:
+                if name not in COLUMNS.names:
+                    raise DatasetError(unknown_name("column", name, COLUMNS.names))
+            numbers = [COLUMNS.get_field_index(name) for name in columns]
+            self._readers[key] = _opened(self.path, self._content, numbers)
+        return self._readers[key]
 
     def _row_error(self, row: int, error: Exception | str) -> ShardError:
         return ShardError(_damaged(self.path, f"record {row} of {len(self)}", error))
@@ -147,6 +219,21 @@ class Dataset:
 
     def __iter__(self) -> Iterator[Demonstration]:
         return (self[episode_index] for episode_index in range(len(self)))
+
+    def read(self, episode_index: int, columns: Sequence[str]) -> dict[str, Any]:  # Any: one column, one type
+        """Read some columns of one episode, as `Shard.read` does.
+
+        Example:
+            >>> Dataset("demos").read(0, ["rgb_top", "pose0_position"])["rgb_top"].shape
+            (2, 128, 256, 3)
+        """
+        shard, row = self._checked(episode_index)
+        return shard.read(row, columns)
+
+    def step(self, episode_index: int, step: int, *, views: Sequence[str] = VIEWS, segm: bool = True) -> Step:
+        """Read one step of one episode, as `Shard.step` does."""
+        shard, row = self._checked(episode_index)
+        return shard.step(row, step, views=views, segm=segm)
 
     def batch(self, episode_index: int) -> pa.RecordBatch:
         """Read one episode as it is stored: a row with the columns of `schema.COLUMNS`."""
@@ -221,10 +308,10 @@ def _mapped(path: Path) -> memoryview:
         raise ShardError(_damaged(path, "it", error)) from None
 
 
-def _opened(path: Path, columns: list[int] | None = None) -> pa.RecordBatchFileReader:
+def _opened(path: Path, content: memoryview, columns: list[int] | None = None) -> pa.RecordBatchFileReader:
     options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=columns)
     try:
-        return pa.ipc.open_file(pa.memory_map(str(path)), options=options)
+        return pa.ipc.open_file(pa.py_buffer(content), options=options)
     except _ODD_ERRORS as error:
         raise ShardError(_damaged(path, "it", error)) from None
 

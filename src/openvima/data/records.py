@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -93,6 +93,19 @@ class Demonstration:
         versions of the packages do not count.
         """
         return columns_of(self).content_hash(self.assets)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What the oracle saw, and what it did then.
+
+    Args:
+        observation: As the environment gives it: "rgb" and "segm" of each view, and "ee".
+        action: The action.
+    """
+
+    observation: dict[str, Any]  # Any: nested dictionaries
+    action: Action
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:

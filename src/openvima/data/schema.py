@@ -97,3 +97,4 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     **{f"{kind}rgb_{view}": ("u1", (*IMAGE_SHAPE, 3)) for kind in ("prompt_", "") for view in VIEWS},
     **{f"{kind}segm_{view}": ("u1", IMAGE_SHAPE) for kind in ("prompt_", "") for view in VIEWS},
 }
+IMAGES = frozenset(name for name, (_, shape) in ARRAYS.items() if shape[:2] == IMAGE_SHAPE)
