@@ -32,13 +32,15 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
+from openvima.perception.image_stack import ImageStack
 from openvima.policies import preset
 from openvima.policies.acting import NetworkPolicy
 from openvima.policies.heads.base import ACTION_WIDTH, ActionTargets
-from openvima.policies.inputs import ImageStack, Reader, batch_histories, batch_prompts
+from openvima.policies.inputs import Reader, batch_histories, batch_prompts
 from openvima.policies.network import PolicyNetwork, outline_network
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
-from openvima.training.dataset import make_batch, read_examples
+from openvima.training.collate import Collator
+from openvima.training.dataset import read_examples
 from sim import circumstances
 
 HISTORY = 5
@@ -142,8 +144,8 @@ class Training:
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
         reader = Reader.of(network.config.images, tokenizer_of(network))
-        examples = read_examples(demos, reader, validation_share=0.0, seed=0)
-        batch = make_batch(examples.training)
+        examples = read_examples(demos, reader, validation_share=0.0)
+        batch = Collator(reader)(examples.training)
         used = torch.cat([batch.prompts.crops_VS.flatten(), batch.history.crops_BTVN.flatten()]).unique()
         self._used, self._images = used.to(device), examples.images[used].to(device)
         self._num_images = len(examples.images)

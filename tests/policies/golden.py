@@ -20,13 +20,13 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectViews, see_nothing
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
 from openvima.policies.heads.bins import BinsHead, decode_bins
 from openvima.policies.inputs import (
     WORD,
     HistoryBatch,
-    ImageStack,
     PromptInput,
     Reader,
     StepInput,

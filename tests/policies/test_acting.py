@@ -10,11 +10,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
+from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.acting import NetworkPolicy, drawing  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
-from openvima.policies.inputs import ImageStack, batch_histories, batch_prompts  # noqa: E402
+from openvima.policies.inputs import batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.layers.trunk import MAX_PLACES  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402

@@ -19,7 +19,8 @@ from openvima.policies.layers.prompt_encoder import PromptEncoder, PromptEncoder
 from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
-from openvima.training.dataset import make_batch, read_examples  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import read_examples  # noqa: E402
 
 FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 NUM_LAYERS = 3  # of the text encoder
@@ -70,8 +71,9 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
     with torch.no_grad():  # layers that start at zero stop gradients on their first step
         for parameter in model.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    examples = read_examples(demonstrations, Reader.of(sizes.images), validation_share=0, seed=0)
-    batch = make_batch(examples.training)
+    reader = Reader.of(sizes.images)
+    examples = read_examples(demonstrations, reader, validation_share=0)
+    batch = Collator(reader)(examples.training)
     features = model.encode_images(examples.images)
     memory = model.encode_prompts(batch.prompts, features)
     inputs = model(memory, batch.history, features, batch.targets.actions_BTC)

@@ -12,7 +12,8 @@ from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa:
 from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
-from openvima.training.dataset import make_batch, read_examples  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import read_examples  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -47,8 +48,9 @@ def test_images_and_trunk_of_different_widths_are_refused():
 @pytest.mark.parametrize("name", ["nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano"])
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
-    examples = read_examples(demonstrations, Reader.of(network.config.images), validation_share=0.0, seed=0)
-    batch = make_batch(examples.training)
+    reader = Reader.of(network.config.images)
+    examples = read_examples(demonstrations, reader, validation_share=0.0)
+    batch = Collator(reader)(examples.training)
 
     def loss() -> torch.Tensor:
         features = network.encode_images(examples.images)

@@ -9,42 +9,48 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
+from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.training.augment import augmented  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.dataset import (  # noqa: E402
     groups_of_equal_length,
-    make_batch,
     read_examples,
     rows_of_step,
 )
 
+OBJECTS, VIEWS = Reader("objects"), Reader("views")
+
 
 @pytest.fixture(scope="module")
 def examples(data):
-    return read_examples(Dataset(data), Reader("objects"), validation_share=0.0, seed=0)
+    return read_examples(Dataset(data), Reader("objects"), validation_share=0.0)
 
 
 def test_slots_point_at_the_objects_that_were_picked(data, examples):
-    for demo, example in zip(Dataset(data), examples.training, strict=True):
-        for t, step in enumerate(example.steps):
-            assert step.objects.ids[example.pick_slots[t]] == demo.pick_ids[t]
-            pick = np.array(demo.actions[t].pose0_position)
-            assert np.linalg.norm(step.positions[example.pick_slots[t]] - pick) < 0.06
+    batch = Collator(OBJECTS)(examples.training)
+    for b, demo in enumerate(Dataset(data)):
+        for t, action in enumerate(demo.actions):
+            slot = batch.targets.pick_BT[b, t]
+            seen = observe(demo.observation(t))
+            assert seen.ids[slot] == demo.pick_ids[t]
+            position = batch.history.positions_BTN2[b, t, slot].numpy()
+            assert np.linalg.norm(position - np.array(action.pose0_position)) < 0.06
 
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
-    split = read_examples(Dataset(data), Reader("objects"), validation_share=0.3, seed=0)
-    names = [{(e.task, e.seed) for e in part} for part in (split.training, split.validation)]
+    split = read_examples(Dataset(data), Reader("objects"), validation_share=0.3)
+    names = [{(e.tokens.task, e.tokens.seed) for e in part} for part in (split.training, split.validation)]
     assert names[0].isdisjoint(names[1])
     assert len(names[0] | names[1]) == 24
     assert 1 <= len(names[1]) <= 14
-    fewer = read_examples(list(Dataset(data))[:10], Reader("objects"), validation_share=0.3, seed=0)
-    assert {(e.task, e.seed) for e in fewer.validation} <= names[1]
+    fewer = read_examples(list(Dataset(data))[:10], Reader("objects"), validation_share=0.3)
+    assert {(e.tokens.task, e.tokens.seed) for e in fewer.validation} <= names[1]
 
 
 def test_no_demonstration_is_an_error():
     with pytest.raises(DatasetError, match="no demonstration to learn from"):
-        read_examples([], Reader("objects"), validation_share=0.1, seed=0)
+        read_examples([], Reader("objects"), validation_share=0.1)
 
 
 def test_every_epoch_shows_each_example_once():
@@ -58,11 +64,11 @@ def test_every_epoch_shows_each_example_once():
 def test_groups_hold_all_examples_of_like_length(examples):
     groups = groups_of_equal_length(examples.training)
     assert sum(len(group) for group in groups) == 24
-    assert {len(e.steps) for e in groups[0]} == {1}
+    assert {e.tokens.num_steps for e in groups[0]} == {1}
 
 
 def test_targets_follow_their_objects_through_shuffling(examples):
-    batch = make_batch(examples.training)
+    batch = Collator(OBJECTS)(examples.training)
     generator = torch.Generator().manual_seed(0)
     changed = augmented(batch, "objects", probability=0.5, generator=generator)
     for b, t in np.argwhere(batch.targets.steps_BT.numpy()):
@@ -80,7 +86,7 @@ def test_targets_follow_their_objects_through_shuffling(examples):
 
 
 def test_a_false_detection_shows_in_one_view_only(examples):
-    batch = make_batch(examples.training[:4])
+    batch = Collator(OBJECTS)(examples.training[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
     changed = augmented(
         replace(batch, history=nothing),
@@ -97,7 +103,7 @@ def test_a_false_detection_shows_in_one_view_only(examples):
 def views(demonstrations_of_several_steps):
     """With a token for each view, as the published VIMA has it."""
     reader = Reader("views")
-    return read_examples(demonstrations_of_several_steps, reader, validation_share=0.0, seed=0)
+    return read_examples(demonstrations_of_several_steps, reader, validation_share=0.0)
 
 
 def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
@@ -108,7 +114,7 @@ def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
 
 
 def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_their_order(views):
-    batch = make_batch(views.training)
+    batch = Collator(VIEWS)(views.training)
     changed = augmented(batch, "views", probability=0.5, generator=torch.Generator().manual_seed(0))
     before, after = batch.history, changed.history
     places = []
@@ -127,7 +133,7 @@ def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_t
 
 
 def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
-    batch = make_batch(views.training)
+    batch = Collator(VIEWS)(views.training)
     after = augmented(batch, "views", probability=0.3, generator=torch.Generator().manual_seed(1)).history
     visible_BTV = after.masks_BTVN.sum(dim=3)
     for b, t in np.argwhere(batch.history.steps_BT.numpy()):
@@ -144,7 +150,7 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
 
 
 def test_without_false_detections_views_stay_as_they_are(views):
-    batch = make_batch(views.training)
+    batch = Collator(VIEWS)(views.training)
     after = augmented(batch, "views", probability=0.0, generator=torch.Generator().manual_seed(0)).history
     count = batch.history.masks_BTVN.shape[3]
     assert torch.equal(after.counts_BT, batch.history.counts_BT)
@@ -155,26 +161,8 @@ def test_without_false_detections_views_stay_as_they_are(views):
 
 def test_whole_frames_know_no_false_detections_and_stay_bytes(demonstrations_of_several_steps):
     reader = Reader("frames", (64, 128), tokens_per_frame_pair=1)
-    examples = read_examples(demonstrations_of_several_steps, reader, validation_share=0.0, seed=0)
+    examples = read_examples(demonstrations_of_several_steps, reader, validation_share=0.0)
     assert examples.images.dtype == torch.uint8
     assert examples.images.shape[1:] == (3, 64, 128)
-    batch = make_batch(examples.training)
+    batch = Collator(reader)(examples.training)
     assert augmented(batch, "frames", probability=1.0, generator=torch.Generator()) is batch
-
-
-@pytest.mark.parametrize("layout", ["objects", "views"])
-def test_only_visible_objects_have_an_image_of_their_own(demonstrations_of_several_steps, layout):
-    examples = read_examples(demonstrations_of_several_steps, Reader(layout), validation_share=0.0, seed=0)
-    numbers = [0]
-    for example in examples.training:
-        for objects, crops in zip(
-            (example.prompt.objects, *(step.objects for step in example.steps)),
-            (example.prompt_crops, *example.step_crops),
-            strict=True,
-        ):
-            assert np.array_equal(crops > 0, objects.masks)
-            assert np.array_equal(examples.images[torch.from_numpy(crops)].numpy(), objects.crops)
-            numbers += crops[objects.masks].tolist()
-        numbers += example.spurious.crops.flatten().tolist()
-    assert set(numbers) == set(range(len(examples.images)))
-    assert len(np.unique(examples.images.numpy(), axis=0)) == len(examples.images)  # equal ones share one

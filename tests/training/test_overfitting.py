@@ -17,7 +17,8 @@ from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
-from openvima.training.dataset import Batch, make_batch, read_examples  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import Batch, read_examples  # noqa: E402
 from openvima.training.stages import Cloning  # noqa: E402
 
 DEMONSTRATIONS = {
@@ -61,8 +62,9 @@ def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family
 
 def read(model: PolicyNetwork, runs: Sequence[Demonstration]) -> tuple[Batch, "torch.Tensor"]:
     """One batch of all, and its images."""
-    examples = read_examples(runs, Reader.of(model.config.images), validation_share=0.0, seed=0)
-    return make_batch(examples.training), examples.images
+    reader = Reader.of(model.config.images)
+    examples = read_examples(runs, reader, validation_share=0.0)
+    return Collator(reader)(examples.training), examples.images
 
 
 def learn_by_heart(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]]) -> None:
@@ -135,12 +137,13 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
         trunk=replace(sizes.trunk, width=64, num_layers=1, dropout=0.0),
     )
     runs = [run for group in demonstrations.values() for run in group]
-    examples = read_examples(runs, Reader.of(sizes.images), validation_share=0.0, seed=0)
+    reader = Reader.of(sizes.images)
+    examples = read_examples(runs, reader, validation_share=0.0)
     model = build_network(sizes, seed=0)
     config = TrainingConfig(
         data=tmp_path, out=tmp_path, batch=32, pretraining_steps=0, spurious_probability=0.0
     )
-    stage = Cloning(model, config, replace(examples, validation=examples.training))
+    stage = Cloning(model, config, replace(examples, validation=examples.training), reader)
     optimizer = torch.optim.AdamW(stage.parameters, lr=2e-3)
     for step in range(150):
         optimizer.zero_grad()

@@ -20,6 +20,7 @@ def main(
     threads: int = 1,
     t5: str | None = None,
     assets: str = "procedural",
+    tokens: Path | None = None,
     force: bool = False,
 ) -> int:
     """Train a policy on demonstrations, or go on with a run that was interrupted.
@@ -45,6 +46,7 @@ def main(
         t5: Where the published sizes (vima-2m …) take T5 from: a folder with weights and tokenizer, or
             t5-base to fetch it from the Hugging Face Hub.
         assets: Pack of the demonstrations: procedural, original, or a checkout of the original benchmark.
+        tokens: Folder to keep objects in that are cut out of the demonstrations; by default beside them.
         force: Throw away a run with other settings that is in the run folder.
     """
     from openvima.training import TrainingConfig, train
@@ -62,6 +64,7 @@ def main(
         threads=threads,
         t5=t5,
         assets=assets,
+        tokens=tokens,
         force=force,
     )
     with progress_bar("training") as report:

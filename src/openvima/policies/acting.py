@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from openvima.errors import PolicyError
+from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectFinder
 from openvima.policies.base import Policy, prompt_number
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
 from openvima.policies.inputs import (
     EpisodeReader,
-    ImageStack,
     Reader,
     batch_histories,
     batch_prompts,

@@ -36,6 +36,7 @@ class TrainingConfig:
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder: checkpoints, settings, metrics.
+        tokens: Folder of the token cache; None keeps it beside the demonstrations.
         preset: Network and sizes, such as "nano" or "gato-nano"; `openvima policies` lists them.
         steps: Steps of behaviour cloning.
         batch: Demonstrations a step.
@@ -85,6 +86,7 @@ class TrainingConfig:
     validation_share: float = 0.05
     checkpoint_every: int = 100
     threads: int = 1
+    tokens: Path | None = None
     force: bool = False
 
     def __post_init__(self) -> None:

@@ -13,6 +13,7 @@ import torch
 from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
+from openvima.data.tokens.cache import open_tokens
 from openvima.errors import ConfigError
 from openvima.policies.config import PolicyConfig
 from openvima.policies.inputs import Reader
@@ -21,7 +22,7 @@ from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.config import MATCHING_STEPS, TrainingConfig
-from openvima.training.dataset import read_examples
+from openvima.training.dataset import read_examples, token_kind
 from openvima.training.pretrain import render_pairs
 from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, RunFolder
 from openvima.training.schedule import learning_rate_share, step_seed
@@ -31,7 +32,7 @@ Report = Callable[[int, int, str], None]
 
 LOG_EVERY = 20  # steps
 # Where files are, with how many threads it runs and how often it saves does not make it another run.
-_NOT_SETTINGS = ("data", "out", "t5", "threads", "force", "checkpoint_every")
+_NOT_SETTINGS = ("data", "out", "tokens", "t5", "threads", "force", "checkpoint_every")
 
 
 def train(config: TrainingConfig, report: Report | None = None) -> Path:
@@ -179,23 +180,23 @@ class _Trainer:
         self.run.save(name, self.model, optimizer, self.progress, self.reader.tokenizer)
 
     def _matching(self) -> Stage:
-        def say(done: int, total: int, note: str) -> None:
-            self._report(f"{note}, {done} of {total}")
-
         tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
         num_scenes, assets = self.config.pretraining_scenes, self.config.assets
-        pairs = render_pairs(tasks, num_scenes=num_scenes, seed=self.config.seed, assets=assets, report=say)
+        pairs = render_pairs(
+            tasks, num_scenes=num_scenes, seed=self.config.seed, assets=assets, report=self._say
+        )
         return Matching(self.model, self.config, pairs)
 
     def _cloning(self) -> Stage:
         self._report(f"reading {len(self.dataset)} demonstrations")
-        examples = read_examples(
-            self.dataset,
-            self.reader,
-            validation_share=self.config.validation_share,
-            seed=self.config.seed,
+        tokens = open_tokens(
+            self.dataset, token_kind(self.reader), folder=self.config.tokens, report=self._say
         )
-        return Cloning(self.model, self.config, examples)
+        examples = read_examples(tokens, self.reader, validation_share=self.config.validation_share)
+        return Cloning(self.model, self.config, examples, self.reader)
+
+    def _say(self, done: int, total: int, note: str) -> None:
+        self._report(f"{note or 'cutting out objects'}, {done} of {total}")
 
     def _report(self, note: str) -> None:
         before = sum(steps for steps, _ in self.stages[: self.progress.stage])

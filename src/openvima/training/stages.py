@@ -11,12 +11,12 @@ from openvima.policies.inputs import Reader
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
+from openvima.training.collate import Collator
 from openvima.training.config import TrainingConfig
 from openvima.training.dataset import (
     Batch,
     Examples,
     groups_of_equal_length,
-    make_batch,
     rows_of_step,
 )
 from openvima.training.pretrain import Pairs, matching_loss, scene_accuracy
@@ -89,10 +89,12 @@ class Cloning:
 
     name = "2-cloning"
 
-    def __init__(self, model: PolicyNetwork, config: TrainingConfig, examples: Examples) -> None:
+    def __init__(
+        self, model: PolicyNetwork, config: TrainingConfig, examples: Examples, reader: Reader
+    ) -> None:
         self.learning_rate = config.learning_rate
         self.model = model
-        self._reader = Reader.of(model.config.images)
+        self._collate = Collator(reader)
         self._config = config
         self._examples = examples
         self._features: torch.Tensor | None = None
@@ -109,16 +111,16 @@ class Cloning:
         rows = rows_of_step(len(training), batch=config.batch, step=step, seed=config.seed)
         generator = step_generator(config.seed, "augmentation", step)
         chosen = [training[row] for row in rows]
-        total = sum(len(example.steps) for example in chosen)
+        total = sum(example.tokens.num_steps for example in chosen)
         sums: Metrics = {}
         for group in groups_of_equal_length(chosen):
             batch = augmented(
-                make_batch(group),
-                self._reader.layout,
+                self._collate(group),
+                self._collate.reader.layout,
                 probability=config.spurious_probability,
                 generator=generator,
             )
-            share = sum(len(example.steps) for example in group) / total
+            share = sum(example.tokens.num_steps for example in group) / total
             loss, metrics = self._loss(batch)
             (loss * share).backward()
             for name, value in {"loss": loss, **metrics}.items():
@@ -131,13 +133,13 @@ class Cloning:
         examples = self._examples.validation
         if not examples:
             return {}
-        total = sum(len(example.steps) for example in examples)
+        total = sum(example.tokens.num_steps for example in examples)
         sums: Metrics = {}
         for group in groups_of_equal_length(examples):
             for start in range(0, len(group), self._config.batch):
                 part = group[start : start + self._config.batch]
-                share = sum(len(example.steps) for example in part) / total
-                loss, metrics = self._loss(make_batch(part))
+                share = sum(example.tokens.num_steps for example in part) / total
+                loss, metrics = self._loss(self._collate(part))
                 for name, value in {"loss": loss, **metrics}.items():
                     sums[name] = sums.get(name, 0.0) + value.item() * share
         score = sums[self.model.head.score]

@@ -1,0 +1,196 @@
+"""The token cache of a data set: a derived folder, made when it is first needed and safe to delete."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.data.manifest import joint_hash
+from openvima.data.reader import Dataset, Shard
+from openvima.data.tokens.episode import KINDS, TokenEpisode, TokenKind, tokens_of
+from openvima.data.tokens.token_file import TOKENS_VERSION, TokenFile, write_tokens
+from openvima.data.writer import remove_leftovers
+from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.processes import in_processes
+
+CACHE_FOLDER = "tokens"
+
+Report = Callable[[int, int, str], None]
+
+
+class TokenCache(Sequence[TokenEpisode]):
+    """The episodes of a data set as tokens, each read when it is asked for.
+
+    The order is that of the data set. Objects can be sent to other processes: they open files anew.
+
+    Args:
+        dataset: The demonstrations, perhaps of some tasks only.
+        kind: "objects" for crops of the segmented objects, "frames" for whole frames at half the size.
+        folder: Where the files are; None means `tokens/` in the folder of the demonstrations.
+
+    Raises:
+        DatasetError: There is no such kind, or files are missing or older than the demonstrations;
+            `open_tokens` makes them.
+
+    Example:
+        >>> cache = open_tokens(Dataset("demos"))
+        >>> cache[0].images.shape
+        (14, 3, 32, 32)
+    """
+
+    def __init__(self, dataset: Dataset, kind: TokenKind = "objects", folder: Path | None = None) -> None:
+        self.dataset, self.kind, self._root = dataset, kind, folder
+        self.folder = _cache_folder(dataset, kind, folder)
+        missing = [source.name for source in sources(dataset) if not _is_made(self.folder, source, kind)]
+        if missing:
+            raise DatasetError(
+                f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
+                f"`openvima data tokens {dataset.path} --kind {kind}` makes them."
+            )
+        self._files: dict[str, TokenFile] = {}
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    @overload
+    def __getitem__(self, index: int) -> TokenEpisode: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[TokenEpisode]: ...
+    def __getitem__(self, index: int | slice) -> TokenEpisode | list[TokenEpisode]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        name, row = self.dataset.locate(index)
+        return self._file(name)[row]
+
+    def __iter__(self) -> Iterator[TokenEpisode]:
+        return (self[index] for index in range(len(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+        return TokenCache, (self.dataset, self.kind, self._root)
+
+    def lengths(self) -> np.ndarray:
+        """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
+        of_file = {source.name: self._file(source.name).lengths() for source in sources(self.dataset)}
+        places = [self.dataset.locate(index) for index in range(len(self))]
+        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, 2)
+
+    def _file(self, name: str) -> TokenFile:
+        if name not in self._files:
+            self._files[name] = TokenFile(self.folder / name)
+        return self._files[name]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One shard of demonstrations.
+
+    Args:
+        name: Of the shard, and of its file of tokens.
+        content_hash: Of its episodes together.
+    """
+
+    name: str
+    content_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    shard: Path
+    path: Path
+    kind: TokenKind
+    source: str
+
+
+def open_tokens(
+    dataset: Dataset,
+    kind: TokenKind = "objects",
+    *,
+    folder: Path | None = None,
+    workers: int = 1,
+    report: Report | None = None,
+) -> TokenCache:
+    """Open the token cache of a data set; make what is missing, or older than the demonstrations.
+
+    Args:
+        dataset: The demonstrations, perhaps of some tasks only.
+        kind: "objects" for crops of the segmented objects, "frames" for whole frames at half the size.
+        folder: Where to keep them; None means `tokens/` in the folder of the demonstrations.
+        workers: Number of processes.
+        report: Called with episodes done, episodes in all, and a note.
+
+    Raises:
+        DatasetError: There is no such kind, or the folder cannot be written to.
+        ShardError: A shard is damaged.
+    """
+    target = _cache_folder(dataset, kind, folder)
+    work = [
+        _Work(dataset.path / source.name, target / source.name, kind, source.content_hash)
+        for source in sources(dataset)
+        if not _is_made(target, source, kind)
+    ]
+    if work:
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatasetError(
+                f"cannot keep tokens in {target}: {error.strerror}. Name another folder."
+            ) from None
+        remove_leftovers(target)
+        sizes = {item.shard.name: len(Shard(item.shard)) for item in work}
+        total = sum(sizes.values())
+        work.sort(key=lambda item: -sizes[item.shard.name])
+
+        def say(done: int) -> None:
+            if report is not None:
+                report(done, total, "")
+
+        try:
+            for _ in in_processes(_write, work, workers, report=say):
+                pass  # the result of a job is its file
+        finally:
+            remove_leftovers(target)
+    return TokenCache(dataset, kind, folder)
+
+
+def sources(dataset: Dataset) -> list[Source]:
+    """List the shards of a data set, each with the hash of all its episodes."""
+    whole = dataset if dataset.tasks is None else Dataset(dataset.path)
+    shards = whole.index.column("shard").combine_chunks().dictionary_encode()
+    hashes = whole.index.column("content_hash").combine_chunks()
+    starts = np.flatnonzero(
+        np.diff(shards.indices.to_numpy(), prepend=-1)
+    )  # episodes of a shard follow each other
+    wanted, found = set(dataset.shard_names()), []
+    for start, end in zip(starts, [*starts[1:], whole.index.num_rows], strict=True):
+        name = shards[start].as_py()
+        if name in wanted:
+            found.append(Source(name, joint_hash(pa.chunked_array([hashes.slice(start, end - start)]))))
+    return found
+
+
+def _cache_folder(dataset: Dataset, kind: TokenKind, folder: Path | None) -> Path:
+    if kind not in KINDS:
+        raise DatasetError(unknown_name("kind of tokens", kind, KINDS))
+    return (folder or dataset.path / CACHE_FOLDER) / f"{kind}-v{TOKENS_VERSION}"
+
+
+def _is_made(folder: Path, source: Source, kind: TokenKind) -> bool:
+    path = folder / source.name
+    if not path.is_file():
+        return False
+    try:
+        file = TokenFile(path)
+    except ShardError:  # damaged, or of another version: made anew
+        return False
+    return file.source == source.content_hash and file.kind == kind
+
+
+def _write(work: _Work, count: Callable[[int], None]) -> None:
+    shard, episodes = Shard(work.shard), []
+    for row in range(len(shard)):
+        episodes.append(tokens_of(shard[row], work.kind))
+        count(row + 1)
+    write_tokens(work.path, episodes, work.kind, work.source)

@@ -1,0 +1,119 @@
+"""Demonstrations for PyTorch: the same batches for any number of workers, and a position that lasts."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
+from openvima.data.batching import BatchOrder  # noqa: E402
+from openvima.data.tokens.cache import open_tokens  # noqa: E402
+from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    out = tmp_path_factory.mktemp("torch") / "demos"
+    tasks = ("rotate", "manipulate_old_neighbor")
+    return Dataset(generate(GenerateConfig(out=out, tasks=tasks, episodes=4)))
+
+
+class Numbers(Sequence):
+    """Episodes that are just numbers."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index):
+        return index
+
+
+def total(episodes: list[int]) -> torch.Tensor:
+    return torch.tensor(sum(episodes))
+
+
+def test_a_demonstration_becomes_tensors(demos: Dataset) -> None:
+    items, demo = DemonstrationDataset(demos), demos[5]
+    item = items[5]
+    assert len(items) == 8
+    assert item["rgb_top"].shape == (demo.num_steps + 1, 3, 128, 256)
+    assert torch.equal(item["segm_front"], torch.from_numpy(np.array(demo.segm["front"])))
+    assert item["pose1_rotation"].shape == (demo.num_steps, 4)
+    assert item["pose0_position"][0].tolist() == pytest.approx(demo.actions[0].pose0_position)
+    assert item["prompt"] == demo.prompt.text
+    assert set(item["prompt_images"]) == set(demo.prompt.images)
+    assert item["prompt_images"][next(iter(demo.prompt.images))]["rgb_front"].shape == (3, 128, 256)
+    assert DemonstrationDataset(demos, lambda demo: demo.seed)[5] == demo.seed
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of two processors
+@pytest.mark.parametrize("workers", [1, 3])
+def test_loader_workers_do_not_change_the_batches(workers: int) -> None:
+    order = BatchOrder(60, batch=4, seed=2)
+    expected = [order.rows(number).tolist() for number in range(30)]
+    loader = BatchLoader(Numbers(60), order, workers=workers)
+    assert [*loader, *loader] == expected
+
+
+def test_an_epoch_ends_and_the_next_one_follows() -> None:
+    order = BatchOrder(10, batch=4, seed=2)
+    loader = BatchLoader(Numbers(10), order, transform=total)
+    assert len(loader) == 2
+    assert len(list(loader)) == 2
+    assert loader.epoch == 1
+    assert [int(batch) for batch in loader] == [order.rows(n).sum() for n in (2, 3)]
+    forever = loader.forever()
+    assert [int(next(forever)) for _ in range(5)] == [order.rows(n).sum() for n in range(4, 9)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_position_is_that_of_what_was_shown_not_of_what_was_read_ahead(workers: int) -> None:
+    order = BatchOrder(60, batch=4, seed=2)
+    loader = BatchLoader(Numbers(60), order, workers=workers)
+    batches = iter(loader)
+    shown = [next(batches) for _ in range(5)]
+    state = json.loads(json.dumps(loader.state_dict()))
+    rest = list(batches)
+    other = BatchLoader(Numbers(60), order, workers=2 - workers)
+    other.load_state_dict(state)
+    assert list(other) == rest
+    assert [*shown, *rest] == [order.rows(number).tolist() for number in range(15)]
+
+
+def test_ranks_that_become_more_go_on_where_one_was() -> None:
+    whole = BatchOrder(60, batch=4, seed=2)
+    one = BatchLoader(Numbers(60), whole)
+    forever = one.forever()
+    for _ in range(17):
+        next(forever)
+    seen = []
+    for rank in range(2):
+        part = BatchLoader(Numbers(60), replace(whole, rank=rank, num_ranks=2))
+        part.load_state_dict(one.state_dict())
+        seen += next(part.forever())
+    assert sorted(seen) == sorted(whole.rows(17))
+
+
+def test_a_position_of_another_order_is_refused() -> None:
+    order = BatchOrder(60, batch=4, seed=2)
+    state = BatchLoader(Numbers(60), order).state_dict()
+    with pytest.raises(ConfigError, match=r"another order: seed was 2, is 3"):
+        BatchLoader(Numbers(60), replace(order, seed=3)).load_state_dict(state)
+    with pytest.raises(ConfigError, match="the order is for 60 episodes; there are 59"):
+        BatchLoader(Numbers(59), order)
+
+
+@pytest.mark.parametrize("source", ["images", "tokens"])
+def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> None:
+    episodes = demos if source == "images" else open_tokens(demos)
+    loader = BatchLoader(episodes, BatchOrder(8, batch=4, seed=0), workers=1)
+    seen = [(episode.task, episode.seed) for batch in loader for episode in batch]
+    assert sorted(seen) == sorted((demo.task, demo.seed) for demo in demos)

@@ -1,0 +1,112 @@
+"""Batches for training are what a policy would see that acts in the same episodes."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data.tokens.episode import tokens_of  # noqa: E402
+from openvima.errors import DatasetError, PromptError  # noqa: E402
+from openvima.perception.image_stack import ImageStack  # noqa: E402
+from openvima.perception.objects import PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
+from openvima.policies.heads.base import ACTION_PARTS  # noqa: E402
+from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import Example, read_examples, stack_images, token_kind  # noqa: E402
+
+READERS = {
+    "objects": Reader("objects"),
+    "views": Reader("views", finder=PUBLISHED_ORDER),
+    "frames": Reader("frames", (64, 128), tokens_per_frame_pair=3),
+}
+
+
+def as_when_acting(demos, reader: Reader):
+    """Prompts and histories as a policy reads them step by step, and their images."""
+    stack = ImageStack(reader.image_size)
+    stack.add(np.zeros((3, *reader.image_size), np.uint8))
+
+    def add(objects: ObjectViews) -> np.ndarray:
+        numbers = np.zeros(objects.masks.shape, np.int64)
+        numbers[objects.masks] = stack.add(objects.crops[objects.masks])
+        return numbers
+
+    prompts = [reader.read_prompt(demo.prompt) for demo in demos]
+    histories = []
+    for demo in demos:
+        episode = reader.begin_episode()
+        histories.append([episode.read_step(demo.observation(t)) for t in range(demo.num_steps)])
+    prompt_batch = batch_prompts(prompts, [add(prompt.objects) for prompt in prompts])
+    numbers = [[add(step.objects) for step in history] for history in histories]
+    return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.stacked())
+
+
+@pytest.mark.parametrize("layout", READERS)
+def test_training_and_acting_see_the_same(layout, demonstrations_of_several_steps):
+    reader, demos = READERS[layout], demonstrations_of_several_steps
+    examples, images = stack_images([tokens_of(demo, token_kind(reader)) for demo in demos], reader)
+    batch = Collator(reader)(examples)
+    *expected, expected_images = as_when_acting(demos, reader)
+    for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
+        for field in fields(ours):
+            got, asked = getattr(ours, field.name), getattr(theirs, field.name)
+            if field.name.startswith("crops"):  # the numbers differ, what they name does not
+                got, asked = images[got], expected_images[asked]
+            assert got.dtype == asked.dtype, field.name
+            assert torch.equal(got, asked), field.name
+
+
+def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
+    demos = demonstrations_of_several_steps
+    batch = Collator(READERS["objects"])(
+        read_examples(demos, READERS["objects"], validation_share=0.0).training
+    )
+    for b, demo in enumerate(demos):
+        assert batch.targets.steps_BT[b].sum() == demo.num_steps
+        for t, action in enumerate(demo.actions):
+            asked = np.concatenate([np.asarray(getattr(action, part)) for part in ACTION_PARTS])
+            np.testing.assert_allclose(batch.targets.actions_BTC[b, t], asked, atol=1e-6)
+        assert not batch.targets.actions_BTC[b, demo.num_steps :].any()
+        assert (batch.targets.pick_BT[b, demo.num_steps :] == -1).all()
+
+
+def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_steps):
+    demos = demonstrations_of_several_steps
+    examples, images = stack_images([tokens_of(demo, "objects") for demo in demos], READERS["objects"])
+    spurious = Collator(READERS["objects"])(examples).spurious
+    for b, demo in enumerate(demos):
+        for t in range(demo.num_steps):
+            for v, view in enumerate(("front", "top")):
+                x, y, height, width = spurious.boxes[b, t, v]
+                extent = (x - width // 2, x - width // 2 + width, y - height // 2, y - height // 2 + height)
+                crop, box = crop_box(demo.rgb[view][t], extent)
+                assert np.array_equal(crop, images[spurious.crops[b, t, v]])
+                assert np.array_equal(box, spurious.boxes[b, t, v])
+
+
+def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps):
+    collator = Collator(READERS["objects"])
+    examples = read_examples(
+        demonstrations_of_several_steps, READERS["objects"], validation_share=0.0
+    ).training
+    together, alone = collator(examples), collator(examples[2:3])
+    steps, slots = alone.history.crops_BTVN.shape[1], alone.history.crops_BTVN.shape[3]
+    assert torch.equal(together.history.boxes_BTVN4[2, :steps, :, :slots], alone.history.boxes_BTVN4[0])
+    assert not together.history.masks_BTVN[2, steps:].any()
+    length = alone.prompts.words_BL.shape[1]
+    assert torch.equal(together.prompts.words_BL[2, :length], alone.prompts.words_BL[0])
+
+
+def test_an_episode_in_which_nothing_is_seen_is_named(demonstrations_of_several_steps):
+    tokens = tokens_of(demonstrations_of_several_steps[-1], "objects")
+    blind = replace(tokens, objects=tokens.objects[:0], steps=np.zeros_like(tokens.steps))
+    with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
+        Collator(READERS["objects"])([Example(blind, 0)])
+
+
+def test_a_word_that_nobody_knows_is_found_before_training(demonstrations_of_several_steps):
+    tokens = tokens_of(demonstrations_of_several_steps[-1], "objects")
+    with pytest.raises(PromptError, match="xylophone"):
+        read_examples([replace(tokens, text="xylophone")], READERS["objects"], validation_share=0.0)
