@@ -47,7 +47,8 @@ def on_cluster(
 
     Raises:
         MissingExtraError: Ray is not installed.
-        ConfigError: No cluster answers at the address, or it has another version of Ray or Python.
+        ConfigError: No cluster answers at the address, it has another version of Ray or Python, or it lacks
+            the job's module.
         WorkerError: A worker died.
         Exception: Whatever a job raised; the other jobs are stopped.
     """
@@ -143,6 +144,11 @@ def _run_all(
                     counts[slot] = numbers
             watch(counts)
     except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, ray.exceptions.RayError):  # of reading the job, before it could begin
+            raise ConfigError(
+                f"a machine of the Ray cluster cannot do the work ({_first_line(error.cause)}). "
+                "All of them need this version of openvima, with what its extras and your tasks import."
+            ) from None
         raise error.cause from None  # what the job raised
     except ray.exceptions.RayError as error:
         raise WorkerError(

@@ -44,7 +44,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         problems = _differences(shard.info, blocks[0].info)
         block = wanted.get(path.name)
         if block is None and not problems:
-            problems = [f"it is not among the {len(blocks)} shards of {config.episodes} episodes a task"]
+            problems = [_surplus(shard.info, config)]
         if block is not None and len(shard) > block.episodes:
             problems.append(f"it has {len(shard)} episodes, asked for are {block.episodes}")
         if problems:
@@ -81,6 +81,12 @@ def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
 def _has_failed(shard: Shard) -> bool:
     rows = shard.table(["skipped"]).column("skipped").to_pylist()
     return any(skipped["kind"] in FAILED_KINDS for row in rows for skipped in row)
+
+
+def _surplus(found: ShardInfo, config: GenerateConfig) -> str:
+    if found.task in config.resolved_tasks():
+        return f"it has episodes beyond the {config.episodes} a task that are asked for"
+    return f"its task {found.task} is not asked for"
 
 
 def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:

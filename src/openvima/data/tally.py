@@ -16,7 +16,7 @@ class TaskProgress:
 
     Args:
         task: Its name.
-        done: Episodes written, those that were there before included.
+        done: Episodes written, those of whole shards that were there before included.
         total: Episodes asked for.
         written: Episodes written by this run.
         tried: Seeds that this run tried.
@@ -43,7 +43,7 @@ class GenerationProgress:
 
     @property
     def done(self) -> int:
-        """Episodes written, those that were there before included."""
+        """Episodes written, those of whole shards that were there before included."""
         return sum(task.done for task in self.tasks)
 
     @property

@@ -1,0 +1,177 @@
+"""Who does the work, processes, a Ray cluster or the parts of a job array, does not change a byte."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import worker_jobs
+from openvima.cluster import on_cluster
+from openvima.data import GenerateConfig, GenerationProgress, generate, plan
+from openvima.data.resuming import is_finished
+from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
+from small_datasets import config, contents
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return generate(config(tmp_path_factory.mktemp("whole")))
+
+
+@pytest.fixture(scope="module")
+def ray() -> Iterator[ModuleType]:
+    """Ray with two processors on this machine."""
+    ray = pytest.importorskip("ray")
+    ray.init(
+        address="local",
+        num_cpus=2,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="ERROR",
+        runtime_env={"env_vars": {"PYTHONPATH": str(Path(worker_jobs.__file__).parent)}},
+    )
+    yield ray
+    ray.shutdown()
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Path, workers: int) -> None:
+    reports: list[GenerationProgress] = []
+    generate(config(tmp_path, workers=workers), reports.append)
+    assert contents(tmp_path) == contents(whole)
+    assert (reports[0].done, reports[-1].done, reports[-1].total) == (0, 6, 6)
+
+
+def test_ray_started_for_the_work_gives_the_same_bytes_and_is_stopped(whole: Path, tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    reports: list[GenerationProgress] = []
+    generate(config(tmp_path, workers=2, engine="ray"), reports.append)
+    assert contents(tmp_path) == contents(whole)
+    assert not ray.is_initialized()
+    last = reports[-1]
+    assert (last.done, last.total, last.written) == (6, 6, 6)
+    assert last.tried >= 6
+
+
+def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
+    whole: Path, tmp_path: Path, ray: ModuleType
+) -> None:
+    def stop(progress: GenerationProgress) -> None:
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(config(tmp_path, workers=2, engine="ray"), stop)
+    there = contents(tmp_path)
+    assert there
+    assert there.items() <= contents(whole).items()
+    generate(config(tmp_path, workers=2, engine="ray"))
+    assert contents(tmp_path) == contents(whole)
+    assert ray.is_initialized()  # as it was found
+
+
+def test_jobs_on_ray_use_one_thread_each(
+    tmp_path: Path, ray: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    counts = []
+    paths = [tmp_path / str(k) for k in range(3)]
+    done = list(on_cluster(worker_jobs.write_number, paths, 2, watch=lambda rows: counts.append(list(rows))))
+    assert sorted(item for item, _ in done) == paths
+    assert [path.read_text() for path in paths] == ["1"] * 3
+    assert counts[-1] == [(3,), (3,), (3,)]
+
+
+def test_an_error_of_a_job_on_ray_reaches_the_caller(ray: ModuleType) -> None:
+    with pytest.raises(SceneError, match=r"^job 1 fails$"):
+        list(on_cluster(worker_jobs.fail, [0, 1, 2], 2))
+
+
+def test_a_killed_worker_of_ray_is_reported(ray: ModuleType) -> None:
+    with pytest.raises(WorkerError, match=r"worker of the Ray cluster died.*same command continues"):
+        list(on_cluster(worker_jobs.die, [0, 1, 2], 2))
+
+
+def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"pip install openvima\[scale\]"):
+        generate(config(tmp_path, engine="ray"))
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("127.0.0.1:9", r"no Ray cluster answers at 127\.0\.0\.1:9"),
+        ("nowhere", "allowed are HOST:PORT"),
+        ("127.0.0.1:999999", "no Ray cluster answers"),
+    ],
+)
+def test_a_cluster_that_does_not_answer_is_named(address: str, message: str) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match=message):
+        list(on_cluster(worker_jobs.fail, [0], None, address=address))
+
+
+def test_ranges_of_shards_in_any_order_make_the_same_data_set(whole: Path, tmp_path: Path) -> None:
+    for shard_range in ((3, 9), (0, 1), (1, 3)):
+        assert not is_finished(tmp_path)
+        generate(config(tmp_path, shard_range=shard_range))
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_a_range_of_shards_is_all_that_is_written_and_reported(tmp_path: Path) -> None:
+    reports: list[GenerationProgress] = []
+    generate(config(tmp_path, shard_range=(1, 3)), reports.append)
+    names = [block.path.name for block in plan(config(tmp_path))]
+    assert sorted(contents(tmp_path)) == names[1:3]
+    assert [task.total for task in reports[-1].tasks] == [1, 2]
+
+
+def test_the_plain_command_finishes_what_ranges_began(whole: Path, tmp_path: Path) -> None:
+    generate(config(tmp_path, shard_range=(2, 3)))
+    generate(config(tmp_path))
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_a_range_leaves_the_temporary_files_of_other_ranges_alone(tmp_path: Path) -> None:
+    names = [block.path.name for block in plan(config(tmp_path))]
+    for name in names[:2]:
+        (tmp_path / f".{name}.123.tmp").write_bytes(b"half")
+    generate(config(tmp_path, shard_range=(1, 2)))
+    assert sorted(contents(tmp_path)) == [f".{names[0]}.123.tmp", names[1]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"shard_range": (2, 2)}, "shard_range is 2:2; it must be a:b"),
+        ({"shard_range": (-1, 2)}, "shard_range is -1:2"),
+        ({"shard_range": (0, 2), "force": True}, "force and shard_range exclude each other"),
+        ({"address": "auto"}, "address is 'auto', but the engine is 'processes'"),
+        ({"engine": "slurm"}, "engine is 'slurm'; allowed are processes and ray"),
+        ({"compression": "gzip"}, "compression is 'gzip'; allowed are lz4 and zstd"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(changes: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        config(tmp_path, **changes)
+
+
+def test_a_range_beyond_the_last_shard_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"shard_range is 4:6, but there are 4 shards, 0 … 3"):
+        generate(config(tmp_path / "out", shard_range=(4, 6)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_large_shards_are_handed_out_first(tmp_path: Path) -> None:
+    asked = GenerateConfig(out=tmp_path, tasks=("rotate",), episodes=21)
+    order: list[str] = []
+
+    def note(progress: GenerationProgress) -> None:
+        order.extend(sorted({path.name for path in tmp_path.glob("*.arrow")} - set(order)))
+
+    generate(asked, note)
+    sizes = {block.path.name: block.episodes for block in plan(asked)}
+    assert [sizes[name] for name in order] == [5, 4, 4, 4]  # the fifth ends after the last report
