@@ -84,7 +84,7 @@ def generation_table() -> Iterator[Callable[["GenerationProgress"], None]]:
             is_last = progress.done == progress.total
             if is_last or time.monotonic() - drawn_s >= REDRAW_S:
                 drawn_s = time.monotonic()
-                live.update(_table(progress, pace), refresh=True)
+                live.update(table_of(progress, pace), refresh=True)
 
         yield report
 
@@ -115,8 +115,9 @@ class Pace:
         share = f"{progress.done:,} of {progress.total:,} ({100 * progress.done // progress.total} %)"
         if self.rate is None:
             return share
-        left = _duration((progress.total - progress.done) / self.rate)
-        return f"{share}, {self.rate:.1f} episodes/s, {left} left"
+        num_left = progress.total - progress.done
+        left = f", {_duration(num_left / self.rate)} left" if num_left else ""
+        return f"{share}, {self.rate:.1f} episodes/s{left}"
 
 
 def _plain_lines(write: Callable[[str], object], pace: Pace) -> Callable[["GenerationProgress"], None]:
@@ -128,17 +129,21 @@ def _plain_lines(write: Callable[[str], object], pace: Pace) -> Callable[["Gener
         part = LINES * progress.done // progress.total
         if part > shown:
             shown = part
-            solved = f", {_percent(progress.written, progress.tried)} solved" if progress.tried else ""
+            solved = (
+                f", {_percent(progress.written, progress.tried)} of the seeds solved"
+                if progress.tried
+                else ""
+            )
             write(f"demonstrations: {pace.summary(progress)}{solved}\n")
 
     return report
 
 
-def _table(progress: "GenerationProgress", pace: Pace) -> "Table":
-    from rich import box
+def table_of(progress: "GenerationProgress", pace: Pace) -> "Table":
+    """Draw a line a task; 17 of them fit a terminal of 80 columns and 24 lines."""
     from rich.table import Table
 
-    table = Table(title=pace.summary(progress), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=pace.summary(progress), title_justify="left", box=None, pad_edge=False)
     table.add_column("task", no_wrap=True)
     for name in ("done", "of", "solved", "redraws"):
         table.add_column(name, justify="right", no_wrap=True)

@@ -1,0 +1,99 @@
+"""`openvima generate`: flags reach the library, and progress fits where it is shown."""
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from openvima.cli.main import main
+from openvima.cli.progress import LINES, Pace, generation_table, table_of
+from openvima.data import Dataset, GenerationProgress, Shard, TaskProgress
+from openvima.tasks import list_tasks
+
+WORDS = ["generate", "--tasks", "rotate", "--episodes", "5"]
+
+
+def test_flags_reach_the_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--compression", "zstd", "--no-images", "--keep-failed", "--seed", "7", "--shard-size", "3"]
+    assert main([*WORDS, *flags, "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'out'}\n"
+    shard = Shard(tmp_path / "out" / "rotate-train-00001.arrow")
+    assert (shard.info.compression, shard.info.images) == ("zstd", False)
+    assert (shard.info.first_seed, shard.info.shard_size, len(shard)) == (7, 3, 2)
+
+
+def test_parts_of_a_job_array_tell_whether_the_data_set_is_finished(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    assert main([*WORDS, "--list-shards", *out]) == 0
+    assert capsys.readouterr().out == "0\trotate-train-00000.arrow\t4\n1\trotate-train-00001.arrow\t1\n"
+    assert not (tmp_path / "out").exists()
+    assert main([*WORDS, "--shard-range", "1:2", *out]) == 0
+    assert "is not finished yet" in capsys.readouterr().err
+    assert main([*WORDS, "--shard-range", "0:1", *out]) == 0
+    assert "shows what is there" in capsys.readouterr().err
+    assert len(Dataset(tmp_path / "out")) == 5
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--shard-range", "3"], "shard_range is '3'; it must be a:b"),
+        (["--shard-range", "9:10"], "shard_range is 9:10, but there are 2 shards"),
+        (["--shard-range", "0:1", "--force"], "exclude each other"),
+        (["--address", "head:6379"], "only 'ray' takes one"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*WORDS, *flags, "--out", str(tmp_path / "out")]) == 2
+    line = capsys.readouterr().err.strip()
+    assert message in line
+    assert "\n" not in line
+    assert not (tmp_path / "out").exists()
+
+
+def progress(done: int, total: int = 1000) -> GenerationProgress:
+    return GenerationProgress((TaskProgress("rotate", done, total, done, 2 * done, 3),))
+
+
+def test_without_a_terminal_progress_is_a_few_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    with generation_table() as report:
+        for done in range(1001):
+            report(progress(done))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == LINES + 1
+    assert lines[0] == "demonstrations: 0 of 1,000 (0 %)"
+    assert lines[-1].startswith("demonstrations: 1,000 of 1,000 (100 %), ")
+    assert lines[-1].endswith(" episodes/s, 50.0 % of the seeds solved")
+
+
+def test_a_run_with_nothing_to_do_says_that_it_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+    with generation_table() as report:
+        report(GenerationProgress((TaskProgress("rotate", 5, 5),)))
+    assert capsys.readouterr().err == "demonstrations: 5 of 5 (100 %)\n"
+
+
+def test_all_tasks_fit_a_small_terminal() -> None:
+    tasks = tuple(TaskProgress(task, 10**6, 10**7, 10**6, 10**7, 10**7) for task in list_tasks())
+    console = Console(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+    console.print(table_of(GenerationProgress(tasks), Pace()))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # a StringIO
+    assert len(lines) <= 22
+    for task in tasks:
+        line = next(line for line in lines if line.startswith(f"{task.task} "))
+        assert all(word in line for word in ("1,000,000", "10,000,000", "10.0 %"))
+
+
+def test_the_pace_leaves_out_the_start_of_the_workers() -> None:
+    now = iter([100.0, 102.0, 104.0])
+    pace = Pace(lambda: next(now))
+    pace.update(0)
+    assert "left" not in pace.summary(progress(0))
+    for written in (10, 30, 60):
+        pace.update(written)
+    assert pace.rate == 12.5
+    assert pace.summary(progress(60, 45_060)) == "60 of 45,060 (0 %), 12.5 episodes/s, 1:00:00 left"
