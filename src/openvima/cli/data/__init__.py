@@ -1,5 +1,6 @@
 """`openvima data`: look into demonstrations, check them, and make others of them."""
 
+from openvima.cli.data.importing import import_published
 from openvima.cli.data.info import info
 from openvima.cli.data.lerobot import export_lerobot
 from openvima.cli.data.subsets import merge, sample, split
@@ -11,6 +12,7 @@ COMMANDS = {
     "merge": merge,
     "sample": sample,
     "split": split,
+    "import": import_published,
     "tokens": tokens,
     "export-lerobot": export_lerobot,
 }

@@ -216,7 +216,7 @@ def _broken_in(block: Block) -> list[Broken] | None:
     others = set(present) - {place.folder for place in block.places}
     if others:
         raise DatasetError(
-            f"{block.path} holds {len(others)} episodes that were not asked for, such as {min(others)}. "
+            f"{block.path} holds episodes that were not asked for, such as {min(others)}. "
             "Give its settings, another folder, or --force to delete it."
         )
     missing = [place for place in block.places if place.folder not in set(present)]

@@ -1,0 +1,71 @@
+"""`openvima data import`: the published demonstrations as a data set of this package."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from openvima.cli.progress import progress_bar
+
+
+def import_published(
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+    *,
+    tasks: str = "all",
+    part: Literal["all", "train", "validation"] = "all",
+    episodes: int | None = None,
+    compression: Literal["lz4", "zstd"] = "lz4",
+    workers: int = 1,
+    force: bool = False,
+) -> int:
+    """Convert the demonstrations that the benchmark's authors published; docs/published_data.md says how.
+
+    The zip archive is read where it is, without unpacking it, and nothing in it is run. Broken episodes are
+    left out and named in OUT/broken.json. Repeating a command that was interrupted continues it.
+
+    Example: openvima data import vima.zip published --workers 2
+
+    Args:
+        source: The zip archive, or a folder with unpacked episodes.
+        out: Folder to write to.
+        tasks: Old or new names of tasks with commas between them, or "all".
+        part: All episodes, or one of two parts: train (twelve thirteenths) or validation.
+        episodes: At most so many episodes of each task, the first ones; by default all.
+        compression: Codec of the files; zstd is smaller, lz4 faster.
+        workers: Number of processes.
+        force: Delete the data set that is in OUT.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.data.published import ImportConfig
+    from openvima.data.published import import_published as convert
+    from openvima.data.published.importing import BROKEN_NAME
+
+    config = ImportConfig(
+        source=source,
+        out=out,
+        tasks=tuple(name.strip() for name in tasks.split(",") if name.strip()),
+        part=part,
+        episodes=episodes,
+        compression=compression,
+        workers=workers,
+        force=force,
+    )
+    with progress_bar("episodes") as report:
+        folder = convert(config, report)
+    if (folder / BROKEN_NAME).is_file():
+        entries = json.loads((folder / BROKEN_NAME).read_text(encoding="utf-8"))
+        print(
+            f"{len(entries)} left out, see {folder / BROKEN_NAME}; first {_shown(entries[0])}",
+            file=sys.stderr,
+        )
+    print(folder)
+    return 0
+
+
+def _shown(entry: dict[str, str]) -> str:
+    return f"{entry['member']}: {entry['reason']}"
