@@ -112,6 +112,19 @@ def _finish(config: GenerateConfig, blocks: Sequence[Block], own: Sequence[Block
         return
     if len(own) < len(blocks) and not all(is_done(block) for block in blocks):
         return
+    finish(config, blocks)
+
+
+def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Write index and manifest of a folder whose shards are all there, and those of its failed episodes.
+
+    Args:
+        config: What was generated.
+        blocks: Its division into shards.
+
+    Raises:
+        ShardError: A shard is damaged.
+    """
     versions, record = blocks[0].info.versions, config.record()
     failed = [block.failed_path for block in blocks if block.failed_path and block.failed_path.is_file()]
     if failed:

@@ -17,7 +17,7 @@ from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS
 
 # What Arrow raises when it is given damaged bytes.
-_ODD_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
+ODD_ERRORS = (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError)
 
 
 class Shard:
@@ -55,7 +55,7 @@ class Shard:
         batch = self.batch(row)
         try:
             demo = decode(batch, self.info)
-        except _ODD_ERRORS as error:
+        except ODD_ERRORS as error:
             raise self._row_error(row, error) from None
         if self.info.images:
             return demo
@@ -85,7 +85,7 @@ class Shard:
         batch = self._batch(self._reader_of(needed), row)
         try:
             values = decode_columns(batch)
-        except _ODD_ERRORS as error:
+        except ODD_ERRORS as error:
             raise self._row_error(row, error) from None
         if not self.info.images and not IMAGES.isdisjoint(columns):
             values |= columns_of(self[row]).images
@@ -134,7 +134,7 @@ class Shard:
         try:
             batch = reader.get_batch(row)
             batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
-        except _ODD_ERRORS as error:
+        except ODD_ERRORS as error:
             raise self._row_error(row, error) from None
         return batch
 
@@ -159,7 +159,7 @@ class Shard:
         """
         try:
             return self._reader_of(names).read_all().select(list(names))
-        except _ODD_ERRORS as error:
+        except ODD_ERRORS as error:
             raise ShardError(_damaged(self.path, "its records", error)) from None
 
     def _reader_of(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
@@ -304,7 +304,7 @@ def _mapped(path: Path) -> memoryview:
         return mapped(path)
     except FileNotFoundError:
         raise ShardError(f"there is no file {path}. {remedy(path.parent)}") from None
-    except _ODD_ERRORS as error:
+    except ODD_ERRORS as error:
         raise ShardError(_damaged(path, "it", error)) from None
 
 
@@ -312,7 +312,7 @@ def _opened(path: Path, content: memoryview, columns: list[int] | None = None) -
     options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=columns)
     try:
         return pa.ipc.open_file(pa.py_buffer(content), options=options)
-    except _ODD_ERRORS as error:
+    except ODD_ERRORS as error:
         raise ShardError(_damaged(path, "it", error)) from None
 
 
