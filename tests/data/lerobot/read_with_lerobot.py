@@ -30,7 +30,7 @@ def main(export: Path, twin: Path, frames: Path) -> None:
         if key not in COUNTERS
     }
     written = LeRobotDataset.create(
-        "local/twin", dataset.fps, features, root=twin, robot_type=dataset.meta.robot_type, vcodec="h264"
+        "local/twin", dataset.fps, features, root=twin, robot_type=dataset.meta.robot_type
     )
     for item in items:
         frame = {key: _as_given(item[key].numpy(), features[key]) for key in features}

@@ -279,6 +279,14 @@ def test_without_joint_paths_the_state_is_the_tool_alone(
     assert info["features"]["observation.state"]["names"] == ["end_effector"]
 
 
+def test_an_episode_without_steps_is_an_error(
+    tmp_path: Path, made_up: Callable[..., Demonstration], store: Callable[..., Path]
+) -> None:
+    data = store([made_up(0, num_steps=0)])
+    with pytest.raises(DatasetError, match="an episode without steps"):
+        export_lerobot(LerobotConfig(data, tmp_path / "out"))
+
+
 def test_the_same_export_twice_has_the_same_bytes(tmp_path: Path, export: Path) -> None:
     again = export_lerobot(LerobotConfig(tmp_path / "demos", tmp_path / "again"))
     assert digests(again) == digests(export)

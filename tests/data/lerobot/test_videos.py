@@ -6,6 +6,7 @@ import av
 import numpy as np
 import pytest
 
+from openvima.data.lerobot import videos
 from openvima.data.lerobot.layout import FileNumber
 from openvima.data.lerobot.videos import NumberedVideo, PixelFormat
 
@@ -79,9 +80,24 @@ def test_files_stay_below_their_limit(tmp_path: Path) -> None:
     assert [place.number for place in places] == sorted(
         (place.number for place in places), key=lambda n: n.file
     )
-    assert all(place.first_frame == 0 for place in places if places.index(place) == 0)
     for file_index, file in enumerate(files):
         firsts = [place.first_frame for place in places if place.number == FileNumber(0, file_index)]
         with av.open(str(file)) as container:
             assert container.streams.video[0].frames == 2 * len(firsts)
         assert firsts == list(range(0, 2 * len(firsts), 2))
+
+
+def test_a_file_is_closed_after_so_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(videos, "MAX_FRAMES", 4)
+    with NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video:
+        places = [video.write(pictures(1), num_frames=3) for _ in range(3)]
+    assert [(place.number.file, place.first_frame) for place in places] == [(0, 0), (0, 3), (1, 0)]
+
+
+def test_nothing_is_in_the_way_of_the_first_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ZeroDivisionError),
+        NumberedVideo(tmp_path, "eye", fps=1, pixels="yuv444p", limit_bytes=LARGE) as video,
+    ):
+        video.write(pictures(1), num_frames=1)
+        raise ZeroDivisionError

@@ -111,10 +111,15 @@ def survey(dataset: Dataset) -> FrameLayout:
 
     Args:
         dataset: The demonstrations.
+
+    Raises:
+        DatasetError: An episode has no steps, so no frames either.
     """
     num_images, has_joints = 0, True
     for name in dataset.index.column("shard").unique().to_pylist():
         table = Shard(dataset.path / name).table(["prompt_images", "joint_paths", "steps"])
+        if not table["steps"].to_numpy().all():
+            raise DatasetError(f"{dataset.path / name} holds an episode without steps; LeRobot takes none.")
         num_images = max(num_images, *_lengths(table["prompt_images"].combine_chunks()))
         has_joints = has_joints and _has_joints(table)
     return FrameLayout(num_images, has_joints)

@@ -48,10 +48,13 @@ class PixelCounts:
             pictures: Shape (num_frames or 1, 3, height, width), uint8; one picture stands for all frames.
             num_frames: Frames of the episode.
         """
+        self.num_frames += num_frames
+        if not pictures.any():  # most prompts have fewer images than the longest
+            self.counts[:, 0] += num_frames * pictures[0, 0].size
+            return
         times = num_frames // len(pictures)
         for channel in range(3):
             self.counts[channel] += times * np.bincount(pictures[:, channel].reshape(-1), minlength=256)
-        self.num_frames += num_frames
 
     def merge(self, other: "PixelCounts") -> None:
         """Add what another has counted."""
@@ -66,15 +69,22 @@ class PixelCounts:
         squares = self.counts @ levels**2 / num_pixels
         below = self.counts.cumsum(axis=1)
         ranks = {name: _rank(share, num_pixels) for name, share in QUANTILES.items()}
-        rows = {
+        moments = {
             "min": levels[(self.counts > 0).argmax(axis=1)],
             "max": levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)],
             "mean": mean,
             "std": np.sqrt(np.maximum(squares - mean**2, 0)),
-            **{name: levels[(below > rank).argmax(axis=1)] for name, rank in ranks.items()},
         }
-        shaped = {name: row.reshape(3, 1, 1) for name, row in rows.items()}
-        return {**shaped, "count": np.array([self.num_frames])}
+        quantiles = {name: levels[(below > rank).argmax(axis=1)] for name, rank in ranks.items()}
+        return {
+            **_by_channel(moments),
+            "count": np.array([self.num_frames]),
+            **_by_channel(quantiles),
+        }
+
+
+def _by_channel(statistics: Statistics) -> Statistics:
+    return {name: row.reshape(3, 1, 1) for name, row in statistics.items()}
 
 
 def _rank(share: float, count: int) -> int:

@@ -1,7 +1,7 @@
 """Parquet files: rows of frames and of episodes, spread over numbered files, and the list of prompts."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -36,23 +36,24 @@ class NumberedTable:
         self._waiting_bytes = self._footer_bytes = 0
 
     def place(self, num_bytes: int) -> FileNumber:
-        """Return the number of the file that takes the next rows, whose size is `num_bytes`."""
+        """Return the number of the file that takes the next rows, if they have `num_bytes`."""
         if self._number is None:
             return FileNumber()
         written = (self._file.tell() if self._file else 0) + self._footer_bytes
         is_full = written + self._waiting_bytes + num_bytes >= self._limit_bytes
         return self._number.next() if is_full else self._number
 
-    def write(self, rows: pa.Table) -> FileNumber:
+    def write(self, rows: pa.Table, number: FileNumber | None = None) -> FileNumber:
         """Append rows.
 
         Args:
             rows: Always of the same schema.
+            number: The file, as `place` gave it; None asks for it.
 
         Returns:
             The number of the file that they are in.
         """
-        number = self.place(rows.nbytes)
+        number = number or self.place(rows.nbytes)
         if number != self._number:
             self.close()
             self._number = number
@@ -106,11 +107,6 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     }
     table = table.replace_schema_metadata({"pandas": json.dumps(notes)})
     pq.write_table(table, path, compression=_COMPRESSION)
-
-
-def table_of(columns: Mapping[str, object], schema: pa.Schema | None = None) -> pa.Table:
-    """Return a table of Python or NumPy columns."""
-    return pa.table(dict(columns), schema=schema)
 
 
 def _pandas_column(name: str | None, pandas_type: str, numpy_type: str) -> dict[str, object]:

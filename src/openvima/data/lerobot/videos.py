@@ -7,7 +7,6 @@ rounding colours to YUV.
 """
 
 import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +23,7 @@ PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
 
 _QUALITY = {"yuv444p": {"qp": "0"}, "yuv420p": {"crf": "12"}}
 _BYTES_PER_FRAME = 64  # generous share of the file's tables
+MAX_FRAMES = 100_000  # in a file: of each one about 70 bytes stay in memory until it is closed
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +76,18 @@ class NumberedVideo:
             Where they are.
         """
         expected = num_frames * max(self._largest_frame, _BYTES_PER_FRAME)
-        if self._number is None or self._num_bytes + expected >= self._limit_bytes:
+        is_full = self._num_bytes + expected >= self._limit_bytes or self._num_frames >= MAX_FRAMES
+        if self._number is None or is_full:
             self._begin()
         assert self._number is not None  # `_begin` has set it
         place = VideoPlace(self._number, self._num_frames)
-        for index, frame in enumerate(self._frames(pictures, num_frames)):
-            frame.pts = self._num_frames
-            if index == 0:
-                frame.pict_type = self._av.video.frame.PictureType.I
+        kinds = self._av.video.frame.PictureType
+        frame: Any = None  # Any: PyAV is optional
+        for index in range(num_frames):
+            if index < len(pictures):
+                picture = np.ascontiguousarray(np.moveaxis(pictures[index], 0, -1))
+                frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.pict_type = self._num_frames, kinds.NONE if index else kinds.I
             self._mux(self._stream.encode(frame))
             self._num_frames += 1
         return place
@@ -126,11 +130,6 @@ class NumberedVideo:
             "forced-idr": "1",
             **_QUALITY[self._pixels],
         }
-
-    def _frames(self, pictures: np.ndarray, num_frames: int) -> Iterator[Any]:  # Any: PyAV is optional
-        for index in range(num_frames):
-            picture = np.ascontiguousarray(np.moveaxis(pictures[min(index, len(pictures) - 1)], 0, -1))
-            yield self._av.VideoFrame.from_ndarray(picture, format="rgb24")
 
     def _mux(self, packets: list[Any]) -> None:  # Any: PyAV is optional
         for packet in packets:

@@ -49,6 +49,8 @@ class LerobotWriter:
         self._schema = _schema(frames)
         self._tasks: dict[str, int] = {}
         self._num_episodes = self._num_frames = 0
+        self._row_schema: pa.Schema | None = None  # of the list of episodes; its first row gives it
+        self._row_bytes = 0
         self._pixel_counts = {key: PixelCounts() for key in frames.video_keys}
         self._closing = contextlib.ExitStack()
         data_bytes, video_bytes = (limit * layout.BYTES_PER_MB for limit in self._limits.values())
@@ -132,12 +134,11 @@ class LerobotWriter:
 
     def _write_episode(self, row: dict[str, Any]) -> None:  # Any: one column, one type
         """Append a row to the list of episodes, which says itself in which file it is."""
-        names = ("meta/episodes/chunk_index", "meta/episodes/file_index")
-        table = pa.Table.from_pylist([row | dict.fromkeys(names, 0)])
-        number = self._episodes.place(table.nbytes)
-        for name, value in zip(names, (number.chunk, number.file), strict=True):
-            table = table.set_column(table.schema.get_field_index(name), name, [[value]])
-        self._episodes.write(table)
+        number = self._episodes.place(self._row_bytes)
+        own_place = {"meta/episodes/chunk_index": number.chunk, "meta/episodes/file_index": number.file}
+        table = pa.Table.from_pylist([row | own_place], schema=self._row_schema)
+        self._episodes.write(table, number)
+        self._row_schema, self._row_bytes = table.schema, max(self._row_bytes, table.nbytes)
 
     def _write_metadata(self) -> None:
         info = {
