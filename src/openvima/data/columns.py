@@ -1,8 +1,9 @@
 """A demonstration as columns: texts, records and arrays in the layout in which shards store them."""
 
+import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """A demonstration, column by column; only "content_hash" and "skipped" are missing.
+    """A demonstration, column by column; only "skipped" is missing.
 
     Args:
         records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
@@ -27,35 +28,29 @@ class Columns:
         path_lengths: Number of waypoints of each step.
         images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
             and `segm_…` (N, 128, 256).
+        content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
     """
 
     records: dict[str, Any]  # Any: texts, numbers, and lists and dictionaries of them
     arrays: dict[str, np.ndarray]
     path_lengths: list[int]
     images: dict[str, np.ndarray]
-
-    def content_hash(self, assets: str) -> str:
-        """Return 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
-
-        Args:
-            assets: Name of the asset pack.
-        """
-        described = {**self.records, "assets": assets, "path_lengths": self.path_lengths}
-        digest = xxhash.xxh3_128(json.dumps(described, sort_keys=True).encode())
-        for array in (*self.arrays.values(), *self.images.values()):
-            digest.update(array.nbytes.to_bytes(8, "little"))
-            digest.update(array.reshape(-1).view(np.uint8).data)
-        return digest.hexdigest()
+    content_hash: str
 
 
 def columns_of(demo: "Demonstration") -> Columns:
     """Return the columns of a demonstration."""
-    return Columns(
-        records=_records(demo),
-        arrays=_arrays(demo),
-        path_lengths=[len(path) for path in demo.joint_paths],
-        images=_images(demo),
-    )
+    records, arrays = _records(demo), _arrays(demo)
+    path_lengths = [len(path) for path in demo.joint_paths]
+    described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
+    digest = xxhash.xxh3_128(json.dumps(described, sort_keys=True).encode())
+    images = {}
+    for name, array in itertools.chain(arrays.items(), _images(demo)):
+        digest.update(array.nbytes.to_bytes(8, "little"))
+        digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the processor's cache
+        if name not in arrays:
+            images[name] = array
+    return Columns(records, arrays, path_lengths, images, digest.hexdigest())
 
 
 def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
@@ -148,13 +143,14 @@ def _arrays(demo: "Demonstration") -> dict[str, np.ndarray]:
     return arrays
 
 
-def _images(demo: "Demonstration") -> dict[str, np.ndarray]:
+def _images(demo: "Demonstration") -> Iterator[tuple[str, np.ndarray]]:
     shown = list(demo.prompt.images.values())
-    segm = {view: [image.segm[view] for image in shown] for view in VIEWS}
     empty = np.zeros((0, *IMAGE_SHAPE), np.uint8)
-    return {
-        **{f"prompt_rgb_{view}": pixels([image.rgb[view] for image in shown]) for view in VIEWS},
-        **{f"prompt_segm_{view}": np.stack(segm[view]) if shown else empty for view in VIEWS},
-        **{f"rgb_{view}": pixels(demo.rgb[view]) for view in VIEWS},
-        **{f"segm_{view}": np.ascontiguousarray(demo.segm[view]) for view in VIEWS},
-    }
+    for view in VIEWS:
+        yield f"prompt_rgb_{view}", pixels([image.rgb[view] for image in shown])
+    for view in VIEWS:
+        yield f"prompt_segm_{view}", np.stack([image.segm[view] for image in shown]) if shown else empty
+    for view in VIEWS:
+        yield f"rgb_{view}", pixels(demo.rgb[view])
+    for view in VIEWS:
+        yield f"segm_{view}", np.ascontiguousarray(demo.segm[view])

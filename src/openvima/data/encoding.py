@@ -117,7 +117,7 @@ def encode(
     columns = columns_of(demo)
     records = {
         **columns.records,
-        "content_hash": columns.content_hash(demo.assets),
+        "content_hash": columns.content_hash,
         "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
     }
     images = {name: array if with_images else array[:0] for name, array in columns.images.items()}

@@ -92,7 +92,7 @@ class Demonstration:
         Unlike the bytes of a file they depend neither on the version of pyarrow nor on compression. The
         versions of the packages do not count.
         """
-        return columns_of(self).content_hash(self.assets)
+        return columns_of(self).content_hash
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import BinaryIO
 
 import pyarrow as pa
 
@@ -13,6 +14,7 @@ from openvima.data.schema import COLUMNS
 from openvima.files import whole_file
 
 COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few per cent
+BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
 
 
 class ShardWriter:
@@ -33,8 +35,10 @@ class ShardWriter:
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
-        file = self._closing.enter_context(whole_file(path))
-        self._writer = self._closing.enter_context(pa.ipc.new_file(file, self._schema, options=options))
+        sink = _Sink(self._closing.enter_context(whole_file(path)))
+        stream = pa.BufferedOutputStream(pa.PythonFile(sink, "w"), BUFFER_BYTES)
+        self._closing.callback(stream.flush)
+        self._writer = self._closing.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
 
     def write(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> None:
         """Append one episode.
@@ -60,6 +64,30 @@ class ShardWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._closing.__exit__(kind, error, traceback)
+
+
+class _Sink:
+    """A file that raises only once: what Arrow could not write, it tries again as it ends, and complains."""
+
+    closed = False  # `whole_file` closes the file
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._has_failed = file, False
+
+    def write(self, data: bytes) -> int:
+        if self._has_failed:
+            return len(data)
+        try:
+            return self._file.write(data)
+        except BaseException:
+            self._has_failed = True
+            raise
+
+    def flush(self) -> None:
+        """Nothing: `whole_file` does it."""
+
+    def close(self) -> None:
+        """Nothing, likewise."""
 
 
 def remove_leftovers(folder: Path) -> None:
