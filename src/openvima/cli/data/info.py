@@ -23,7 +23,7 @@ def info(
     *,
     details: bool = False,
     html: Path | None = None,
-    samples: int = 2,
+    samples: int = 3,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Show what a folder of demonstrations holds: counts, sizes, histograms, and what made it.

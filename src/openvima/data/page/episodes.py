@@ -1,0 +1,133 @@
+"""One episode on the page: its prompt in words and pictures, its steps with the actions drawn in."""
+
+import base64
+import html
+import io
+import math
+
+import numpy as np
+from PIL import Image
+
+from openvima.data.records import Demonstration
+from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.render.camera import CAMERAS, View, project
+from openvima.scene import BACKGROUND_ID, Action, PromptImage
+
+_GAP = 2  # pixels between the two views
+_MARGIN = 3  # pixels around an object in the prompt
+_RING = 4.5  # radius in pixels
+_HEAD = 7.0  # length of the arrow's head in pixels
+_LEAST_TURN_DEG = 1
+_CLOSING = ".,;:"  # marks that stick to what stands before them
+
+
+def episode_card(demo: Demonstration) -> str:
+    """Write an episode as HTML.
+
+    Args:
+        demo: The episode, with its images.
+    """
+    prompt = " ".join(
+        html.escape(part) if isinstance(part, str) else _prompt_picture(part)
+        for part in demo.prompt.sequence()
+    )
+    for mark in _CLOSING:
+        prompt = prompt.replace(f" {mark}", mark)
+    frames = "".join(_frame(demo, step) for step in range(demo.num_steps + 1))
+    facts = (
+        f"level {demo.level}",
+        f"seed {demo.seed} of domain {demo.domain}",
+        demo.end_effector,
+        *([f"{demo.num_redraws} redraws"] if demo.num_redraws else []),
+        "solved" if demo.outcome.success else demo.outcome.reason or "not solved",
+    )
+    meta = "".join(f"<span>{html.escape(fact)}</span>" for fact in facts)
+    return (
+        f'<article class="card episode"><p class="prompt">{prompt}</p><div class="frames">{frames}</div>'
+        f'<p class="meta">{meta}<span>content <code>{demo.content_hash()}</code></span></p></article>'
+    )
+
+
+def _prompt_picture(image: PromptImage) -> str:
+    pixels = np.moveaxis(image.rgb["front"], 0, -1)
+    if image.kind == "object":
+        pixels = _cut_to_object(pixels, image.segm["front"])
+    kind = "scene" if image.kind == "scene" else "object"
+    return f'<img class="{kind}" src="{_png_uri(pixels)}" alt="[{html.escape(image.name)}]">'
+
+
+def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
+    shown = segm != BACKGROUND_ID
+    rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
+    if not len(rows):
+        return pixels
+    top, left = max(0, rows[0] - _MARGIN), max(0, columns[0] - _MARGIN)
+    return pixels[top : rows[-1] + 1 + _MARGIN, left : columns[-1] + 1 + _MARGIN]
+
+
+def _frame(demo: Demonstration, step: int) -> str:
+    """What both cameras saw before a step, or at the end, with what is done next."""
+    height, width = IMAGE_SHAPE
+    picture = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
+    for place, view in enumerate(VIEWS):
+        top = place * (height + _GAP)
+        picture[top : top + height] = np.moveaxis(demo.rgb[view][step], 0, -1)
+    arrows = "" if step == demo.num_steps else "".join(_arrow(demo.actions[step], view) for view in VIEWS)
+    caption = html.escape(_caption(demo, step))
+    return (
+        f'<figure><svg viewBox="0 0 {width} {2 * height + _GAP}" role="img" aria-label="{caption}">'
+        f'<image href="{_png_uri(picture)}" width="{width}" height="{2 * height + _GAP}"/>{arrows}</svg>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _arrow(action: Action, view: View) -> str:
+    """A ring where the tool goes down, and an arrow to where it goes up again."""
+    points = np.array([(*action.pose0_position, 0.0), (*action.pose1_position, 0.0)])
+    start, end = project(points, CAMERAS[view]) + 0.5  # the middle of a pixel, as SVG counts
+    below = np.array([0, VIEWS.index(view) * (IMAGE_SHAPE[0] + _GAP)])
+    start, end = start + below, end + below
+    way = end - start
+    length = float(np.hypot(*way))
+    ring = f'<circle cx="{start[0]:.1f}" cy="{start[1]:.1f}" r="{_RING}"/>'
+    if length <= _RING:  # it stays where it is, and turns
+        return f'<g class="arrow back">{ring}</g><g class="arrow">{ring}</g>'
+    forward = way / length
+    side = np.array([-forward[1], forward[0]])
+    wings = [end - _HEAD * forward + sign * _HEAD / 2 * side for sign in (1, -1)]
+    path = _path([start + _RING * forward, end]) + _path([wings[0], end, wings[1]])
+    drawn = f'{ring}<path d="{path}"/>'
+    return f'<g class="arrow back">{drawn}</g><g class="arrow">{drawn}</g>'
+
+
+def _path(points: list[np.ndarray]) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+
+
+def _caption(demo: Demonstration, step: int) -> str:
+    if step == demo.num_steps:
+        return "at the end"
+    action, names = demo.actions[step], {o.object_id: f"{o.texture} {o.object}" for o in demo.objects}
+    pick_id, place_id = demo.pick_ids[step], demo.place_ids[step]
+    picked, turn = names.get(pick_id, "an object"), _turn_deg(action)
+    by = f"{abs(turn)}° to the {'left' if turn > 0 else 'right'}"
+    if demo.end_effector == "spatula":
+        words = f"sweep {picked}"
+    elif place_id == pick_id in names:
+        words = f"turn {picked} {by}"
+    else:  # an id that names no object means the table, or that nobody knows
+        words = f"move {picked}" + (f" to {names[place_id]}" if place_id in names else "")
+        words += f", turned {by}" if abs(turn) >= _LEAST_TURN_DEG else ""
+    return f"{step + 1}: {words}"
+
+
+def _turn_deg(action: Action) -> int:
+    """By how much an action turns what it carries, in whole degrees; to the left seen from above."""
+    yaws = [2 * math.atan2(q[2], q[3]) for q in (action.pose0_rotation, action.pose1_rotation)]
+    return round(math.degrees(math.remainder(yaws[1] - yaws[0], math.tau)))
+
+
+def _png_uri(pixels: np.ndarray) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
