@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from openvima.data.reader import Dataset, Shard
     from openvima.data.records import Demonstration, rollout_oracle
     from openvima.data.tally import GenerationProgress, TaskProgress
+    from openvima.data.verification import VerifyConfig, repair, verify
     from openvima.data.writer import ShardWriter
 
 # Reading needs no simulation, so each name brings only what it needs.
@@ -20,9 +21,12 @@ _HOMES = {
     "Shard": "reader",
     "ShardWriter": "writer",
     "TaskProgress": "tally",
+    "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",
+    "repair": "verification",
     "rollout_oracle": "records",
+    "verify": "verification",
 }
 
 __all__ = [
@@ -33,9 +37,12 @@ __all__ = [
     "Shard",
     "ShardWriter",
     "TaskProgress",
+    "VerifyConfig",
     "generate",
     "plan",
+    "repair",
     "rollout_oracle",
+    "verify",
 ]
 
 

@@ -39,9 +39,11 @@ INDEX_SCHEMA = pa.schema(
     ]
 )
 # What a manifest must hold, with the type of each; and what it must hold of each shard.
+ORIGIN_TYPES: dict[str, type] = {"command": str, "config": dict, "versions": dict, "licence": str}
 _TYPES: dict[str, type] = {
-    **dict.fromkeys(("command", "licence", "content_hash"), str),
-    **dict.fromkeys(("config", "versions", "counts", "tasks", "index", "shards"), dict),
+    **ORIGIN_TYPES,
+    "content_hash": str,
+    **dict.fromkeys(("counts", "tasks", "index", "shards"), dict),
 }
 _SHARD_KEYS = ("episodes", "steps", "bytes", "sha256", "head_bytes", "tail_bytes", "frame_crc32")
 

@@ -5,10 +5,12 @@ from openvima.cli.data.info import info
 from openvima.cli.data.lerobot import export_lerobot
 from openvima.cli.data.subsets import merge, sample, split
 from openvima.cli.data.tokens import tokens
+from openvima.cli.data.verify import verify
 
 # Subcommand → what runs it, in the order in which they are listed.
 COMMANDS = {
     "info": info,
+    "verify": verify,
     "merge": merge,
     "sample": sample,
     "split": split,

@@ -1,0 +1,111 @@
+"""Verifying a data folder: what it says of itself, its shards, and a sample of episodes played again."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ShardSummary, compose
+from openvima.data.planning import FAILED_FOLDER
+from openvima.data.verification.findings import Problem, Report, Verification, VerifyConfig
+from openvima.data.verification.inventory import Inventory, take_inventory
+from openvima.data.verification.replay import replay
+from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
+from openvima.processes import in_processes
+
+DEFAULT = VerifyConfig()
+
+
+def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | None = None) -> Verification:
+    """Look for everything that is wrong with a data set; nothing is changed.
+
+    Args:
+        folder: Folder of demonstrations. Its `failed` episodes are looked at too.
+        config: How thoroughly to look.
+        report: Called with episodes done, episodes in all, and what is being done.
+
+    Returns:
+        All problems; none if every byte is as it was written and says what it should.
+
+    Raises:
+        DatasetError: There is no data set.
+        WorkerError: A worker died.
+    """
+    folder = Path(folder)
+    found = _verify(folder, folder, config, report)
+    failed = folder / FAILED_FOLDER
+    if failed.is_dir() and any(failed.iterdir()):
+        found = found.joined(_verify(failed, folder, config, report))
+    return found
+
+
+def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | None) -> Verification:
+    inventory = take_inventory(folder)
+    tasks = _tasks(inventory, root)
+    results: dict[str, ShardFindings] = {}
+    episodes = [0 if task.index is None else task.index.num_rows for task in tasks]
+    watch = None if report is None else (lambda done: report(done, sum(episodes), "comparing"))
+    for task, findings in in_processes(check_shard, tasks, config.workers, report=watch):
+        results[task.path.name] = findings
+    found = [results[task.path.name] for task in tasks]
+    replayed = replay(inventory, results, config, report)
+    place = "" if folder == root else f"{folder.relative_to(root)}/"
+    own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems]
+    problems = [Problem(place + problem.file, problem.cause, problem.remedy) for problem in own]
+    problems += [problem for findings in found for problem in findings.problems]
+    return Verification(
+        folder=root,
+        problems=tuple(sorted(problems)),
+        notes=(*inventory.notes, *replayed.notes),
+        num_shards=len(tasks),
+        num_episodes=sum(findings.num_episodes for findings in found),
+        num_replayed=replayed.num_episodes,
+        damaged=tuple(place + task.path.name for task in tasks if results[task.path.name].is_damaged),
+    )
+
+
+def _tasks(inventory: Inventory, root: Path) -> list[ShardTask]:
+    manifest, parts = inventory.manifest, inventory.index_parts()
+    generated = manifest if manifest is not None and inventory.is_generated else {}
+    return [
+        ShardTask(
+            path=inventory.folder / name,
+            shown_as=str((inventory.folder / name).relative_to(root)),
+            entry=None if manifest is None else manifest["shards"][name],
+            index=None if inventory.index is None else parts.get(name, inventory.index.slice(0, 0)),
+            config=generated.get("config", {}),
+            versions=generated.get("versions", {}),
+            is_failed=inventory.holds_failed,
+            remedy=inventory.remedy,
+        )
+        for name in inventory.shard_names()
+    ]
+
+
+def _whole_faults(inventory: Inventory, found: Sequence[ShardFindings]) -> Iterator[Problem]:
+    """Yield what is wrong with index and manifest where every shard is as it should be."""
+    summaries = [findings.summary for findings in found if findings.summary is not None]
+    yield from _twins(summaries)
+    manifest = inventory.manifest
+    if manifest is None or len(summaries) < len(found):
+        return
+    index, expected = compose(summaries, {})
+    for key, value in expected.items():
+        if manifest[key] != value:
+            yield Problem(MANIFEST_NAME, f"{key!r} is not what the shards say", inventory.remedy)
+    if inventory.index is not None and not inventory.index.combine_chunks().equals(index):
+        cause = "it does not list what the shards hold, or not in this order"
+        yield Problem(INDEX_NAME, cause, inventory.remedy)
+
+
+def _twins(summaries: Sequence[ShardSummary]) -> Iterator[Problem]:
+    """Yield episodes that are there twice."""
+    first: dict[str, str] = {}
+    for summary in summaries:
+        twins = []
+        for content_hash in summary.index.column("content_hash").to_pylist():
+            if content_hash in first:
+                twins.append(content_hash)
+            first.setdefault(content_hash, summary.name)
+        if twins:
+            cause = f"{len(twins)} of its {summary.index.num_rows} episodes are there twice, "
+            cause += f"the first of them also in {first[twins[0]]}"
+            yield Problem(summary.name, cause, "Take one away, and repeat the command that wrote the folder.")

@@ -1,0 +1,136 @@
+"""What a data folder says of itself: manifest, index, and the names of its files."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ORIGIN_TYPES, parse_index, parse_manifest
+from openvima.data.planning import COMMAND, FAILED_FOLDER
+from openvima.data.reader import remedy
+from openvima.data.verification.findings import Problem
+from openvima.errors import DatasetError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inventory:
+    """What is known of a folder before its shards are opened.
+
+    Args:
+        folder: The folder.
+        manifest: Its manifest; None where it cannot be trusted.
+        index: Its index; None where it cannot be trusted.
+        problems: What is wrong with both, and with the names of files.
+        notes: What is worth knowing.
+        doubtful: A manifest that can be read and yet not be trusted.
+    """
+
+    folder: Path
+    manifest: dict[str, Any] | None  # Any: JSON
+    index: pa.Table | None
+    problems: tuple[Problem, ...]
+    notes: tuple[str, ...]
+    doubtful: dict[str, Any] | None = None  # Any: JSON
+
+    @property
+    def is_generated(self) -> bool:
+        """Whether the simulation can make lost shards again."""
+        return self.manifest is not None and self.manifest["command"] == COMMAND
+
+    @property
+    def holds_failed(self) -> bool:
+        """Whether it is the part of a data set that holds the episodes which were not solved."""
+        return self.folder.name == FAILED_FOLDER and (self.folder.parent / MANIFEST_NAME).is_file()
+
+    @property
+    def remedy(self) -> str:
+        """What mends a file of the folder."""
+        return remedy(self.folder.parent if self.holds_failed else self.folder)
+
+    def shard_names(self) -> list[str]:
+        """Return the names of the manifest's shards in the order of the data set.
+
+        Where there is no manifest, they are those of the files that are there.
+        """
+        if self.manifest is None:
+            return sorted(path.name for path in self.folder.glob("*.arrow"))
+        listed = self.manifest["shards"]
+        first = [] if self.index is None else self.index.column("shard").unique().to_pylist()
+        return [name for name in first if name in listed] + sorted(set(listed) - set(first))
+
+    def index_parts(self) -> dict[str, pa.Table]:
+        """Return the rows of the index by shard."""
+        if self.index is None or self.index.num_rows == 0:
+            return {}
+        shards = self.index.column("shard").combine_chunks().dictionary_encode()
+        codes = shards.indices.to_numpy()
+        order = np.argsort(codes, kind="stable")
+        starts = np.searchsorted(codes[order], np.arange(1, len(shards.dictionary)))
+        names = shards.dictionary.to_pylist()
+        return {
+            name: self.index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)
+        }
+
+
+def take_inventory(folder: Path) -> Inventory:
+    """Read what a folder says of itself.
+
+    Args:
+        folder: A folder of demonstrations.
+
+    Raises:
+        DatasetError: There is no folder, or nothing of a data set in it.
+    """
+    shards = sorted(path.name for path in folder.glob("*.arrow"))
+    if not shards and not (folder / MANIFEST_NAME).is_file():
+        raise DatasetError(f"{folder} holds no data set: neither {MANIFEST_NAME} nor shards.")
+    problems: list[Problem] = []
+    manifest, index = None, None
+    found = Inventory(folder, None, None, (), ())
+    try:
+        manifest = parse_manifest((folder / MANIFEST_NAME).read_bytes())
+    except FileNotFoundError:
+        unfinished = "If the command that wrote it was stopped, repeat it; otherwise"
+        problems.append(Problem(MANIFEST_NAME, "it is missing", f"{unfinished} {found.remedy}"))
+    except DatasetError as error:
+        problems.append(Problem(MANIFEST_NAME, str(error), found.remedy))
+    try:
+        index_bytes = (folder / INDEX_NAME).read_bytes()
+        index = None if manifest is None else parse_index(index_bytes, manifest)
+    except FileNotFoundError:
+        problems.append(Problem(INDEX_NAME, "it is missing", found.remedy))
+    except DatasetError as error:
+        problems.append(Problem(INDEX_NAME, str(error), found.remedy))
+    problems += () if manifest is None else _strangers(shards, manifest)
+    doubtful = _doubtful(folder / MANIFEST_NAME) if manifest is None else None
+    notes = tuple(_leftovers(folder))
+    return replace(
+        found, manifest=manifest, index=index, problems=tuple(problems), notes=notes, doubtful=doubtful
+    )
+
+
+def _doubtful(path: Path) -> dict[str, Any] | None:  # Any: JSON
+    """Read what a damaged manifest says of its origin, if that is still in its place."""
+    try:
+        manifest = json.loads(path.read_bytes())
+        origin = {key: manifest[key] for key in ORIGIN_TYPES}
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+    are_theirs = all(isinstance(origin[key], kind) for key, kind in ORIGIN_TYPES.items())
+    return origin if are_theirs else None
+
+
+def _strangers(shards: list[str], manifest: dict[str, Any]) -> Iterator[Problem]:  # Any: JSON
+    remedy = "If a run was stopped, repeat its command; otherwise move the file elsewhere."
+    for name in shards:
+        if name not in manifest["shards"]:
+            yield Problem(name, "the manifest does not list it", remedy)
+
+
+def _leftovers(folder: Path) -> Iterator[str]:
+    for path in sorted(folder.glob(".*.tmp")):
+        yield f"{path}: a process was killed while it wrote this, or is writing it. If not, delete it."

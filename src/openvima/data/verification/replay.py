@@ -1,0 +1,239 @@
+"""Playing stored episodes again: the same seed, oracle and actions must show the same bytes."""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from openvima.data.encoding import ShardInfo
+from openvima.data.reader import Shard
+from openvima.data.records import Demonstration, package_versions
+from openvima.data.verification.episodes import PUBLISHED
+from openvima.data.verification.findings import Problem, Report, VerifyConfig, by_cause
+from openvima.data.verification.inventory import Inventory
+from openvima.data.verification.shards import ShardFindings
+from openvima.env.setup import Setup
+from openvima.errors import AssetError, OpenVimaError
+from openvima.processes import in_processes
+from openvima.scene import RenderedPrompt
+
+if TYPE_CHECKING:  # comes with the simulator
+    from openvima.env import TabletopEnv
+
+_REMEDY = "The files are as they were written: another machine or other code made them. Generate them anew."
+_NO_MATTER = "pyarrow"  # its version decides bytes of files, not of episodes
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """What came of playing episodes again.
+
+    Args:
+        num_episodes: How many were played.
+        problems: Shards with episodes that were not the same.
+        notes: What could not be played or compared, and why.
+    """
+
+    num_episodes: int = 0
+    problems: tuple[Problem, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayTask:
+    """Episodes of one shard to play again.
+
+    Args:
+        path: The file.
+        info: What it says of itself.
+        rows: Which of its records.
+        assets: Name or folder of the asset pack.
+    """
+
+    path: Path
+    info: ShardInfo
+    rows: tuple[int, ...]
+    assets: str
+
+
+def replay(
+    inventory: Inventory,
+    findings: Mapping[str, ShardFindings],
+    config: VerifyConfig,
+    report: Report | None = None,
+) -> Replayed:
+    """Play a sample of episodes again.
+
+    Args:
+        inventory: The folder.
+        findings: What was found in its shards; only those that could be read are played.
+        config: How many episodes, and where the assets are.
+        report: Called with episodes done, episodes in all, and what is being done.
+    """
+    if config.replay == 0:
+        return Replayed()
+    tasks = list(_chosen(inventory, findings, config))
+    total = sum(len(task.rows) for task in tasks)
+    watch = None if report is None else (lambda done: report(done, total, "playing again"))
+    problems, notes = [], _notes_on_origin(findings)
+    num_played = 0
+    for task, found in in_processes(replay_shard, tasks, config.workers, report=watch):
+        name = task.path.name
+        if isinstance(found, str):
+            notes.append(f"{name} cannot be played again: {found}")
+            continue
+        num_played += len(task.rows)
+        for cause in by_cause(found, findings[name].num_episodes):
+            if others := _other_versions(task.info):
+                notes.append(f"{name}, written by {others}, which may be why: played again, {cause}")
+            else:
+                problems.append(Problem(name, f"played again, {cause}", _REMEDY))
+    return Replayed(num_played, tuple(problems), tuple(notes))
+
+
+def replay_shard(task: ReplayTask, count: Callable[[int], None]) -> list[tuple[int, str]] | str:
+    """Play episodes of a shard again.
+
+    Args:
+        task: Which.
+        count: Called with the number of episodes played so far.
+
+    Returns:
+        Row and first difference of those that are not the same; or why none can be played.
+    """
+    shard, found = Shard(task.path), []
+    try:
+        env = _env(task.info.task, task.info.level, task.info.domain, _setup(task))
+    except OpenVimaError as error:  # the task is not installed, or the asset pack not imported
+        return str(error)
+    for number, row in enumerate(task.rows, start=1):
+        try:
+            difference = first_difference(env, shard[row])
+        except AssetError as error:
+            return str(error)
+        except OpenVimaError as error:
+            difference = f"it stops: {error}"
+        if difference:
+            found.append((row, difference))
+        count(number)
+    return found
+
+
+def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
+    """Play the actions of a demonstration and compare all that is to be seen, bit by bit.
+
+    Args:
+        env: An environment of the same task, level and settings.
+        demo: The demonstration.
+
+    Returns:
+        What is not the same first; nothing if all is.
+
+    Raises:
+        SamplingError: The seed no longer has an episode.
+        OracleError: The oracle no longer has an action.
+    """
+    observation, _ = env.reset(seed=demo.seed)
+    if (env.episode.num_redraws, env.episode.max_steps) != (demo.num_redraws, demo.max_steps):
+        return "the seed gives another episode"
+    if not _is_same_prompt(env.prompt, demo.prompt):
+        return "the prompt is another one"
+    for step, action in enumerate((*demo.actions, None)):
+        if env.scene != demo.scenes[step]:
+            return f"objects lie elsewhere {_when(step)}"
+        if not _is_same_view(observation, demo.observation(step)):
+            return f"the images are others {_when(step)}"
+        if action is None:
+            break
+        decision = env.oracle_decision()
+        if (decision.action, decision.pick_id, decision.place_id) != (
+            action,
+            demo.pick_ids[step],
+            demo.place_ids[step],
+        ):
+            return f"the oracle acts otherwise in step {step}"
+        observation, *_ = env.step(action)
+        if not np.array_equal(env.joint_path, demo.joint_paths[step]):
+            return f"the arm takes another path in step {step}"
+    return "" if env.outcome == demo.outcome else "it ends otherwise"
+
+
+def _chosen(
+    inventory: Inventory, findings: Mapping[str, ShardFindings], config: VerifyConfig
+) -> Iterator[ReplayTask]:
+    """Choose the episodes of each task whose content hashes, hashed with the seed, are smallest."""
+    ranked: dict[str, list[tuple[bytes, str, int]]] = {}
+    for name, found in findings.items():
+        if found.is_damaged or found.summary is None or found.info is None or found.info.domain == PUBLISHED:
+            continue
+        columns = (found.summary.index.column(key).to_pylist() for key in ("task", "content_hash"))
+        for row, (task, content_hash) in enumerate(zip(*columns, strict=True)):
+            rank = hashlib.sha256(f"{config.seed} {content_hash}".encode()).digest()
+            ranked.setdefault(task, []).append((rank, name, row))
+    rows: dict[str, list[int]] = {}
+    for candidates in ranked.values():
+        for _, name, row in sorted(candidates)[: config.replay]:
+            rows.setdefault(name, []).append(row)
+    for name in sorted(rows):
+        info = findings[name].info
+        assert info is not None  # see above
+        assets = info.assets if config.assets is None or info.assets == "procedural" else config.assets
+        yield ReplayTask(inventory.folder / name, info, tuple(sorted(rows[name])), assets)
+
+
+def _notes_on_origin(findings: Mapping[str, ShardFindings]) -> list[str]:
+    infos = [(found.info, found.num_episodes) for found in findings.values() if found.info is not None]
+    imported = sum(num for info, num in infos if info.domain == PUBLISHED)
+    notes = [f"{imported} episodes are imported ones; these cannot be played again."] if imported else []
+    others = {_other_versions(info) for info, _ in infos if info.domain != PUBLISHED} - {""}
+    installed = ", ".join(f"{name} {version}" for name, version in package_versions().items())
+    return notes + [
+        f"Written by {versions}; installed are {installed}. Only equal versions promise equal episodes."
+        for versions in sorted(others)
+    ]
+
+
+def _other_versions(info: ShardInfo) -> str:
+    """Name the packages that wrote a shard, if others are installed; nothing if the same are."""
+    installed, wrote = package_versions(), info.versions
+    if all(wrote.get(name) == version for name, version in installed.items() if name != _NO_MATTER):
+        return ""
+    return ", ".join(f"{name} {version}" for name, version in wrote.items())
+
+
+def _is_same_prompt(ours: RenderedPrompt, theirs: RenderedPrompt) -> bool:
+    if ours.text != theirs.text or list(ours.images) != list(theirs.images):
+        return False
+    pairs = [(image, theirs.images[name]) for name, image in ours.images.items()]
+    return all(
+        (a.kind, a.objects) == (b.kind, b.objects)
+        and all(np.array_equal(a.rgb[view], b.rgb[view]) for view in a.rgb)
+        and all(np.array_equal(a.segm[view], b.segm[view]) for view in a.segm)
+        for a, b in pairs
+    )
+
+
+def _is_same_view(ours: Mapping[str, object], theirs: Mapping[str, object]) -> bool:
+    for key in ("rgb", "segm"):
+        a, b = ours[key], theirs[key]
+        assert isinstance(a, Mapping) and isinstance(b, Mapping)
+        if not all(np.array_equal(a[view], b[view]) for view in a):
+            return False
+    return ours["ee"] == theirs["ee"]
+
+
+def _when(step: int) -> str:
+    return "at the start" if step == 0 else f"after step {step - 1}"
+
+
+def _setup(task: ReplayTask) -> Setup:
+    return Setup(task.assets, task.info.compat, task.info.difficulty)
+
+
+@lru_cache(maxsize=4)
+def _env(task: str, level: str, domain: str, setup: Setup) -> "TabletopEnv":
+    return setup.make(task, level, domain=domain)

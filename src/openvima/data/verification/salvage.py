@@ -1,0 +1,119 @@
+"""Keeping the whole records of a damaged shard, wherever in the file they lie."""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.data.checksums import Span, mapped
+from openvima.data.decoding import decode
+from openvima.data.encoding import ShardInfo
+from openvima.data.reader import ODD_ERRORS, Shard
+from openvima.data.redrawing import redrawn
+from openvima.data.schema import COLUMNS
+from openvima.data.writer import ShardWriter
+from openvima.errors import OpenVimaError, ShardError
+
+_MARK = 0xFFFFFFFF  # begins every message of an Arrow file, at a multiple of 8
+_WORD_BYTES = 4
+_MAGIC_BYTES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Salvaged:
+    """What was kept of a damaged shard.
+
+    Args:
+        num_kept: Records that were whole; they are in the shard, which is whole again.
+        content_hashes: Theirs.
+    """
+
+    num_kept: int
+    content_hashes: tuple[str, ...]
+
+
+def salvage(path: Path, spans: list[Span] | None) -> Salvaged:
+    """Write a shard anew with those of its records that are whole; without any it is deleted.
+
+    Args:
+        path: The shard; it may be missing.
+        spans: What the index holds of its records; without, they are compared with their content hashes.
+
+    Raises:
+        ShardError: There are whole records, but nothing in the file says what they have in common.
+    """
+    if not path.is_file():
+        return Salvaged(0, ())
+    content = mapped(path) if path.stat().st_size else memoryview(b"")
+    info = _info(path, content)
+    batches = list(_whole_records(content, info, spans))
+    hashes = tuple(batch.column("content_hash")[0].as_py() for batch in batches)
+    if not batches:
+        path.unlink()
+    elif info is None:
+        raise ShardError(
+            f"{path} has {len(batches)} whole records, but its schema and its footer are damaged. "
+            "Restore it from a copy, or delete it to go on without."
+        )
+    else:
+        with ShardWriter(path, info) as writer:
+            for batch in batches:
+                writer.copy(batch)
+    return Salvaged(len(batches), hashes)
+
+
+def _info(path: Path, content: memoryview) -> ShardInfo | None:
+    """Read what a shard says of itself at its end, or else at its beginning."""
+    try:
+        return Shard(path).info
+    except ShardError:
+        pass
+    try:
+        schema = pa.ipc.read_schema(pa.BufferReader(content[_MAGIC_BYTES:]))
+        return ShardInfo.from_metadata(schema.metadata)
+    except ODD_ERRORS:
+        return None
+
+
+def _whole_records(
+    content: memoryview, info: ShardInfo | None, spans: list[Span] | None
+) -> Iterator[pa.RecordBatch]:
+    """Yield the records that are whole, in the order of the file.
+
+    Each begins with a mark; where a damaged length hides the next one, looking for marks finds it.
+    """
+    known = None if spans is None else {(span.num_bytes, span.crc32) for span in spans}
+    words = np.frombuffer(content[: len(content) // 8 * 8], dtype="<u4")
+    end = 0
+    for position in (np.flatnonzero(words[::2] == _MARK) * 2 * _WORD_BYTES).tolist():
+        if position < end:  # inside the record before
+            continue
+        try:
+            source = pa.BufferReader(pa.py_buffer(content[position:]))
+            message = pa.ipc.read_message(source)
+            num_bytes = source.tell()
+            found = (num_bytes, zlib.crc32(content[position : position + num_bytes]))
+            if known is not None and found not in known:
+                continue
+            batch = pa.ipc.read_record_batch(message, COLUMNS)
+            batch.validate(full=True)
+            if known is None and not _has_own_hash(batch, info):
+                continue
+        except (EOFError, *ODD_ERRORS):
+            continue
+        end = position + num_bytes
+        yield batch
+
+
+def _has_own_hash(batch: pa.RecordBatch, info: ShardInfo | None) -> bool:
+    if info is None or batch.num_rows != 1:
+        return False
+    stored = batch.column("content_hash")[0].as_py()
+    try:
+        demo = decode(batch, info)
+        return (demo if info.images else redrawn(demo, info, stored)).content_hash() == stored
+    except OpenVimaError:
+        return False

@@ -1,0 +1,175 @@
+"""Checking one shard: bytes, form, and every record in it."""
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from openvima.data.checksums import Frame, Span, mapped
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import ShardSummary, fingerprint, summarise
+from openvima.data.reader import Shard, remedy
+from openvima.data.verification.episodes import faults
+from openvima.data.verification.findings import Problem, by_cause
+from openvima.errors import OpenVimaError, ShardError
+
+_KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "success")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShardTask:
+    """One shard to look at.
+
+    Args:
+        path: The file.
+        shown_as: Its name in messages, relative to the data folder.
+        entry: Its entry in the manifest; None where that cannot be trusted.
+        index: Its part of the index; None where that cannot be trusted.
+        config: Settings of the manifest that all generated shards share; empty for others.
+        versions: Those of the manifest, for generated shards; empty for others.
+        is_failed: Whether it holds episodes that were not solved.
+        remedy: What mends it.
+    """
+
+    path: Path
+    shown_as: str
+    entry: dict[str, Any] | None  # Any: JSON
+    index: pa.Table | None
+    config: dict[str, Any]  # Any: JSON
+    versions: dict[str, str]
+    is_failed: bool
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShardFindings:
+    """What was found in a shard.
+
+    Args:
+        problems: All that is wrong.
+        is_damaged: Whether its bytes are not those that were written, or it is missing.
+        summary: What index and manifest should hold of it; None where it cannot be read.
+        info: What it says of itself; None where it cannot be read.
+        num_episodes: Records that were decoded.
+    """
+
+    problems: tuple[Problem, ...]
+    is_damaged: bool
+    summary: ShardSummary | None = None
+    info: ShardInfo | None = None
+    num_episodes: int = 0
+
+
+def check_shard(task: ShardTask, count: Callable[[int], None]) -> ShardFindings:
+    """Check a shard.
+
+    Args:
+        task: The shard, and what is known of it.
+        count: Called with the number of episodes looked at so far.
+    """
+    causes = list(_byte_faults(task))
+    if causes:
+        return ShardFindings(_problems(task, causes), is_damaged=True)
+    try:
+        shard = Shard(task.path)
+        summary = summarise(task.path)
+    except ShardError as error:
+        return ShardFindings(_problems(task, [_cause(error, task.path)]), is_damaged=True)
+    found = list(_record_faults(task, shard, count))
+    is_damaged = any(is_damage for _, _, is_damage in found)
+    causes = by_cause(((row, cause) for row, cause, _ in found), len(shard))
+    causes += [*_info_faults(task, shard.info), *_summary_faults(task, summary)]
+    return ShardFindings(_problems(task, causes), is_damaged, summary, shard.info, len(shard))
+
+
+def spans_of(index: pa.Table) -> list[Span]:
+    """Return where the records of a shard lie, from its part of the index."""
+    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
+    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
+
+
+def _problems(task: ShardTask, causes: Sequence[str]) -> tuple[Problem, ...]:
+    return tuple(Problem(task.shown_as, cause, task.remedy) for cause in causes)
+
+
+def _cause(error: OpenVimaError, path: Path) -> str:
+    """The message of a reader's error without what a problem says besides: file, record and remedy."""
+    text = str(error).removesuffix(f" {remedy(path.parent)}").removesuffix(".")
+    return re.sub(rf"^{re.escape(str(path))}(, record \d+)?: (record \d+ of \d+ is )?", "", text)
+
+
+def _byte_faults(task: ShardTask) -> Iterator[str]:
+    """Yield what is wrong with the bytes, and where."""
+    if not task.path.is_file():
+        yield "it is missing"
+        return
+    if task.entry is None:
+        return
+    found = fingerprint(task.path)
+    if (found["bytes"], found["sha256"]) == (task.entry["bytes"], task.entry["sha256"]):
+        return
+    content = memoryview(b"") if found["bytes"] == 0 else mapped(task.path)
+    places = [Frame.from_entry(task.entry).fault_in(content)]
+    if task.index is not None:
+        broken = [row for row, span in enumerate(spans_of(task.index)) if span.fault_in(content)]
+        places += by_cause(((row, "damaged") for row in broken), task.index.num_rows)
+    where = "; ".join(place for place in places if place)
+    yield f"its bytes are not those that were written{f': {where}' if where else ''}"
+
+
+def _record_faults(
+    task: ShardTask, shard: Shard, count: Callable[[int], None]
+) -> Iterator[tuple[int, str, bool]]:
+    """Yield row, what is wrong, and whether damaged bytes are the reason."""
+    keys = shard.table(_KEY_COLUMNS).to_pylist()
+    for row, key in enumerate(keys):
+        try:
+            demo = shard[row]
+        except ShardError as error:
+            yield row, _cause(error, shard.path), shard.info.images
+            continue
+        except OpenVimaError as error:  # the pack of which its images would be drawn is not there
+            yield row, f"its images cannot be drawn: {error}", False
+            continue
+        if demo.content_hash() != key["content_hash"]:
+            yield row, "its content hash is not that of its content", True
+        if demo.num_steps != key["steps"]:
+            yield row, "it does not have as many actions as steps", False
+        if task.config and demo.outcome.success == task.is_failed:
+            yield row, f"it is {'' if task.is_failed else 'not '}solved", False
+        yield from ((row, fault, False) for fault in faults(demo))
+        count(row + 1)
+    if task.config:
+        for row, (before, after) in enumerate(itertools.pairwise(key["seed"] for key in keys), start=1):
+            if after <= before:
+                yield row, "its seed does not follow that of the record before", False
+
+
+def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
+    """Yield where a generated shard contradicts the manifest."""
+    for name in ("level", "domain", "assets", "compat", "difficulty", "compression", "images"):
+        if name in task.config and getattr(info, name) != task.config[name]:
+            yield f"{name} is {getattr(info, name)}, in the manifest {task.config[name]}"
+    if task.versions and info.versions != task.versions:
+        yield f"it was written by {info.versions}, says the manifest {task.versions}"
+    name = f"{info.task}-{info.level}-{info.number:05d}.arrow"
+    if task.config and task.path.name != name:
+        yield f"it says that it is {name}"
+
+
+def _summary_faults(task: ShardTask, summary: ShardSummary) -> Iterator[str]:
+    """Yield where manifest and index say other things than the shard."""
+    if task.entry is not None and summary.entry != task.entry:
+        names = [key for key, value in summary.entry.items() if task.entry.get(key) != value]
+        yield f"the manifest says otherwise of its {', '.join(names) or 'entries'}"
+    if task.index is not None and not task.index.combine_chunks().equals(summary.index.combine_chunks()):
+        names = [
+            name
+            for name in summary.index.column_names
+            if summary.index.column(name).to_pylist() != task.index.column(name).to_pylist()
+        ]
+        yield f"the index says otherwise of its {', '.join(names)}"
