@@ -56,7 +56,7 @@ class ImportConfig:
     part: str = "all"
     episodes: int | None = None
     shard_size: int = SHARD_SIZE
-    compression: str = "lz4"
+    compression: str = "zstd"
     workers: int = 1
     force: bool = False
 
