@@ -36,8 +36,12 @@ class Numbers(Sequence):
         return index
 
 
-def total(episodes: list[int]) -> torch.Tensor:
+def total(episodes: list[int], number: int) -> torch.Tensor:
     return torch.tensor(sum(episodes))
+
+
+def numbered(episodes: list[int], number: int) -> tuple[int, list[int]]:
+    return number, episodes
 
 
 def test_a_demonstration_becomes_tensors(demos: Dataset) -> None:
@@ -61,6 +65,13 @@ def test_loader_workers_do_not_change_the_batches(workers: int) -> None:
     expected = [order.rows(number).tolist() for number in range(30)]
     loader = BatchLoader(Numbers(60), order, workers=workers)
     assert [*loader, *loader] == expected
+
+
+def test_a_transform_is_told_the_number_of_its_batch() -> None:
+    order = BatchOrder(60, batch=4, seed=2)
+    loader = BatchLoader(Numbers(60), order, workers=2, transform=numbered)
+    list(loader)
+    assert next(iter(loader)) == (15, order.rows(15).tolist())
 
 
 def test_an_epoch_ends_and_the_next_one_follows() -> None:

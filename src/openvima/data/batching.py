@@ -84,10 +84,14 @@ class BatchOrder:
         Returns:
             Shape (batch / ranks,), int64; the last batch of an epoch may be shorter if none is dropped.
         """
+        return self.rows_of_all(number)[self.rank :: self.num_ranks]
+
+    def rows_of_all(self, number: int) -> np.ndarray:
+        """Return the episodes of one batch, those of all ranks."""
         epoch, place = divmod(number, self.batches_per_epoch)
         rows, order = _epoch(self, epoch)
         start = order[place] * self.batch
-        return rows[start : start + self.batch][self.rank :: self.num_ranks]
+        return rows[start : start + self.batch]
 
     def settings(self) -> dict[str, int | bool]:
         """Return what decides which episodes a batch takes."""

@@ -14,7 +14,8 @@ from openvima.errors import ConfigError
 from openvima.scene import ACTION_SHAPES
 
 Episode = TypeVar("Episode")
-Transform = Callable[[list[Episode]], Any]  # Any: whatever the user's training step takes
+# Episodes of a batch and its number to whatever the user's training step takes (Any).
+Transform = Callable[[list[Episode], int], Any]
 
 
 class DemonstrationDataset(Dataset):
@@ -85,8 +86,9 @@ class BatchStream(IterableDataset, Generic[Episode]):
         order: Which of them each batch takes.
         first: Number of the first batch.
         stop: Number of the batch before which to stop; None goes on for ever.
-        transform: Turns a list of episodes into a batch; by default the list itself is the batch. It is sent
-            to the workers, so that it must be a function of a module or an object that can be pickled.
+        transform: Turns a list of episodes into a batch; by default the list itself is the batch. It is also
+            given the number of the batch, for what it may draw at random. It is sent to the workers, so that
+            it must be a function of a module or an object that can be pickled.
     """
 
     def __init__(
@@ -106,7 +108,7 @@ class BatchStream(IterableDataset, Generic[Episode]):
         number, stride = (self.first, 1) if worker is None else (self.first + worker.id, worker.num_workers)
         while self.stop is None or number < self.stop:
             episodes = [self.source[int(row)] for row in self.order.rows(number)]
-            yield episodes if self.transform is None else self.transform(episodes)
+            yield episodes if self.transform is None else self.transform(episodes, number)
             number += stride
 
 
@@ -121,7 +123,7 @@ class BatchLoader(Generic[Episode]):
         order: Which of them each batch takes.
         transform: Turns a list of episodes into a batch; see `BatchStream`.
         workers: Processes that read ahead; 0 reads when asked.
-        context: How they start: "fork", "spawn", "forkserver", or None for what the system does.
+        context: How they start: "fork", "spawn" or "forkserver"; by default as the system does.
         pin_memory: Put tensors into memory from which a GPU copies faster.
 
     Raises:
@@ -194,6 +196,10 @@ class BatchLoader(Generic[Episode]):
         stream = BatchStream(
             self.source, self.order, first=self._num_done, stop=stop, transform=self.transform
         )
-        for batch in DataLoader(stream, batch_size=None, **self._options):
+        for batch in DataLoader(stream, batch_size=None, collate_fn=_unchanged, **self._options):
             self._num_done += 1
             yield batch
+
+
+def _unchanged(batch: Any) -> Any:  # Any: see `Transform`; PyTorch's default would turn tuples into lists
+    return batch
