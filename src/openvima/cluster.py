@@ -91,8 +91,10 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
     try:
         ray.init(**options)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise ConfigError(f"cannot use the Ray cluster at {address or 'this machine'}: {reason}") from error
+        hint = " If it asks for a token, RAY_AUTH_TOKEN must hold it here too." if address else ""
+        raise ConfigError(
+            f"cannot use Ray at {address or 'this machine'}: {_first_line(error)}.{hint}"
+        ) from error
     try:
         yield
     finally:
