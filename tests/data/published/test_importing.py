@@ -1,6 +1,8 @@
 """Importing the published data set: equal content, equal bytes by any road, and nothing lost or hidden."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,6 +92,21 @@ def test_an_import_that_was_stopped_goes_on(source: Path, imported: Path, tmp_pa
     import_published(config(source, tmp_path))
     assert contents(tmp_path) == contents(imported)
     assert (tmp_path / "rotate-train-00000.arrow").stat().st_mtime_ns == before
+
+
+def test_a_full_disk_loses_no_whole_shard(source: Path, imported: Path, tmp_path: Path) -> None:
+    """The first shard fits into the largest size of files that the process may write, the second does not."""
+    size = (imported / "rotate-train-00000.arrow").stat().st_size
+    code = (
+        "import resource, signal, sys; from openvima.cli.main import main; "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); "
+        f"sys.exit(main(['data', 'import', {str(source)!r}, {str(tmp_path)!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "1 of 2 shards are whole and were kept. Make room" in done.stderr.replace("\n", " ")
+    assert sorted(contents(tmp_path)) == ["rotate-train-00000.arrow"]
 
 
 def test_a_whole_import_is_left_alone(imported: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:

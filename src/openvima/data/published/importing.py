@@ -1,5 +1,6 @@
 """Converting the published data set to shards, the same bytes whatever the number of workers."""
 
+import errno
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from openvima.data.published.reader import (
 )
 from openvima.data.reader import Shard
 from openvima.data.writer import ShardWriter
-from openvima.errors import ConfigError, DatasetError
+from openvima.errors import ConfigError, DatasetError, StorageError
 from openvima.files import write_whole
 from openvima.processes import Counts, in_watched_processes
 
@@ -30,6 +31,7 @@ BROKEN_NAME = "broken.json"
 SHARD_SIZE = 1000  # episodes read; broken ones leave their shard smaller
 MAX_WORKERS = 1024
 _NUM_PROBES = 3  # episodes of each task
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Report = Callable[[int, int, str], None]
 
@@ -108,6 +110,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         DatasetError: There is nothing to import, nothing that can be read, or the folder holds another data
             set.
         ConfigError: The settings do not fit.
+        StorageError: The disk is full. Whole shards are kept.
         WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
     """
     tasks = None if config.tasks == ("all",) else config.tasks
@@ -128,6 +131,14 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
             write_block, missing, config.workers, num_counts=2, watch=watch
         ):
             broken[block.path] = found
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        num_there = sum(block.path.is_file() for block in blocks)
+        raise StorageError(
+            f"cannot write to {config.out}: {error.strerror}. {num_there} of {len(blocks)} shards are whole "
+            "and were kept. Make room; the same command then goes on from there."
+        ) from error
     finally:
         _remove_leftovers(config.out)
     if not (config.out / MANIFEST_NAME).is_file():
