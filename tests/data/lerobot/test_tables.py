@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 
 from openvima.data.lerobot import layout
 from openvima.data.lerobot.layout import FileNumber
@@ -15,9 +16,10 @@ def test_a_chunk_is_full_after_a_thousand_files() -> None:
     assert FileNumber(0, 999).next() == FileNumber(1, 0)
 
 
-def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("group_bytes", [1000, 10**6])
+def test_files_stay_below_their_limit_and_hold_all_rows_in_order(tmp_path: Path, group_bytes: int) -> None:
     limit, numbers = 20_000, []
-    with NumberedTable(tmp_path, layout.DATA_PATH, limit_bytes=limit, group_bytes=1000) as table:
+    with NumberedTable(tmp_path, layout.DATA_PATH, limit_bytes=limit, group_bytes=group_bytes) as table:
         for start in range(0, 10_000, 50):
             numbers.append(table.write(pa.table({"x": pa.array(range(start, start + 50))})))
     files = sorted(tmp_path.rglob("*.parquet"))

@@ -12,6 +12,8 @@ from openvima.data.lerobot.layout import FileNumber
 _COMPRESSION = "snappy"  # as LeRobot writes
 _FOOTER_BYTES = 400  # what a file's end holds for each column of a row group, generously
 
+_MAX_PIECES = 16  # a row of 300 columns takes a megabyte as a table of its own, 20 kB among others
+
 
 class NumberedTable:
     """A table over numbered Parquet files, each smaller than a limit; a context manager.
@@ -63,6 +65,8 @@ class NumberedTable:
         self._waiting_bytes += rows.nbytes
         if self._waiting_bytes >= self._group_bytes:
             self._flush()
+        elif len(self._waiting) >= _MAX_PIECES:
+            self._waiting = [pa.concat_tables(self._waiting).combine_chunks()]
         return number
 
     def close(self) -> None:

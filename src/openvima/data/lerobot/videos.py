@@ -1,9 +1,9 @@
 """The pictures of one feature as H.264 films, many episodes in a file.
 
-Measured on 4 % of the tasks' frames: halving the resolution of colours (yuv420p) alone caps the signal at
-35 dB, with errors of up to 138 of 255 levels on textures, whatever the quality. Without that and without loss
-(yuv444p, quantiser 0) a frame is even smaller, 2.1 kB instead of 2.4, and off by 2 levels at most, from
-rounding colours to YUV.
+Measured on 451 steps of 13 tasks: halving the resolution of colours (yuv420p) alone leaves 35 dB, with errors
+of up to 185 of 255 levels on textures, however fine the quantiser. Without that and without loss (yuv444p,
+quantiser 0) a picture is even smaller, 2.2 kB instead of 2.6, and off by at most 2 levels, from rounding
+colours to YUV.
 """
 
 import contextlib
