@@ -141,7 +141,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         ) from error
     finally:
         _remove_leftovers(config.out)
-    if not (config.out / MANIFEST_NAME).is_file():
+    if not all((config.out / name).is_file() for name in (INDEX_NAME, MANIFEST_NAME)):
         _finish(config, data, blocks, [entry for block in blocks for entry in broken[block.path] or ()])
     return config.out
 
