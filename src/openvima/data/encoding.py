@@ -14,7 +14,8 @@ from openvima.data.schema import ARRAYS, CODECS, COLUMNS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
 
 _METADATA_KEY = b"openvima"
-_JOINT_PATHS: pa.ListType = COLUMNS.field("joint_paths").type
+_LISTS: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in (*ARRAYS, "joint_paths")}
+_NAMES = COLUMNS.names
 # All other columns, to be made at once: each call into Arrow costs some microseconds.
 _RECORDS = pa.struct([field for field in COLUMNS if field.name not in (*ARRAYS, "joint_paths")])
 
@@ -125,10 +126,10 @@ def encode(
     cells: dict[str, pa.Array] = {
         "joint_paths": _nested_cell(arrays.pop("joint_paths"), columns.path_lengths)
     }
-    cells |= {name: _list_cell(array, COLUMNS.field(name).type) for name, array in arrays.items()}
+    cells |= {name: _list_cell(array, _LISTS[name]) for name, array in arrays.items()}
     plain = pa.array([records], type=_RECORDS).flatten()
     cells |= {field.name: cell for field, cell in zip(_RECORDS, plain, strict=True)}
-    return pa.RecordBatch.from_arrays([cells[name] for name in COLUMNS.names], schema=COLUMNS)
+    return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=COLUMNS)
 
 
 def _list_cell(array: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
@@ -140,9 +141,9 @@ def _list_cell(array: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
 def _nested_cell(array: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
     """The column of joint paths of one row, without a copy."""
     ends = np.cumsum([0, *lengths], dtype=np.int32)
-    steps = _JOINT_PATHS.value_type
+    steps = _LISTS["joint_paths"].value_type
     paths = _lists(ends, _fixed_lists(array, steps.value_type), steps)
-    return _lists(np.array([0, len(lengths)], np.int32), paths, _JOINT_PATHS)
+    return _lists(np.array([0, len(lengths)], np.int32), paths, _LISTS["joint_paths"])
 
 
 def _lists(offsets: np.ndarray, items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
