@@ -1,0 +1,212 @@
+"""Damaged data sets: every accident is found, and reading gives the same content or one clear error."""
+
+import json
+import multiprocessing
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from small_data_sets import (
+    contents,
+    damaged,
+    edit_manifest,
+    read_all,
+    read_damaged_shards,
+    with_plain_images,
+    write_folder,
+)
+
+from openvima.data import Dataset, Demonstration, Shard, VerifyConfig, verify
+from openvima.data.encoding import ShardInfo
+from openvima.data.schema import COLUMNS
+from openvima.errors import DatasetError, ShardError
+
+MadeUp = Callable[..., Demonstration]
+LOOK = VerifyConfig(replay=0)
+FIRST = "stack-train-00000.arrow"
+SECOND = "stack-train-00001.arrow"
+
+
+@pytest.fixture
+def demos(made_up: MadeUp) -> list[Demonstration]:
+    return [with_plain_images(made_up(seed, num_steps=1, num_images=1)) for seed in range(4)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, info: ShardInfo, demos: list[Demonstration]) -> Path:
+    return write_folder(tmp_path / "whole", info, [demos[:2], demos[2:]])
+
+
+def test_a_whole_data_set_is_clean(folder: Path, demos: list[Demonstration]) -> None:
+    assert verify(folder, LOOK).problems == ()
+    assert read_all(folder) == [demo.content_hash() for demo in demos]
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "index.parquet", FIRST, SECOND])
+def test_any_accident_is_found_and_named(folder: Path, name: str) -> None:
+    path, whole, hashes = folder / name, (folder / name).read_bytes(), read_all(folder)
+    for seed in range(60):
+        path.write_bytes(damaged(whole, seed))
+        found, read = verify(folder, LOOK), read_all(folder)
+        if found.is_clean:
+            assert _is_same(path, whole), f"seed {seed}"
+        else:
+            assert name in {problem.file for problem in found.problems}, f"seed {seed}"
+        assert read in (hashes, None), f"seed {seed}"
+
+
+def _is_same(path: Path, whole: bytes) -> bool:
+    """Whether two files say the same: white space in JSON means nothing."""
+    if path.suffix == ".json":
+        return json.loads(path.read_bytes()) == json.loads(whole)
+    return path.read_bytes() == whole
+
+
+def test_no_accident_to_a_shard_ends_the_process_or_gives_an_odd_error(folder: Path) -> None:
+    result = folder.parent / "odd.json"
+    arguments = (folder / FIRST, folder.parent / "copy.arrow", range(1000, 1400), result)
+    process = multiprocessing.get_context("spawn").Process(target=read_damaged_shards, args=arguments)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    assert json.loads(result.read_text()) == []
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "index.parquet", FIRST])
+@pytest.mark.parametrize("share", [0, 0.001, 0.1, 0.5, 0.9, 0.999])
+def test_a_file_that_ends_early_is_found(folder: Path, name: str, share: float) -> None:
+    path = folder / name
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    assert [problem.file for problem in verify(folder, LOOK).problems] == [name]
+    assert read_all(folder) is None
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "index.parquet", FIRST])
+def test_a_file_that_is_missing_is_found(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    problem, *others = verify(folder, LOOK).problems
+    assert others == []
+    assert (problem.file, problem.cause) == (name, "it is missing")
+    with pytest.raises((DatasetError, ShardError), match=name):
+        _ = Dataset(folder)[0]
+
+
+def test_a_damaged_record_is_named_and_the_others_are_read(folder: Path, demos: list[Demonstration]) -> None:
+    path = folder / FIRST
+    content = bytearray(path.read_bytes())
+    place = Dataset(folder).index.column("offset")[1].as_py() + 5000
+    content[place] ^= 1
+    path.write_bytes(content)
+    problem, *others = verify(folder, LOOK).problems
+    assert others == []
+    assert problem.file == FIRST
+    assert "record 1 of 2" in problem.cause
+    assert "--repair" in problem.remedy
+    dataset = Dataset(folder)
+    assert dataset[0].content_hash() == demos[0].content_hash()
+    with pytest.raises(ShardError, match=rf"{FIRST}: record 1 of 2 .*checksum is wrong.*--repair"):
+        _ = dataset[1]
+
+
+def test_shards_that_changed_places_are_found(folder: Path) -> None:
+    first, second = (folder / FIRST).read_bytes(), (folder / SECOND).read_bytes()
+    (folder / FIRST).write_bytes(second)
+    (folder / SECOND).write_bytes(first)
+    assert {problem.file for problem in verify(folder, LOOK).problems} == {FIRST, SECOND}
+    with pytest.raises(ShardError, match=FIRST):
+        _ = Dataset(folder)[0]
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "index.parquet"])
+def test_a_file_of_another_data_set_is_found(
+    folder: Path, name: str, info: ShardInfo, demos: list[Demonstration]
+) -> None:
+    other = write_folder(folder.parent / "other", info, [demos[:2], demos[1:2] + demos[3:]])
+    shutil.copy(other / name, folder / name)
+    assert not verify(folder, LOOK).is_clean
+    with pytest.raises((DatasetError, ShardError)):
+        list(Dataset(folder))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "cause"),
+    [
+        ("counts", {"episodes": 5, "steps": 4, "shards": 2, "bytes": 1}, "'counts' is not what the shards"),
+        ("content_hash", "0" * 32, "'content_hash' is not what"),
+        ("tasks", {}, "'tasks' is not what"),
+        ("schema", 1, "it has schema 1; this package reads 2"),
+        ("shards", [], "it lacks shards"),
+    ],
+)
+def test_a_manifest_that_was_edited_with_care_is_found(
+    folder: Path, key: str, value: object, cause: str
+) -> None:
+    edit_manifest(folder, lambda manifest: manifest.update({key: value}))
+    causes = {problem.cause for problem in verify(folder, LOOK).problems if problem.file == "dataset.json"}
+    assert any(cause in found for found in causes)
+
+
+def test_a_manifest_without_checksums_of_a_shard_is_found(folder: Path) -> None:
+    edit_manifest(folder, lambda manifest: manifest["shards"][FIRST].pop("sha256"))
+    with pytest.raises(DatasetError, match=rf"dataset\.json: it lacks sha256 of {FIRST}"):
+        Dataset(folder)
+
+
+def test_one_letter_of_a_manifest_counts(folder: Path) -> None:
+    _replace(folder / "dataset.json", b'"licence": "MIT"', b'"licence": "MIX"')
+    with pytest.raises(DatasetError, match=r"dataset\.json: it is damaged or was edited"):
+        Dataset(folder)
+
+
+def test_what_a_shard_says_of_itself_is_read_after_its_checksum_only(folder: Path) -> None:
+    _replace(folder / FIRST, b'"numpy": "0"', b'"numpy": "1"')
+    assert Shard(folder / FIRST)[0].versions["numpy"] == "1"  # nothing else can tell
+    with pytest.raises(ShardError, match=rf"{FIRST}.*checksum of its schema and footer is wrong"):
+        _ = Dataset(folder)[0]
+
+
+def test_a_shard_of_another_version_is_named_with_both(folder: Path) -> None:
+    _replace(folder / FIRST, b'"schema": 2', b'"schema": 7')
+    with pytest.raises(ShardError, match=rf"{FIRST}.*version 7; this package reads 2"):
+        Shard(folder / FIRST)
+
+
+def test_nothing_in_a_shard_is_run(folder: Path, tmp_path: Path) -> None:
+    """Old versions of pyarrow unpickled the types of fields that say they are made by Python."""
+    trap = pickle.dumps(_Trap(tmp_path / "sprung"))
+    metadata = {b"ARROW:extension:name": b"arrow.py_extension_type", b"ARROW:extension:metadata": trap}
+    shard = Shard(folder / FIRST)
+    fields = [field.with_metadata(metadata) if field.name == "seed" else field for field in COLUMNS]
+    schema = pa.schema(fields, shard.info.to_metadata())
+    batches = [shard.batch(row) for row in range(len(shard))]
+    with pa.OSFile(str(folder / FIRST), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
+        for batch in batches:
+            writer.write_batch(pa.record_batch(batch.columns, schema=schema))
+    assert not verify(folder, LOOK).is_clean
+    _ = Shard(folder / FIRST)[0]
+    assert not (tmp_path / "sprung").exists()
+
+
+class _Trap:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self._path,)
+
+
+def test_looking_changes_nothing(folder: Path) -> None:
+    (folder / FIRST).write_bytes(b"ARROW1")
+    before = contents(folder)
+    verify(folder, LOOK)
+    assert contents(folder) == before
+
+
+def _replace(path: Path, before: bytes, after: bytes) -> None:
+    content = path.read_bytes()
+    assert before in content
+    path.write_bytes(content.replace(before, after))
