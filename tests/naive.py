@@ -95,3 +95,12 @@ def label_cells(
                     if weights.min() >= 0 and z < 0.3 and z >= heights[i, j] - 1e-9:
                         labels[i, j], heights[i, j] = object_id, z
     return labels, heights
+
+
+def interleaved(planes: np.ndarray) -> np.ndarray:
+    """Images (N, 3, H, W) as pixels (N, H, W, 3)."""
+    num_images, _, height, width = planes.shape
+    pixels = np.zeros((num_images, height, width, 3), planes.dtype)
+    for n, row, column, colour in np.ndindex(pixels.shape):
+        pixels[n, row, column, colour] = planes[n, colour, row, column]
+    return pixels

@@ -1,0 +1,178 @@
+"""Parts of episodes: columns and steps are read without decoding the others."""
+
+import json
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from naive import interleaved
+from openvima.data import Dataset, Demonstration, Shard, ShardWriter
+from openvima.data.columns import pixels, planes
+from openvima.data.encoding import ShardInfo, encode
+from openvima.data.manifest import finish_folder
+from openvima.data.schema import ARRAYS, COLUMNS, VIEWS
+from openvima.errors import DatasetError, ShardError
+
+MadeUp = Callable[..., Demonstration]
+
+
+def write(path: Path, info: ShardInfo, demos: Sequence[Demonstration]) -> Shard:
+    with ShardWriter(path, info) as writer:
+        for demo in demos:
+            writer.write(demo)
+    return Shard(path)
+
+
+@pytest.fixture
+def demo(made_up: MadeUp) -> Demonstration:
+    return made_up(3, num_steps=3)
+
+
+@pytest.fixture
+def shard(tmp_path: Path, made_up: MadeUp, demo: Demonstration, info: ShardInfo) -> Shard:
+    """Two episodes, of which the second is `demo`."""
+    return write(tmp_path / "a.arrow", info, [made_up(1), demo])
+
+
+def test_every_column_is_read_alone(shard: Shard, demo: Demonstration) -> None:
+    row = encode(demo).to_pylist()[0]
+    for name in COLUMNS.names:
+        (value,) = shard.read(1, [name]).values()
+        if name in ARRAYS:
+            assert value.reshape(len(row[name]), -1).tolist() == row[name], name
+        elif name == "joint_paths":
+            assert [path.tolist() for path in value] == row[name]
+        else:
+            assert value == row[name], name
+
+
+def test_arrays_have_their_shapes(shard: Shard, demo: Demonstration) -> None:
+    values = shard.read(1, ["rgb_top", "segm_front", "prompt_rgb_front", "poses", "pose0_rotation"])
+    shapes = {name: value.shape for name, value in values.items()}
+    assert shapes == {
+        "rgb_top": (4, 128, 256, 3),
+        "segm_front": (4, 128, 256),
+        "prompt_rgb_front": (2, 128, 256, 3),
+        "poses": (4, 2, 7),
+        "pose0_rotation": (3, 4),
+    }
+    assert np.array_equal(values["rgb_top"], np.moveaxis(demo.rgb["top"], 1, -1))
+    assert values["poses"][2, 1].tolist() == [
+        *demo.scenes[2].placements[1].pose.position,
+        *demo.scenes[2].placements[1].pose.quaternion,
+    ]
+
+
+def test_a_step_is_what_the_oracle_saw_and_did(shard: Shard, demo: Demonstration) -> None:
+    for number in range(demo.num_steps):
+        step = shard.step(1, number)
+        assert step.action == demo.actions[number]
+        seen = demo.observation(number)
+        assert step.observation["ee"] == seen["ee"]
+        for kind in ("rgb", "segm"):
+            assert list(step.observation[kind]) == list(VIEWS)
+            for view in VIEWS:
+                assert np.array_equal(step.observation[kind][view], seen[kind][view])
+
+
+def test_a_step_of_one_view_has_no_other(shard: Shard) -> None:
+    observation = shard.step(1, 0, views=["front"], segm=False).observation
+    assert sorted(observation) == ["ee", "rgb"]
+    assert list(observation["rgb"]) == ["front"]
+
+
+def test_damage_in_other_columns_is_not_met(tmp_path: Path, demo: Demonstration, info: ShardInfo) -> None:
+    path = write(tmp_path / "b.arrow", info, [demo]).path
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2  # among the images, which come last
+    content[middle : middle + 8192] = bytes(8192)
+    path.write_bytes(content)
+    damaged = Shard(path)
+    with pytest.raises(ShardError):
+        _ = damaged[0]
+    assert damaged.read(0, ["prompt"]) == {"prompt": demo.prompt.text}
+    assert damaged.step(0, 1, views=["top"]).action == demo.actions[1]
+
+
+def test_columns_not_asked_for_are_not_decompressed(shard: Shard) -> None:
+    def bytes_for(columns: list[str]) -> int:
+        before = pa.total_allocated_bytes()
+        held = shard.read(1, columns)
+        assert held
+        return pa.total_allocated_bytes() - before
+
+    frames = 4 * 128 * 256
+    assert bytes_for(["seed", "pose0_position"]) < 4096
+    assert frames <= bytes_for(["segm_top"]) < frames + 4096
+    assert 3 * frames <= bytes_for(["rgb_top", "seed"]) < 3 * frames + 4096
+
+
+def test_what_is_read_belongs_to_the_reader(shard: Shard) -> None:
+    first = shard.read(1, ["segm_top"])["segm_top"]
+    kept = first.copy()
+    first[:] = 0
+    assert np.array_equal(shard.read(1, ["segm_top"])["segm_top"], kept)
+
+
+def test_unknown_columns_views_and_steps_are_refused(shard: Shard) -> None:
+    with pytest.raises(DatasetError, match=r"no column 'rgb_tip'\. Did you mean 'rgb_top'"):
+        shard.read(0, ["rgb_tip"])
+    with pytest.raises(DatasetError, match="no view 'side'"):
+        shard.step(0, 0, views=["side"])
+    with pytest.raises(IndexError, match="step 3 of 3; count from 0 to 2"):
+        shard.step(1, 3)
+
+
+def test_a_data_set_reads_columns_and_steps_by_episode(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo
+) -> None:
+    demos = [made_up(seed) for seed in range(3)]
+    path = write(tmp_path / "stack-train-00000.arrow", info, demos).path
+    finish_folder(tmp_path, [path], command="test", config={}, versions={})
+    dataset = pickle.loads(pickle.dumps(Dataset(tmp_path)))
+    assert [dataset.read(number, ["seed"])["seed"] for number in (2, 0, -2)] == [2, 0, 1]
+    assert dataset.step(2, 1).action == demos[2].actions[1]
+    with pytest.raises(IndexError, match="episode 3 of 3"):
+        dataset.step(3, 0)
+
+
+def test_a_data_set_notices_damage_in_any_column(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
+    path = write(tmp_path / "stack-train-00000.arrow", info, [made_up()]).path
+    finish_folder(tmp_path, [path], command="test", config={}, versions={})
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ShardError, match="checksum"):
+        Dataset(tmp_path).read(0, ["seed"])
+
+
+def test_many_open_shards_need_no_open_files(tmp_path: Path, demo: Demonstration, info: ShardInfo) -> None:
+    files = Path("/proc/self/fd")
+    if not files.is_dir():
+        pytest.skip("this system does not list open files")
+    first = write(tmp_path / "a.arrow", info, [demo])
+    before = len(list(files.iterdir()))
+    opened = [Shard(first.path) for _ in range(20)]
+    assert all(shard.read(0, ["seed"])["seed"] == demo.seed for shard in opened)
+    assert len(list(files.iterdir())) == before
+
+
+def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
+    given = np.random.default_rng(0).integers(0, 256, (3, 3, 128, 256), dtype=np.uint8)
+    joined = pixels(given)
+    assert np.array_equal(joined[:, :5], interleaved(given[:, :, :5]))
+    assert np.array_equal(pixels([np.asfortranarray(image) for image in given]), joined)
+    assert np.array_equal(planes(joined), given)
+    assert planes(joined).flags.c_contiguous
+    assert pixels(given[:0]).shape == (0, 128, 256, 3)
+
+
+def test_the_schema_says_how_images_are_shaped() -> None:
+    for name, (_, shape) in ARRAYS.items():
+        told = (COLUMNS.field(name).metadata or {}).get(b"shape")
+        if told is not None and name != "poses":
+            assert json.loads(f"[{told.decode()}]") == list(shape)
