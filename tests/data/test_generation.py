@@ -168,7 +168,10 @@ def test_failed_episodes_can_be_asked_for_later_and_are_extended(tmp_path: Path)
     generate(config(tmp_path / "later", episodes=1))
     generate(config(tmp_path / "later", episodes=1, keep_failed=True))
     generate(config(tmp_path / "later", keep_failed=True))
+    generate(config(tmp_path / "at_last"))
+    generate(config(tmp_path / "at_last", keep_failed=True))
     assert contents(tmp_path / "later") == contents(tmp_path / "at_once")
+    assert contents(tmp_path / "at_last") == contents(tmp_path / "at_once")
 
 
 @pytest.mark.usefixtures("clumsy")

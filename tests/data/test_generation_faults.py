@@ -21,7 +21,7 @@ from openvima.data import Dataset, GenerationProgress, generate
 from openvima.errors import DatasetError, ShardError, StorageError
 from small_datasets import TASKS, config, contents
 
-NUM_KILLS = 20  # for each of two beginnings
+NUM_KILLS = 10  # for each of two beginnings
 
 
 @pytest.fixture(scope="module")
