@@ -11,7 +11,7 @@ import pytest
 
 from naive import interleaved
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
-from openvima.data.columns import pixels, planes
+from openvima.data.columns import Scratch, pixels, planes
 from openvima.data.encoding import ShardInfo, encode
 from openvima.data.manifest import finish_folder
 from openvima.data.schema import ARRAYS, COLUMNS, VIEWS
@@ -168,12 +168,18 @@ def test_many_open_shards_need_no_open_files(tmp_path: Path, demo: Demonstration
 
 def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
     given = np.random.default_rng(0).integers(0, 256, (3, 3, 128, 256), dtype=np.uint8)
-    joined = pixels(given)
+    joined = pixels(given, np.empty((3, 128, 256, 3), np.uint8))
     assert np.array_equal(joined[:, :5], interleaved(given[:, :, :5]))
-    assert np.array_equal(pixels([np.asfortranarray(image) for image in given]), joined)
+    odd = [np.asfortranarray(image) for image in given]
+    assert np.array_equal(pixels(odd, np.empty_like(joined)), joined)
     assert np.array_equal(planes(joined), given)
     assert planes(joined).flags.c_contiguous
-    assert pixels(given[:0]).shape == (0, 128, 256, 3)
+
+
+def test_memory_that_is_used_again_changes_nothing(made_up: MadeUp) -> None:
+    scratch = Scratch()
+    for demo in (made_up(1, num_steps=4, num_images=3), made_up(2, num_steps=0, num_images=0), made_up(3)):
+        assert encode(demo, scratch=scratch).equals(encode(demo))
 
 
 def test_the_schema_says_how_images_are_shaped() -> None:

@@ -23,51 +23,70 @@ class Columns:
 
     Args:
         records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
-        arrays: Column name to numbers, little-endian: `poses` (T + 1, objects, 7), the four arrays of the
-            actions (T, 2) and (T, 4), and `joint_paths`, the waypoints of all steps after each other, (W, 6).
-        path_lengths: Number of waypoints of each step.
+        numbers: Column name to lists of lists of numbers: poses, the four arrays of the actions, joint paths.
         images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
             and `segm_…` (N, 128, 256).
         content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
     """
 
     records: dict[str, Any]  # Any: texts, numbers, and lists and dictionaries of them
-    arrays: dict[str, np.ndarray]
-    path_lengths: list[int]
+    numbers: dict[str, list]
     images: dict[str, np.ndarray]
     content_hash: str
 
 
-def columns_of(demo: "Demonstration") -> Columns:
-    """Return the columns of a demonstration."""
+class Scratch:
+    """Memory for the images of one episode after the other: fresh memory costs more than filling it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def images(self, name: str, count: int) -> np.ndarray:
+        """Return room for images in colour, shape (count, 128, 256, 3), uint8, valid until the next call.
+
+        Args:
+            name: What they are for; each name has its own memory.
+            count: Number of images.
+        """
+        if count > len(self._arrays.get(name, ())):
+            self._arrays[name] = np.empty((count, *IMAGE_SHAPE, 3), np.uint8)
+        return self._arrays[name][:count] if count else np.empty((0, *IMAGE_SHAPE, 3), np.uint8)
+
+
+def columns_of(demo: "Demonstration", scratch: Scratch | None = None) -> Columns:
+    """Return the columns of a demonstration.
+
+    Args:
+        demo: The demonstration.
+        scratch: Memory for its images; None gives them their own.
+    """
     records, arrays = _records(demo), _arrays(demo)
     path_lengths = [len(path) for path in demo.joint_paths]
     described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
     digest = xxhash.xxh3_128(json.dumps(described, sort_keys=True).encode())
     images = {}
-    for name, array in itertools.chain(arrays.items(), _images(demo)):
+    for name, array in itertools.chain(arrays.items(), _images(demo, scratch or Scratch())):
         digest.update(array.nbytes.to_bytes(8, "little"))
         digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the processor's cache
         if name not in arrays:
             images[name] = array
-    return Columns(records, arrays, path_lengths, images, digest.hexdigest())
+    numbers = {name: array.reshape(-1, array.shape[-1]).tolist() for name, array in arrays.items()}
+    numbers["joint_paths"] = [path.tolist() for path in demo.joint_paths]
+    return Columns(records, numbers, images, digest.hexdigest())
 
 
-def pixels(planes: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-    """Return images with their colours last.
+def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.ndarray:
+    """Copy images so that their colours come last.
 
     Args:
         planes: N images of shape (3, 128, 256), uint8.
-
-    Returns:
-        Shape (N, 128, 256, 3), uint8, contiguous.
+        out: Where to, shape (N, 128, 256, 3), uint8, contiguous; also what is returned.
     """
     from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
 
-    joined = np.empty((len(planes), *IMAGE_SHAPE, 3), np.uint8)
-    for image, out in zip(planes, joined, strict=True):
-        join_colours(np.ascontiguousarray(image).reshape(3, -1), out.reshape(-1))
-    return joined
+    for image, joined in zip(planes, out, strict=True):
+        join_colours(np.ascontiguousarray(image).reshape(3, -1), joined.reshape(-1))
+    return out
 
 
 def planes(pixels: np.ndarray) -> np.ndarray:
@@ -143,14 +162,16 @@ def _arrays(demo: "Demonstration") -> dict[str, np.ndarray]:
     return arrays
 
 
-def _images(demo: "Demonstration") -> Iterator[tuple[str, np.ndarray]]:
+def _images(demo: "Demonstration", scratch: Scratch) -> Iterator[tuple[str, np.ndarray]]:
     shown = list(demo.prompt.images.values())
     empty = np.zeros((0, *IMAGE_SHAPE), np.uint8)
     for view in VIEWS:
-        yield f"prompt_rgb_{view}", pixels([image.rgb[view] for image in shown])
+        name = f"prompt_rgb_{view}"
+        yield name, pixels([image.rgb[view] for image in shown], scratch.images(name, len(shown)))
     for view in VIEWS:
         yield f"prompt_segm_{view}", np.stack([image.segm[view] for image in shown]) if shown else empty
     for view in VIEWS:
-        yield f"rgb_{view}", pixels(demo.rgb[view])
+        name = f"rgb_{view}"
+        yield name, pixels(demo.rgb[view], scratch.images(name, len(demo.rgb[view])))
     for view in VIEWS:
         yield f"segm_{view}", np.ascontiguousarray(demo.segm[view])

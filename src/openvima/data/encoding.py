@@ -8,16 +8,17 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.columns import columns_of
+from openvima.data.columns import Scratch, columns_of
 from openvima.data.records import Demonstration
-from openvima.data.schema import ARRAYS, CODECS, COLUMNS, SCHEMA_VERSION
+from openvima.data.schema import CODECS, COLUMNS, IMAGES, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
 
 _METADATA_KEY = b"openvima"
-_LISTS: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in (*ARRAYS, "joint_paths")}
 _NAMES = COLUMNS.names
-# All other columns, to be made at once: each call into Arrow costs some microseconds.
-_RECORDS = pa.struct([field for field in COLUMNS if field.name not in (*ARRAYS, "joint_paths")])
+_IMAGE_LISTS: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in IMAGES}
+# All other columns are made at once: each call into Arrow costs some microseconds.
+_OTHER_NAMES = [name for name in _NAMES if name not in IMAGES]
+_OTHERS = pa.struct([COLUMNS.field(name) for name in _OTHER_NAMES])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
 
@@ -103,7 +104,11 @@ class ShardInfo:
 
 
 def encode(
-    demo: Demonstration, skipped: Sequence[Skipped] = (), *, with_images: bool = True
+    demo: Demonstration,
+    skipped: Sequence[Skipped] = (),
+    *,
+    with_images: bool = True,
+    scratch: Scratch | None = None,
 ) -> pa.RecordBatch:
     """Make one row of a demonstration.
 
@@ -111,47 +116,27 @@ def encode(
         demo: The demonstration.
         skipped: Seeds tried just before it in vain.
         with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
+        scratch: Memory for the images, good until it is used again; None gives them their own.
 
     Returns:
         A record batch of one row with the columns of `schema.COLUMNS`.
     """
-    columns = columns_of(demo)
-    records = {
+    columns = columns_of(demo, scratch)
+    others = {
         **columns.records,
+        **columns.numbers,
         "content_hash": columns.content_hash,
         "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
     }
-    images = {name: array if with_images else array[:0] for name, array in columns.images.items()}
-    arrays = {**columns.arrays, **images}
-    cells: dict[str, pa.Array] = {
-        "joint_paths": _nested_cell(arrays.pop("joint_paths"), columns.path_lengths)
-    }
-    cells |= {name: _list_cell(array, _LISTS[name]) for name, array in arrays.items()}
-    plain = pa.array([records], type=_RECORDS).flatten()
-    cells |= {field.name: cell for field, cell in zip(_RECORDS, plain, strict=True)}
+    cells = dict(zip(_OTHER_NAMES, pa.array([others], type=_OTHERS).flatten(), strict=True))
+    for name, images in columns.images.items():
+        cells[name] = _image_cell(images if with_images else images[:0], _IMAGE_LISTS[name])
     return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=COLUMNS)
 
 
-def _list_cell(array: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
-    """A column of one row that lists arrays of one shape, without a copy."""
-    items = _fixed_lists(array, dtype.value_type)
-    return _lists(np.array([0, len(items)], np.int32), items, dtype)
-
-
-def _nested_cell(array: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
-    """The column of joint paths of one row, without a copy."""
-    ends = np.cumsum([0, *lengths], dtype=np.int32)
-    steps = _LISTS["joint_paths"].value_type
-    paths = _lists(ends, _fixed_lists(array, steps.value_type), steps)
-    return _lists(np.array([0, len(lengths)], np.int32), paths, _LISTS["joint_paths"])
-
-
-def _lists(offsets: np.ndarray, items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
-    return pa.Array.from_buffers(
-        dtype, len(offsets) - 1, [None, pa.py_buffer(offsets)], null_count=0, children=[items]
-    )
-
-
-def _fixed_lists(array: np.ndarray, dtype: pa.FixedSizeListType) -> pa.FixedSizeListArray:
-    flat = pa.Array.from_buffers(dtype.value_type, array.size, [None, pa.py_buffer(array)], null_count=0)
-    return pa.Array.from_buffers(dtype, array.size // dtype.list_size, [None], null_count=0, children=[flat])
+def _image_cell(images: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
+    """A column of one row that lists images, without a copy."""
+    flat = pa.Array.from_buffers(pa.uint8(), images.size, [None, pa.py_buffer(images)], null_count=0)
+    items = pa.Array.from_buffers(dtype.value_type, len(images), [None], null_count=0, children=[flat])
+    ends = pa.py_buffer(np.array([0, len(images)], np.int32))
+    return pa.Array.from_buffers(dtype, 1, [None, ends], null_count=0, children=[items])

@@ -8,6 +8,7 @@ from typing import BinaryIO
 
 import pyarrow as pa
 
+from openvima.data.columns import Scratch
 from openvima.data.encoding import ShardInfo, Skipped, encode
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
@@ -31,6 +32,7 @@ class ShardWriter:
     def __init__(self, path: Path, info: ShardInfo) -> None:
         self.path = path
         self._info = info
+        self._scratch = Scratch()
         self._schema = COLUMNS.with_metadata(info.to_metadata())
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
@@ -47,7 +49,7 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self.copy(encode(demo, skipped, with_images=self._info.images))
+        self.copy(encode(demo, skipped, with_images=self._info.images, scratch=self._scratch))
 
     def copy(self, batch: pa.RecordBatch) -> None:
         """Append one episode as another shard holds it.
