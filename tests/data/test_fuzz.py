@@ -9,6 +9,11 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+
+from openvima.data import Dataset, Demonstration, Shard, VerifyConfig, verify
+from openvima.data.encoding import ShardInfo
+from openvima.data.schema import COLUMNS
+from openvima.errors import DatasetError, ShardError
 from small_data_sets import (
     contents,
     damaged,
@@ -18,11 +23,6 @@ from small_data_sets import (
     with_plain_images,
     write_folder,
 )
-
-from openvima.data import Dataset, Demonstration, Shard, VerifyConfig, verify
-from openvima.data.encoding import ShardInfo
-from openvima.data.schema import COLUMNS
-from openvima.errors import DatasetError, ShardError
 
 MadeUp = Callable[..., Demonstration]
 LOOK = VerifyConfig(replay=0)

@@ -2,6 +2,6 @@
 
 from openvima.data.verification.checks import verify
 from openvima.data.verification.findings import Problem, Verification, VerifyConfig
-from openvima.data.verification.repair import Repair, repair
+from openvima.data.verification.repairing import Repair, repair
 
 __all__ = ["Problem", "Repair", "Verification", "VerifyConfig", "repair", "verify"]

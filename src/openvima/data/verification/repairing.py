@@ -23,7 +23,7 @@ from openvima.data.verification.regenerate import (
 )
 from openvima.data.verification.salvage import Salvaged, salvage
 from openvima.data.verification.shards import spans_of
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, OpenVimaError
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +112,9 @@ def _settings_without_manifest(
             with contextlib.suppress(DatasetError):
                 candidates.insert(0, settings_in_manifest(folder, inventory.doubtful, config))
         for settings in candidates:
-            if fits(settings, whole, broken):
-                return settings, whole[0].info.versions
+            with contextlib.suppress(OpenVimaError):  # a task that is not installed, or no asset pack
+                if fits(settings, whole, broken):
+                    return settings, whole[0].info.versions
     raise DatasetError(
         f"the manifest of {folder} is lost, and its shards are not those of one `openvima generate` command. "
         "Repeat the command that wrote it, or restore dataset.json from a copy."

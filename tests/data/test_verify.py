@@ -1,0 +1,328 @@
+"""Verification: what is looked at beyond checksums, and episodes played again."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from openvima.cli.main import main
+from openvima.data import (
+    Dataset,
+    Demonstration,
+    GenerateConfig,
+    Shard,
+    ShardWriter,
+    VerifyConfig,
+    generate,
+    verify,
+)
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import finish_folder
+from openvima.data.planning import COMMAND
+from openvima.data.verification import Verification
+from openvima.data.verification.episodes import faults
+from openvima.errors import ConfigError, DatasetError
+from openvima.scene import Action, ObjectRecord, Outcome
+from small_data_sets import finish, with_plain_images, write_folder
+
+MadeUp = Callable[..., Demonstration]
+TASKS = ("rotate", "sweep_without_exceeding")
+FIRST = "rotate-train-00000.arrow"
+ALL, NONE = VerifyConfig(replay=None), VerifyConfig(replay=0)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole")
+    return generate(GenerateConfig(out=out, tasks=TASKS, episodes=3, shard_size=2))
+
+
+@pytest.fixture
+def folder(whole: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole, tmp_path / "demos")
+
+
+def causes(found: Verification) -> dict[str, list[str]]:
+    result: dict[str, list[str]] = {}
+    for problem in found.problems:
+        result.setdefault(problem.file, []).append(problem.cause)
+    return result
+
+
+def rewrite(folder: Path, name: str, change: Callable[[Demonstration], Demonstration]) -> None:
+    """Write a shard and then the folder anew as if the oracle had done something else."""
+    shard = Shard(folder / name)
+    demos = [change(shard[row]) for row in range(len(shard))]
+    manifest = Dataset(folder).manifest
+    with ShardWriter(folder / name, shard.info) as writer:
+        for demo in demos:
+            writer.write(demo)
+    origin = {key: manifest[key] for key in ("command", "config", "versions", "licence")}
+    finish_folder(folder, sorted(folder.glob("*.arrow")), **origin)
+
+
+def test_a_generated_data_set_is_clean_and_plays_again(whole: Path) -> None:
+    calls = []
+    found = verify(whole, ALL, lambda *call: calls.append(call))
+    assert found.is_clean, found.problems
+    assert found.notes == ()
+    assert (found.num_shards, found.num_episodes, found.num_replayed) == (4, 6, 6)
+    assert calls[-1] == (6, 6, "playing again")
+
+
+def test_one_episode_of_each_task_is_played_again_unless_told_otherwise(whole: Path) -> None:
+    assert verify(whole).num_replayed == len(TASKS)
+    assert verify(whole, NONE).num_replayed == 0
+
+
+def test_two_workers_find_the_same(folder: Path) -> None:
+    (folder / FIRST).write_bytes(b"")
+    (folder / "extra.arrow").write_bytes(b"")
+    one, two = verify(folder), verify(folder, VerifyConfig(workers=2))
+    assert one == two
+    assert one.damaged == (FIRST,)
+
+
+def test_a_shard_that_the_manifest_does_not_list_is_named(folder: Path) -> None:
+    shutil.copy(folder / FIRST, folder / "rotate-train-00009.arrow")
+    assert causes(verify(folder, NONE)) == {"rotate-train-00009.arrow": ["the manifest does not list it"]}
+
+
+def test_what_killed_writers_left_is_noted(folder: Path) -> None:
+    (folder / ".rotate-train-00000.arrow.17.tmp").write_bytes(b"half")
+    found = verify(folder, NONE)
+    assert found.is_clean
+    assert ".rotate-train-00000.arrow.17.tmp: a process was killed" in found.notes[0]
+
+
+def test_an_episode_that_is_there_twice_is_named(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
+    first, second = (with_plain_images(made_up(seed)) for seed in (1, 2))
+    write_folder(tmp_path, info, [[first, second], [second]])
+    cause = "1 of its 1 episodes are there twice, the first of them also in stack-train-00000.arrow"
+    assert causes(verify(tmp_path, NONE)) == {"stack-train-00001.arrow": [cause]}
+
+
+def test_a_content_hash_that_is_not_that_of_the_content_is_found(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo
+) -> None:
+    write_folder(tmp_path, info, [[with_plain_images(made_up(seed)) for seed in (1, 2)]])
+    path = tmp_path / "stack-train-00000.arrow"
+    first, second = (Shard(path).batch(row) for row in (0, 1))
+    place = second.schema.get_field_index("content_hash")
+    forged = second.set_column(place, second.schema.field(place), pa.array(["0" * 32]))
+    with ShardWriter(path, info) as writer:
+        writer.copy(first)
+        writer.copy(forged)
+    finish(tmp_path, info)
+    cause = "its content hash is not that of its content (record 1 of 2)"
+    assert causes(verify(tmp_path, NONE)) == {"stack-train-00000.arrow": [cause]}
+
+
+def test_generated_episodes_that_were_not_solved_or_out_of_order_are_found(folder: Path) -> None:
+    rewrite(folder, FIRST, lambda demo: dataclasses.replace(demo, seed=7, outcome=Outcome()))
+    assert causes(verify(folder, NONE)) == {
+        FIRST: ["it is not solved (records 0, 1 of 2)", _out_of_order("record 1 of 2")]
+    }
+
+
+def _out_of_order(rows: str) -> str:
+    return f"its seed does not follow that of the record before ({rows})"
+
+
+def test_a_shard_of_other_settings_is_found(folder: Path) -> None:
+    shard = Shard(folder / FIRST)
+    demos = [shard[row] for row in range(len(shard))]
+    info = dataclasses.replace(shard.info, difficulty="hard", versions={"openvima": "0"}, number=5)
+    manifest = Dataset(folder).manifest
+    with ShardWriter(folder / FIRST, info) as writer:
+        for demo in demos:
+            writer.write(demo)
+    origin = {key: manifest[key] for key in ("command", "config", "versions", "licence")}
+    finish_folder(folder, sorted(folder.glob("*.arrow")), **origin)
+    found = causes(verify(folder, NONE))[FIRST]
+    assert "difficulty is hard, in the manifest easy" in found
+    assert any(cause.startswith("it was written by {'openvima': '0'}") for cause in found)
+    assert "it says that it is rotate-train-00005.arrow" in found
+
+
+def test_an_oracle_that_acts_otherwise_is_found_by_playing(folder: Path) -> None:
+    other = Action.planar((0.3, 0.1), (0.6, -0.2))
+    rewrite(folder, FIRST, lambda demo: dataclasses.replace(demo, actions=(other,) * demo.num_steps))
+    found = verify(folder, ALL)
+    assert causes(found) == {FIRST: ["played again, the oracle acts otherwise in step 0 (records 0, 1 of 2)"]}
+    assert found.num_replayed == 6
+
+
+def _with_a_pixel_changed(demo: Demonstration) -> Demonstration:
+    rgb = {view: images.copy() for view, images in demo.rgb.items()}
+    rgb["top"][1, 0, 5, 5] ^= 1
+    return dataclasses.replace(demo, rgb=rgb)
+
+
+def _with_an_object_moved(demo: Demonstration) -> Demonstration:
+    scene = demo.scenes[-1]
+    placement = scene.placements[0]
+    pose = dataclasses.replace(placement.pose, position=(0.5, 0.0, 0.0))
+    return dataclasses.replace(demo, scenes=(*demo.scenes[:-1], scene.with_poses({placement.id: pose})))
+
+
+def _with_another_path(demo: Demonstration) -> Demonstration:
+    first, *rest = demo.joint_paths
+    return dataclasses.replace(demo, joint_paths=(first + np.float32(1e-6), *rest))
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (_with_a_pixel_changed, "the images are others after step 0"),
+        (_with_an_object_moved, "objects lie elsewhere after step 0"),
+        (_with_another_path, "the arm takes another path in step 0"),
+        (lambda demo: dataclasses.replace(demo, num_redraws=9), "the seed gives another episode"),
+        (
+            lambda demo: dataclasses.replace(demo, prompt=dataclasses.replace(demo.prompt, text="Do it.")),
+            "the prompt is another one",
+        ),
+    ],
+)
+def test_playing_again_names_what_is_not_the_same_first(
+    folder: Path, change: Callable[[Demonstration], Demonstration], cause: str
+) -> None:
+    rewrite(folder, FIRST, change)
+    found = causes(verify(folder, ALL))
+    assert [text for text in found[FIRST] if text.startswith("played again")] == [
+        f"played again, {cause} (records 0, 1 of 2)"
+    ]
+
+
+def test_what_other_versions_wrote_is_compared_and_noted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rewrite(folder, FIRST, _with_another_path)
+    monkeypatch.setattr(
+        "openvima.data.verification.replay.package_versions", lambda: {"openvima": "9", "pyarrow": "1"}
+    )
+    found = verify(folder, ALL)
+    assert found.is_clean
+    assert "installed are openvima 9, pyarrow 1. Only equal versions promise equal" in found.notes[0]
+    assert "which may be why: played again, the arm takes another path in step 0" in found.notes[1]
+
+
+def test_imported_episodes_are_not_played(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
+    info = dataclasses.replace(info, domain="published")
+    demo = dataclasses.replace(with_plain_images(made_up()), domain="published", joint_paths=(), scenes=())
+    found = verify(write_folder(tmp_path, info, [[demo]]), ALL)
+    assert found.is_clean, found.problems
+    assert found.num_replayed == 0
+    assert found.notes == ("1 episodes are imported ones; these cannot be played again.",)
+
+
+def test_a_task_that_is_not_installed_is_noted(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
+    found = verify(write_folder(tmp_path, info, [[with_plain_images(made_up())]]), ALL)
+    assert found.is_clean
+    assert "there is no task 'stack'" in found.notes[1]
+
+
+def test_every_task_plays_again(tmp_path: Path) -> None:
+    found = verify(generate(GenerateConfig(out=tmp_path, episodes=1)), ALL)
+    assert found.is_clean, found.problems
+    assert found.num_replayed == found.num_episodes >= 13
+
+
+def test_data_without_images_are_compared_through_what_is_drawn(tmp_path: Path) -> None:
+    config = GenerateConfig(out=tmp_path, tasks=("rotate",), episodes=2, images=False)
+    found = verify(generate(config), ALL)
+    assert found.is_clean, found.problems
+    assert (found.num_episodes, found.num_replayed) == (2, 2)
+
+
+def _faulty() -> Iterator[tuple[str, dict[str, object]]]:
+    yield (
+        "pose0_position lies outside the workspace",
+        {"actions": (Action((0.9, 0.0), (0.5, 0.0)), Action((0.5, 0.0), (0.5, 0.0)))},
+    )
+    yield (
+        "pose1_rotation is not a number",
+        {"actions": (Action((0.5, 0.0), (0.5, 0.0), pose1_rotation=(0.0, 0.0, float("nan"), 1.0)),) * 2},
+    )
+    yield (
+        "pose1_rotation is no unit quaternion",
+        {"actions": (Action((0.5, 0.0), (0.5, 0.0), pose1_rotation=(0.0, 0.0, 2.0, 1.0)),) * 2},
+    )
+    yield "pick_ids names an object that is not in the scene", {"pick_ids": (5, 9)}
+    yield "place_ids does not have one id an action", {"place_ids": (5,)}
+    yield "it is both a success and a failure", {"outcome": Outcome(success=True, failure=True)}
+    yield "it has more actions than steps are allowed", {"max_steps": 1}
+    yield "the arm does not have one path an action", {"joint_paths": (np.zeros((3, 6), np.float32),)}
+    yield "the end effector 'hand' does not exist", {"end_effector": "hand"}
+    yield "two objects have the same id", {"objects": (ObjectRecord(5, "flower", "red swirl"),) * 2}
+
+
+@pytest.mark.parametrize(("cause", "change"), list(_faulty()))
+def test_values_that_cannot_be_are_named(made_up: MadeUp, cause: str, change: dict) -> None:
+    demo = with_plain_images(made_up())
+    assert list(faults(demo)) == []
+    assert cause in set(faults(dataclasses.replace(demo, **change)))
+
+
+def test_images_that_do_not_fit_the_rest_are_named(made_up: MadeUp) -> None:
+    demo = with_plain_images(made_up())
+    one_less = dataclasses.replace(demo, rgb={**demo.rgb, "top": demo.rgb["top"][1:]})
+    assert list(faults(one_less)) == ["the top view does not have one image more than there are actions"]
+    strange = {**demo.segm, "front": np.full_like(demo.segm["front"], 77)}
+    assert list(faults(dataclasses.replace(demo, segm=strange))) == [
+        "the segmentation of the front view shows an object that is not in the scene"
+    ]
+    scenes = dataclasses.replace(demo, scenes=demo.scenes[1:])
+    assert list(faults(scenes)) == ["the objects do not have one pose more than there are actions"]
+
+
+def test_settings_and_folders_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="replay is -1"):
+        VerifyConfig(replay=-1)
+    with pytest.raises(ConfigError, match="workers is 0"):
+        VerifyConfig(workers=0)
+    with pytest.raises(DatasetError, match="holds no data set"):
+        verify(tmp_path)
+
+
+def test_the_command_ends_with_0_where_all_is_well(whole: Path, capsys: pytest.CaptureFixture) -> None:
+    assert main(["data", "verify", str(whole), "--replay", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert "4 shards, 6 episodes compared with their hashes, 2 played again" in shown
+    assert "nothing is wrong" in shown
+
+
+def test_the_command_ends_with_1_and_names_what_is_wrong(folder: Path, capsys: pytest.CaptureFixture) -> None:
+    (folder / FIRST).unlink()
+    assert main(["data", "verify", str(folder), "--replay", "0"]) == 1
+    shown = capsys.readouterr().out
+    assert f"{FIRST}: it is missing" in shown
+    assert f"openvima data verify {folder} --repair" in shown
+    assert main(["data", "verify", str(folder), "--replay", "0", "--json"]) == 1
+    record = json.loads(capsys.readouterr().out)
+    assert record["clean"] is False
+    assert record["problems"][0]["file"] == FIRST
+
+
+def test_the_command_refuses_what_is_no_number_of_episodes(
+    whole: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert main(["data", "verify", str(whole), "--replay", "some"]) == 2
+    assert "--replay is 'some'" in capsys.readouterr().err
+
+
+def test_shards_of_failed_episodes_are_looked_at_too(folder: Path, made_up: MadeUp, info: ShardInfo) -> None:
+    failed = dataclasses.replace(
+        with_plain_images(made_up()), outcome=Outcome(failure=True, reason="it fell")
+    )
+    write_folder(folder / "failed", info, [[failed]], command=COMMAND)
+    found = verify(folder, NONE)
+    assert found.num_episodes == 7
+    assert set(causes(found)) <= {"failed/stack-train-00000.arrow"}  # made up, so without settings
+    (folder / "failed" / "index.parquet").unlink()
+    assert causes(verify(folder, NONE))["failed/index.parquet"] == ["it is missing"]
