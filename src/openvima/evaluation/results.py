@@ -27,6 +27,8 @@ class EpisodeOutcome:
         reason: Empty on success, else one sentence.
         kind: Empty on success, else the reason without names and numbers, for counting.
         redraws: Unlucky draws that were thrown away before a start was found.
+        oracle_max_steps: Steps within which the oracle must be done; None: as the row says.
+        near_ties: Decisions in which two classes scored so alike that rounding may choose between them.
     """
 
     seed: int
@@ -35,6 +37,8 @@ class EpisodeOutcome:
     reason: str = ""
     kind: str = ""
     redraws: int = 0
+    oracle_max_steps: int | None = None
+    near_ties: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,8 @@ class Row:
         level: "train", "L1", "L2", "L3" or "L4".
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
+        control: What was taken from the policy, see `openvima.evaluation.controls`; empty for the plain
+            score.
     """
 
     policy: str
@@ -54,6 +60,7 @@ class Row:
     level: str
     oracle_max_steps: int
     outcomes: tuple[EpisodeOutcome, ...]
+    control: str = ""
 
     @property
     def episodes(self) -> int:
@@ -73,7 +80,10 @@ class Row:
     @property
     def successes_strict(self) -> int:
         """Number of episodes solved in no more steps than the oracle may take."""
-        return sum(outcome.success and outcome.steps <= self.oracle_max_steps for outcome in self.outcomes)
+        return sum(
+            outcome.success and outcome.steps <= (outcome.oracle_max_steps or self.oracle_max_steps)
+            for outcome in self.outcomes
+        )
 
     @property
     def interval(self) -> Interval:
@@ -91,6 +101,11 @@ class Row:
         return sum(outcome.redraws for outcome in self.outcomes)
 
     @property
+    def near_ties(self) -> list[int]:
+        """Seeds of episodes whose outcome rounding may have decided."""
+        return [outcome.seed for outcome in self.outcomes if outcome.near_ties]
+
+    @property
     def failures(self) -> dict[str, int]:
         """How often each kind of failure came about, most frequent first."""
         kinds = Counter(outcome.kind for outcome in self.outcomes if not outcome.success)
@@ -106,6 +121,7 @@ class LevelMean:
     mean: float
     interval: Interval
     tasks: tuple[str, ...]
+    control: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +132,14 @@ class Results:
         rows: In the order policy, level, task.
         config: What was asked for, as plain values.
         versions: Versions of the packages that results depend on.
-        policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …}.
+        policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …},
+            for remote ones {"metadata": …}.
     """
 
     rows: tuple[Row, ...]
     config: dict[str, Any] = field(default_factory=dict)  # plain JSON values
     versions: dict[str, str] = field(default_factory=dict)
-    policies: dict[str, dict[str, str]] = field(default_factory=dict)
+    policies: dict[str, dict[str, Any]] = field(default_factory=dict)  # plain JSON values
 
     def policy_names(self) -> list[str]:
         """Names of the policies, in the order of the rows."""
@@ -136,20 +153,23 @@ class Results:
         """Tasks that occur, at one level or at all."""
         return _in_order(row.task for row in self.rows if level in (None, row.level))
 
-    def row(self, policy: str, task: str, level: str) -> Row | None:
-        """The row of that policy, task and level, if there is one."""
-        wanted = (policy, task, level)
-        return next((row for row in self.rows if (row.policy, row.task, row.level) == wanted), None)
+    def row(self, policy: str, task: str, level: str, control: str = "") -> Row | None:
+        """The row of that policy, task and level, under a control or plain, if there is one."""
+        wanted = (policy, task, level, control)
+        return next(
+            (row for row in self.rows if (row.policy, row.task, row.level, row.control) == wanted), None
+        )
 
     def level_means(self) -> list[LevelMean]:
-        """Mean over the tasks of each level, for each policy."""
+        """Mean over the tasks of each level, for each policy, plain and under each control."""
+        cells: dict[tuple[str, str, str], list[Row]] = {}
+        for row in self.rows:
+            cells.setdefault((row.policy, row.control, row.level), []).append(row)
         means = []
-        for policy in self.policy_names():
-            for level in self.levels():
-                rows = [row for row in self.rows if (row.policy, row.level) == (policy, level)]
-                if rows:
-                    mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
-                    means.append(LevelMean(policy, level, mean, interval, tuple(row.task for row in rows)))
+        for (policy, control, level), rows in cells.items():
+            mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
+            tasks = tuple(row.task for row in rows)
+            means.append(LevelMean(policy, level, mean, interval, tasks, control))
         return means
 
     def to_json(self) -> str:
@@ -210,6 +230,7 @@ def _row_record(row: Row) -> dict[str, object]:
         "policy": row.policy,
         "task": row.task,
         "level": row.level,
+        "control": row.control,
         "successes": row.successes,
         "episodes": row.episodes,
         "rate": _rounded(row.rate),
@@ -220,13 +241,21 @@ def _row_record(row: Row) -> dict[str, object]:
         "seeds": [row.outcomes[0].seed, row.outcomes[-1].seed],
         "failures": row.failures,
         "redraws": row.redraws,
+        "near_ties": row.near_ties,
         "outcomes": [asdict(outcome) for outcome in row.outcomes],
     }
 
 
 def _row_from_record(record: Mapping[str, Any]) -> Row:
     outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
-    return Row(record["policy"], record["task"], record["level"], record["oracle_max_steps"], outcomes)
+    return Row(
+        record["policy"],
+        record["task"],
+        record["level"],
+        record["oracle_max_steps"],
+        outcomes,
+        record.get("control", ""),
+    )
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:
