@@ -16,6 +16,8 @@ from openvima.scene import ACTION_SHAPES, ObjectRecord
 if TYPE_CHECKING:
     from openvima.data.records import Demonstration
 
+_JSON = json.JSONEncoder(sort_keys=True)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
@@ -63,7 +65,7 @@ def columns_of(demo: "Demonstration", scratch: Scratch | None = None) -> Columns
     records, arrays = _records(demo), _arrays(demo)
     path_lengths = [len(path) for path in demo.joint_paths]
     described = {**records, "assets": demo.assets, "path_lengths": path_lengths}
-    digest = xxhash.xxh3_128(json.dumps(described, sort_keys=True).encode())
+    digest = xxhash.xxh3_128(_JSON.encode(described).encode())
     images = {}
     for name, array in itertools.chain(arrays.items(), _images(demo, scratch or Scratch())):
         digest.update(array.nbytes.to_bytes(8, "little"))
