@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from openvima.data.generation import generate
     from openvima.data.planning import GenerateConfig, plan
     from openvima.data.reader import Dataset, Shard
-    from openvima.data.records import Demonstration, rollout_oracle
+    from openvima.data.records import Demonstration, Step, rollout_oracle
     from openvima.data.tally import GenerationProgress, TaskProgress
     from openvima.data.verification import VerifyConfig, repair, verify
     from openvima.data.writer import ShardWriter
@@ -20,6 +20,7 @@ _HOMES = {
     "GenerationProgress": "tally",
     "Shard": "reader",
     "ShardWriter": "writer",
+    "Step": "records",
     "TaskProgress": "tally",
     "VerifyConfig": "verification",
     "generate": "generation",
@@ -36,6 +37,7 @@ __all__ = [
     "GenerationProgress",
     "Shard",
     "ShardWriter",
+    "Step",
     "TaskProgress",
     "VerifyConfig",
     "generate",
