@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xxhash
 
-from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.data.schema import ARRAYS, IMAGE_SHAPE, VIEWS
 from openvima.scene import ACTION_SHAPES, ObjectRecord
 
 if TYPE_CHECKING:
@@ -44,15 +44,19 @@ class Scratch:
         self._arrays: dict[str, np.ndarray] = {}
 
     def images(self, name: str, count: int) -> np.ndarray:
-        """Return room for images in colour, shape (count, 128, 256, 3), uint8, valid until the next call.
+        """Return room for images, valid until the next call.
 
         Args:
-            name: What they are for; each name has its own memory.
+            name: Column that they are for; each has its own memory.
             count: Number of images.
+
+        Returns:
+            An array of uint8 with the shape of the column.
         """
-        if count > len(self._arrays.get(name, ())):
-            self._arrays[name] = np.empty((count, *IMAGE_SHAPE, 3), np.uint8)
-        return self._arrays[name][:count] if count else np.empty((0, *IMAGE_SHAPE, 3), np.uint8)
+        _, shape = ARRAYS[name]
+        if name not in self._arrays or count > len(self._arrays[name]):
+            self._arrays[name] = np.empty((count, *shape), np.uint8)
+        return self._arrays[name][:count]
 
 
 def columns_of(demo: "Demonstration", scratch: Scratch | None = None) -> Columns:
@@ -166,12 +170,13 @@ def _arrays(demo: "Demonstration") -> dict[str, np.ndarray]:
 
 def _images(demo: "Demonstration", scratch: Scratch) -> Iterator[tuple[str, np.ndarray]]:
     shown = list(demo.prompt.images.values())
-    empty = np.zeros((0, *IMAGE_SHAPE), np.uint8)
     for view in VIEWS:
         name = f"prompt_rgb_{view}"
         yield name, pixels([image.rgb[view] for image in shown], scratch.images(name, len(shown)))
     for view in VIEWS:
-        yield f"prompt_segm_{view}", np.stack([image.segm[view] for image in shown]) if shown else empty
+        name = f"prompt_segm_{view}"
+        room = scratch.images(name, len(shown))
+        yield name, np.stack([image.segm[view] for image in shown], out=room) if shown else room
     for view in VIEWS:
         name = f"rgb_{view}"
         yield name, pixels(demo.rgb[view], scratch.images(name, len(demo.rgb[view])))
