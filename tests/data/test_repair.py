@@ -13,6 +13,8 @@ from openvima.data import (
     Dataset,
     Demonstration,
     GenerateConfig,
+    Shard,
+    ShardWriter,
     VerifyConfig,
     generate,
     repair,
@@ -148,6 +150,17 @@ def test_a_lost_manifest_and_shard_are_not_guessed(folder: Path) -> None:
     assert contents(folder) == before
 
 
+def test_shards_that_are_not_all_of_some_settings_are_not_taken_for_them(folder: Path) -> None:
+    (folder / "dataset.json").unlink()
+    demo = Shard(folder / FIRST)[0]
+    with ShardWriter(folder / FIRST, Shard(folder / FIRST).info) as writer:
+        writer.write(demo)  # one episode instead of two
+    before = contents(folder)
+    with pytest.raises(DatasetError, match="is lost"):
+        repair(folder, LOOK)
+    assert contents(folder) == before
+
+
 def test_other_versions_generate_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flip(folder / FIRST, 9000)
     before = contents(folder)
@@ -237,6 +250,22 @@ def test_no_whole_record_is_lost_whatever_else_is(
     assert done.after.is_clean, done.after.problems
     assert [demo.content_hash() for demo in Dataset(merged)] == [hashes[k] for k in kept]
     assert bool(done.lost) == (len(kept) < 6 or not has_index)
+
+
+@pytest.mark.parametrize("has_index", [True, False])
+def test_a_record_of_which_one_pixel_changed_is_not_kept(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo, has_index: bool
+) -> None:
+    demos = [made_up(seed, num_steps=0, num_images=0) for seed in range(2)]
+    noise = {view: 5 + images % 2 for view, images in demos[0].segm.items()}  # the objects of the scene
+    demos = [dataclasses.replace(demo, segm=noise) for demo in demos]
+    write_folder(tmp_path, info, [demos])
+    flip(tmp_path / STACK, offset(tmp_path, 1) + 200_000)  # noise is stored as it is, so this still decodes
+    assert not verify(tmp_path, LOOK).is_clean
+    if not has_index:
+        (tmp_path / "index.parquet").unlink()
+    assert repair(tmp_path, LOOK).after.is_clean
+    assert [demo.content_hash() for demo in Dataset(tmp_path)] == [demos[0].content_hash()]
 
 
 def test_a_salvage_that_is_stopped_before_the_index_is_written_loses_nothing(

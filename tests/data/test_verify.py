@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from openvima.cli.main import main
@@ -22,13 +23,13 @@ from openvima.data import (
     verify,
 )
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import finish_folder
+from openvima.data.manifest import fingerprint, finish_folder
 from openvima.data.planning import COMMAND
 from openvima.data.verification import Verification
 from openvima.data.verification.episodes import faults
 from openvima.errors import ConfigError, DatasetError
 from openvima.scene import Action, ObjectRecord, Outcome
-from small_data_sets import finish, with_plain_images, write_folder
+from small_data_sets import edit_manifest, finish, with_plain_images, write_folder
 
 MadeUp = Callable[..., Demonstration]
 TASKS = ("rotate", "sweep_without_exceeding")
@@ -121,6 +122,39 @@ def test_a_content_hash_that_is_not_that_of_the_content_is_found(
     finish(tmp_path, info)
     cause = "its content hash is not that of its content (record 1 of 2)"
     assert causes(verify(tmp_path, NONE)) == {"stack-train-00000.arrow": [cause]}
+
+
+def test_a_number_of_steps_that_is_not_that_of_the_actions_is_found(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo
+) -> None:
+    demo = dataclasses.replace(with_plain_images(made_up()), scenes=(), joint_paths=())
+    write_folder(tmp_path, info, [[demo]])
+    path = tmp_path / "stack-train-00000.arrow"
+    batch = Shard(path).batch(0)
+    place = batch.schema.get_field_index("steps")
+    with ShardWriter(path, info) as writer:
+        writer.copy(batch.set_column(place, batch.schema.field(place), pa.array([1], pa.int32())))
+    finish(tmp_path, info)
+    cause = "it does not have as many actions as steps (record 0 of 1)"
+    assert causes(verify(tmp_path, NONE)) == {path.name: [cause]}
+
+
+def test_a_manifest_and_an_index_that_contradict_a_shard_are_found_shard_by_shard(folder: Path) -> None:
+    other = "rotate-train-00001.arrow"
+    index = Dataset(folder).index
+    seeds = pa.array([seed + (row == 0) for row, seed in enumerate(index.column("seed").to_pylist())])
+    place = index.schema.get_field_index("seed")
+    pq.write_table(index.set_column(place, index.schema.field(place), seeds), folder / "index.parquet")
+
+    def edit(manifest: dict) -> None:
+        manifest["shards"][other]["steps"] += 1
+        manifest["index"] = fingerprint(folder / "index.parquet")
+
+    edit_manifest(folder, edit)
+    found = causes(verify(folder, NONE))
+    assert found[FIRST] == ["the index says otherwise of its seed"]
+    assert found[other] == ["the manifest says otherwise of its steps"]
+    assert "it does not list what the shards hold, or not in this order" in found["index.parquet"]
 
 
 def test_generated_episodes_that_were_not_solved_or_out_of_order_are_found(folder: Path) -> None:
