@@ -158,9 +158,11 @@ class Shard:
             names: Columns of `schema.COLUMNS`.
         """
         try:
-            return self._reader_of(names).read_all().select(list(names))
+            table = self._reader_of(names).read_all()
+            table.validate(full=True)  # as for a row
         except ODD_ERRORS as error:
             raise ShardError(_damaged(self.path, "its records", error)) from None
+        return table.select(list(names))
 
     def _reader_of(self, columns: Sequence[str]) -> pa.RecordBatchFileReader:
         """A reader to which the other columns do not exist."""
