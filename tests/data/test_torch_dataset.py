@@ -122,6 +122,14 @@ def test_a_position_of_another_order_is_refused() -> None:
         BatchLoader(Numbers(59), order)
 
 
+def test_the_global_generator_is_left_alone() -> None:
+    torch.manual_seed(0)
+    expected = torch.rand(1)
+    torch.manual_seed(0)
+    list(BatchLoader(Numbers(60), BatchOrder(60, batch=4, seed=2)))
+    assert torch.equal(torch.rand(1), expected)
+
+
 @pytest.mark.parametrize("source", ["images", "tokens"])
 def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> None:
     episodes = demos if source == "images" else open_tokens(demos)

@@ -20,7 +20,7 @@ from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E40
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import read_examples  # noqa: E402
+from training_examples import examples_of  # noqa: E402
 
 FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 NUM_LAYERS = 3  # of the text encoder
@@ -72,9 +72,9 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
         for parameter in model.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
     reader = Reader.of(sizes.images)
-    examples = read_examples(demonstrations, reader, validation_share=0)
-    batch = Collator(reader)(examples.training)
-    features = model.encode_images(examples.images)
+    examples, images = examples_of(demonstrations, reader)
+    batch = Collator(reader)(examples)
+    features = model.encode_images(images)
     memory = model.encode_prompts(batch.prompts, features)
     inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
     model.head.loss(inputs, batch.targets)[0].backward()

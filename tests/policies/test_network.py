@@ -13,7 +13,7 @@ from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import read_examples  # noqa: E402
+from training_examples import examples_of  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -49,11 +49,11 @@ def test_images_and_trunk_of_different_widths_are_refused():
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
     reader = Reader.of(network.config.images)
-    examples = read_examples(demonstrations, reader, validation_share=0.0)
-    batch = Collator(reader)(examples.training)
+    examples, images = examples_of(demonstrations, reader)
+    batch = Collator(reader)(examples)
 
     def loss() -> torch.Tensor:
-        features = network.encode_images(examples.images)
+        features = network.encode_images(images)
         memory = network.encode_prompts(batch.prompts, features)
         inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
         return network.head.loss(inputs, batch.targets)[0]

@@ -8,27 +8,25 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
-from openvima.errors import DatasetError  # noqa: E402
+from openvima.data.tokens.cache import open_tokens  # noqa: E402
+from openvima.errors import DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.training.augment import augmented  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import (  # noqa: E402
-    groups_of_equal_length,
-    read_examples,
-    rows_of_step,
-)
+from openvima.training.source import ExampleSource, Parts, by_length, check_words, split_examples  # noqa: E402
+from training_examples import examples_of, rngs_of  # noqa: E402
 
 OBJECTS, VIEWS = Reader("objects"), Reader("views")
 
 
 @pytest.fixture(scope="module")
 def examples(data):
-    return read_examples(Dataset(data), Reader("objects"), validation_share=0.0)
+    return examples_of(Dataset(data), OBJECTS)[0]
 
 
 def test_slots_point_at_the_objects_that_were_picked(data, examples):
-    batch = Collator(OBJECTS)(examples.training)
+    batch = Collator(OBJECTS)(examples)
     for b, demo in enumerate(Dataset(data)):
         for t, action in enumerate(demo.actions):
             slot = batch.targets.pick_BT[b, t]
@@ -38,39 +36,90 @@ def test_slots_point_at_the_objects_that_were_picked(data, examples):
             assert np.linalg.norm(position - np.array(action.pose0_position)) < 0.06
 
 
+def names_of(source: ExampleSource) -> set[tuple[str, int]]:
+    return {(example.tokens.task, example.tokens.seed) for example in source}
+
+
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
-    split = read_examples(Dataset(data), Reader("objects"), validation_share=0.3)
-    names = [{(e.tokens.task, e.tokens.seed) for e in part} for part in (split.training, split.validation)]
-    assert names[0].isdisjoint(names[1])
-    assert len(names[0] | names[1]) == 24
-    assert 1 <= len(names[1]) <= 14
-    fewer = read_examples(list(Dataset(data))[:10], Reader("objects"), validation_share=0.3)
-    assert {(e.tokens.task, e.tokens.seed) for e in fewer.validation} <= names[1]
-
-
-def test_no_demonstration_is_an_error():
+    cache = open_tokens(Dataset(data))
+    training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
+    assert names_of(training).isdisjoint(names_of(kept))
+    assert len(names_of(training) | names_of(kept)) == 24
+    assert 1 <= len(kept) <= 14
+    of_one_task = open_tokens(Dataset(data, tasks=["rotate"]))
+    _, fewer = split_examples(of_one_task, validation_share=0.3, validation_episodes=100)
+    assert names_of(fewer) <= names_of(kept)
+    _, least = split_examples(cache, validation_share=0.3, validation_episodes=1)
+    assert len(least) == 1
+    assert names_of(least) <= names_of(kept)
     with pytest.raises(DatasetError, match="no demonstration to learn from"):
-        read_examples([], Reader("objects"), validation_share=0.1)
+        split_examples(cache, validation_share=1.0, validation_episodes=1)
 
 
-def test_every_epoch_shows_each_example_once():
-    rows = np.concatenate([rows_of_step(10, batch=4, step=step, seed=1) for step in range(5)])
-    assert sorted(rows[:10]) == list(range(10))
-    assert sorted(rows[10:]) == list(range(10))
-    assert rows[:10].tolist() != rows[10:].tolist()
-    np.testing.assert_array_equal(rows[8:12], rows_of_step(10, batch=4, step=2, seed=1))
+def test_an_example_of_a_source_knows_its_images_among_all(data):
+    cache = open_tokens(Dataset(data))
+    training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
+    images = np.concatenate([episode.images for episode in cache])
+    for source in (training, kept):
+        for example in source:
+            count = len(example.tokens.images)
+            assert np.array_equal(images[example.base : example.base + count], example.tokens.images)
+            assert cache[example.row].seed == example.tokens.seed
+    assert training.num_steps(np.arange(len(training))) == sum(e.tokens.num_steps for e in training)
+
+
+def test_a_word_that_nobody_knows_is_found_before_training(data):
+    class Cache:
+        def texts(self):
+            return {"rotate the xylophone"}
+
+    check_words(open_tokens(Dataset(data)), OBJECTS)
+    with pytest.raises(PromptError, match="xylophone"):
+        check_words(Cache(), OBJECTS)
 
 
 def test_groups_hold_all_examples_of_like_length(examples):
-    groups = groups_of_equal_length(examples.training)
+    groups = by_length(examples)
     assert sum(len(group) for group in groups) == 24
     assert {e.tokens.num_steps for e in groups[0]} == {1}
 
 
+def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
+    drawn = {}
+
+    def collate(part, rngs):
+        drawn.update({e.row: rng.random() for e, rng in zip(part, rngs, strict=True)})
+        return [example.row for example in part]
+
+    numbered = [replace(example, row=row) for row, example in enumerate(examples)]
+    parts = Parts(collate, seed=3, largest=5)(numbered, 7)
+    assert sorted(row for rows, _ in parts for row in rows) == list(range(24))
+    assert max(len(rows) for rows, _ in parts) <= 5
+    assert sum(steps for _, steps in parts) == sum(e.tokens.num_steps for e in examples)
+    whole, drawn = dict(drawn), {}
+    Parts(collate, seed=3, largest=2)(numbered[10:], 7)
+    assert all(whole[row] == value for row, value in drawn.items())  # whoever shares the batch
+    assert len(set(whole.values())) == 24
+
+
+@pytest.mark.parametrize("layout", ["objects", "views"])
+def test_augmentation_of_an_example_does_not_depend_on_its_company(layout, demonstrations_of_several_steps):
+    reader = Reader(layout)
+    examples, _ = examples_of(demonstrations_of_several_steps, reader)
+    collate, rngs = Collator(reader), rngs_of(examples)
+    together = augmented(collate(examples), layout, probability=0.5, rngs=rngs)
+    for b, example in enumerate(examples):
+        alone = augmented(collate([example]), layout, probability=0.5, rngs=rngs_of(examples)[b : b + 1])
+        for t in range(example.tokens.num_steps):
+            for v in range(2):
+                assert shown(together.history, b, t, v) == shown(alone.history, 0, t, v)
+        pick = together.targets.pick_BT[b, : example.tokens.num_steps]
+        assert torch.equal(pick, alone.targets.pick_BT[0])
+
+
 def test_targets_follow_their_objects_through_shuffling(examples):
-    batch = Collator(OBJECTS)(examples.training)
-    generator = torch.Generator().manual_seed(0)
-    changed = augmented(batch, "objects", probability=0.5, generator=generator)
+    batch = Collator(OBJECTS)(examples)
+    changed = augmented(batch, "objects", probability=0.5, rngs=rngs_of(examples))
     for b, t in np.argwhere(batch.targets.steps_BT.numpy()):
         for targets in ("pick_BT", "place_BT"):
             old, new = getattr(batch.targets, targets)[b, t], getattr(changed.targets, targets)[b, t]
@@ -86,13 +135,13 @@ def test_targets_follow_their_objects_through_shuffling(examples):
 
 
 def test_a_false_detection_shows_in_one_view_only(examples):
-    batch = Collator(OBJECTS)(examples.training[:4])
+    batch = Collator(OBJECTS)(examples[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
     changed = augmented(
         replace(batch, history=nothing),
         "objects",
         probability=1.0,
-        generator=torch.Generator().manual_seed(0),
+        rngs=rngs_of(examples[:4]),
     )
     views = changed.history.masks_BTVN.sum(dim=2)[changed.history.steps_BT]
     assert views.max() == 1
@@ -102,8 +151,7 @@ def test_a_false_detection_shows_in_one_view_only(examples):
 @pytest.fixture(scope="module")
 def views(demonstrations_of_several_steps):
     """With a token for each view, as the published VIMA has it."""
-    reader = Reader("views")
-    return read_examples(demonstrations_of_several_steps, reader, validation_share=0.0)
+    return examples_of(demonstrations_of_several_steps, VIEWS)
 
 
 def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
@@ -114,8 +162,8 @@ def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
 
 
 def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_their_order(views):
-    batch = Collator(VIEWS)(views.training)
-    changed = augmented(batch, "views", probability=0.5, generator=torch.Generator().manual_seed(0))
+    batch = Collator(VIEWS)(views[0])
+    changed = augmented(batch, "views", probability=0.5, rngs=rngs_of(views[0], 1))
     before, after = batch.history, changed.history
     places = []
     for b, t, v in np.ndindex(*before.masks_BTVN.shape[:3]):
@@ -133,8 +181,8 @@ def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_t
 
 
 def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
-    batch = Collator(VIEWS)(views.training)
-    after = augmented(batch, "views", probability=0.3, generator=torch.Generator().manual_seed(1)).history
+    batch = Collator(VIEWS)(views[0])
+    after = augmented(batch, "views", probability=0.3, rngs=rngs_of(views[0], 1)).history
     visible_BTV = after.masks_BTVN.sum(dim=3)
     for b, t in np.argwhere(batch.history.steps_BT.numpy()):
         for v in range(2):  # visible ones first, then empty ones: black, without a box
@@ -146,12 +194,12 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
         expected = (batch.history.counts_BT[b, : t + 1] + false.sum(dim=1)).max()
         assert after.counts_BT[b, t] == expected
     assert not after.counts_BT[~batch.history.steps_BT].any()
-    assert not views.images[0].any()
+    assert not views[1][0].any()
 
 
 def test_without_false_detections_views_stay_as_they_are(views):
-    batch = Collator(VIEWS)(views.training)
-    after = augmented(batch, "views", probability=0.0, generator=torch.Generator().manual_seed(0)).history
+    batch = Collator(VIEWS)(views[0])
+    after = augmented(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
     count = batch.history.masks_BTVN.shape[3]
     assert torch.equal(after.counts_BT, batch.history.counts_BT)
     assert torch.equal(after.crops_BTVN[..., :count], batch.history.crops_BTVN)
@@ -161,8 +209,8 @@ def test_without_false_detections_views_stay_as_they_are(views):
 
 def test_whole_frames_know_no_false_detections_and_stay_bytes(demonstrations_of_several_steps):
     reader = Reader("frames", (64, 128), tokens_per_frame_pair=1)
-    examples = read_examples(demonstrations_of_several_steps, reader, validation_share=0.0)
-    assert examples.images.dtype == torch.uint8
-    assert examples.images.shape[1:] == (3, 64, 128)
-    batch = Collator(reader)(examples.training)
-    assert augmented(batch, "frames", probability=1.0, generator=torch.Generator()) is batch
+    examples, images = examples_of(demonstrations_of_several_steps, reader)
+    assert images.dtype == torch.uint8
+    assert images.shape[1:] == (3, 64, 128)
+    batch = Collator(reader)(examples)
+    assert augmented(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch

@@ -18,8 +18,11 @@ from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import Batch, read_examples  # noqa: E402
+from openvima.training.dataset import Batch  # noqa: E402
+from openvima.training.learner import PolicyLearner  # noqa: E402
+from openvima.training.parallel import Parallel  # noqa: E402
 from openvima.training.stages import Cloning  # noqa: E402
+from training_examples import examples_of, source_of  # noqa: E402
 
 DEMONSTRATIONS = {
     "rotate": 22,
@@ -63,8 +66,8 @@ def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family
 def read(model: PolicyNetwork, runs: Sequence[Demonstration]) -> tuple[Batch, "torch.Tensor"]:
     """One batch of all, and its images."""
     reader = Reader.of(model.config.images)
-    examples = read_examples(runs, reader, validation_share=0.0)
-    return Collator(reader)(examples.training), examples.images
+    examples, images = examples_of(runs, reader)
+    return Collator(reader)(examples), images
 
 
 def learn_by_heart(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]]) -> None:
@@ -138,12 +141,13 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
     )
     runs = [run for group in demonstrations.values() for run in group]
     reader = Reader.of(sizes.images)
-    examples = read_examples(runs, reader, validation_share=0.0)
+    source = source_of(runs, reader)
     model = build_network(sizes, seed=0)
+    learner = PolicyLearner(model, reader)
     config = TrainingConfig(
         data=tmp_path, out=tmp_path, batch=32, pretraining_steps=0, spurious_probability=0.0
     )
-    stage = Cloning(model, config, replace(examples, validation=examples.training), reader)
+    stage = Cloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
     optimizer = torch.optim.AdamW(stage.parameters, lr=2e-3)
     for step in range(150):
         optimizer.zero_grad()

@@ -8,7 +8,7 @@ from openvima.catalog.partitions import pool  # noqa: E402
 from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.training import pretrain  # noqa: E402
-from openvima.training.schedule import learning_rate_share, step_generator  # noqa: E402
+from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 
@@ -74,11 +74,3 @@ def test_the_matching_loss_falls_when_pairs_are_told_apart():
         losses.append(loss.item())
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
     assert pretrain.scene_accuracy(encoder, pairs) > 0.7
-
-
-def test_the_learning_rate_rises_and_falls_to_zero():
-    shares = [learning_rate_share(step, steps=100, warmup_steps=10) for step in range(101)]
-    assert shares[:10] == sorted(shares[:10])
-    assert max(shares) == shares[10] == 1.0
-    assert shares[10:] == sorted(shares[10:], reverse=True)
-    assert shares[100] == 0.0

@@ -19,6 +19,7 @@ VERBS = {
     "policies": "list the named networks and their sizes, or convert published files",
     "train": "train a policy on demonstrations",
     "evaluate": "score policies on levels L1 to L4",
+    "serve": "let a policy be scored over the network, or from programs in other languages",
     "report": "make the HTML report of evaluation results",
 }
 
@@ -69,6 +70,8 @@ def _run(verb: str, rest: list[str]) -> int:
             return tyro.extras.subcommand_cli_from_dict(
                 commands, prog=f"openvima {verb}", description=module.__doc__, args=rest
             )
+        if hasattr(module, "run"):  # parses by itself
+            return module.run(rest)
         return tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
     except OpenVimaError as error:
         # Errors about input are also ValueError, KeyError or ImportError; others are failures of the work.

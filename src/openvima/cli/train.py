@@ -1,74 +1,96 @@
 """`openvima train`: train a policy on demonstrations."""
 
+import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from openvima.cli.progress import progress_bar
 
+if TYPE_CHECKING:
+    from openvima.evaluation.trial import Trial
+    from openvima.training import TrainingConfig
 
-def main(
-    *,
-    data: Path,
-    out: Path,
-    preset: str = "nano",
-    steps: int = 400,
-    batch: int = 64,
-    learning_rate: float = 1e-3,
-    pretraining_steps: int | None = None,
-    checkpoint_every: int = 100,
-    seed: int = 0,
-    threads: int = 1,
-    t5: str | None = None,
-    assets: str = "procedural",
-    tokens: Path | None = None,
-    force: bool = False,
-) -> int:
-    """Train a policy on demonstrations, or go on with a run that was interrupted.
+DESCRIPTION = """Train a policy on demonstrations, or go on with a run that was interrupted.
 
-    The whole policy learns by behaviour cloning. Before that, with nano and nano-bins, the crop encoder
-    learns to match objects in prompt images with objects in scenes drawn for that. The same command continues
-    an interrupted run exactly where its last checkpoint stands.
+The whole policy learns by behaviour cloning. Before that, with nano and nano-bins, the crop encoder learns to
+match objects in prompt images with objects in scenes drawn for that. The same command continues an
+interrupted run exactly where its last checkpoint stands.
 
-    Example: openvima train --data demos --preset nano --out run
+Example: openvima train --data demos --preset nano --out run
+
+--recipe names settings to begin with: "paper" trains as the VIMA paper does, "workstation" on one GPU with
+less data, "nano" on a few cores; by default "nano" for small presets and "paper" for the published sizes.
+--config takes a YAML file of settings, such as the config.yaml of another run. What is given here counts
+most. The defaults below are those of the recipe and file that were chosen.
+
+Several GPUs or machines: torchrun --nproc-per-node 8 -m openvima train --data demos --out run ...
+"""
+
+
+def run(words: Sequence[str]) -> int:
+    """Read the settings, and train.
 
     Args:
-        data: Folder of demonstrations, as `openvima generate` writes it.
-        out: Run folder for checkpoints, settings and metrics; `openvima evaluate --policy` takes it.
-        preset: Network and sizes, such as nano or gato-nano; `openvima policies` lists all.
-        steps: Steps of behaviour cloning.
-        batch: Demonstrations a step.
-        learning_rate: Highest learning rate of cloning.
-        pretraining_steps: Steps of matching prompt and scene; 0 leaves it out. None is as the preset wants:
-            400 for nano and nano-bins, 0 for the others.
-        checkpoint_every: Steps between checkpoints.
-        seed: Decides weights, order of the data and augmentation.
-        threads: Threads to compute with; equal numbers give equal weights.
-        t5: Where the published sizes (vima-2m …) take T5 from: a folder with weights and tokenizer, or
-            t5-base to fetch it from the Hugging Face Hub.
-        assets: Pack of the demonstrations: procedural, original, or a checkout of the original benchmark.
-        tokens: Folder to keep objects in that are cut out of the demonstrations; by default beside them.
-        force: Throw away a run with other settings that is in the run folder.
-    """
-    from openvima.training import TrainingConfig, train
+        words: The words after the verb.
 
-    config = TrainingConfig(
-        data=data,
-        out=out,
-        preset=preset,
-        steps=steps,
-        batch=batch,
-        learning_rate=learning_rate,
-        pretraining_steps=pretraining_steps,
-        checkpoint_every=checkpoint_every,
-        seed=seed,
-        threads=threads,
-        t5=t5,
-        assets=assets,
-        tokens=tokens,
-        force=force,
+    Returns:
+        Exit status.
+    """
+    import tyro
+
+    from openvima.training import TrainingConfig, train
+    from openvima.training.recipes import default_recipe, read_settings, recipe_settings
+
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--recipe")
+    first.add_argument("--config", type=Path)
+    first.add_argument("--preset")
+    known, _ = first.parse_known_args(list(words))
+    file = read_settings(known.config) if known.config else {}
+    preset = known.preset or file.get("preset")
+    recipe = known.recipe or default_recipe(preset or "nano")
+    settings = {**recipe_settings(recipe), **file}
+    rest = _without(_without(list(words), "--recipe"), "--config")
+    given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
+    others = {name: value for name, value in settings.items() if name not in given}
+    if preset:
+        others["preset"] = preset  # so that the defaults fit together even before it is parsed again
+    config = tyro.cli(
+        TrainingConfig,
+        prog="openvima train",
+        description=DESCRIPTION,
+        args=rest,
+        default=TrainingConfig(**given, **others),
     )
     with progress_bar("training") as report:
-        run = train(config, report)
-    print(f"`openvima evaluate --policy {run} --out results` scores it.", file=sys.stderr)
-    print(run)
+        folder = train(config, report, _rollout(config) if config.rollout_every else None)
+    print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
+    print(folder)
     return 0
+
+
+def _without(words: list[str], option: str) -> list[str]:
+    """Leave out an option and its value."""
+    kept, skip = [], False
+    for word in words:
+        if skip:
+            skip = False
+        elif word == option:
+            skip = True
+        elif not word.startswith(f"{option}="):
+            kept.append(word)
+    return kept
+
+
+def _rollout(config: "TrainingConfig") -> "Trial":
+    """What plays a checkpoint in the simulator, on the tasks of the data."""
+    from openvima.data.reader import read_manifest
+    from openvima.env import Setup
+    from openvima.evaluation.trial import TRIAL_LEVEL, Trial
+    from openvima.tasks.registry import task_spec
+
+    tasks = sorted(read_manifest(config.data)["tasks"])
+    playable = tuple(task for task in tasks if TRIAL_LEVEL in task_spec(task).levels)
+    return Trial(playable, config.rollout_episodes, Setup(config.assets))

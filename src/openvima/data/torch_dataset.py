@@ -196,7 +196,9 @@ class BatchLoader(Generic[Episode]):
         stream = BatchStream(
             self.source, self.order, first=self._num_done, stop=stop, transform=self.transform
         )
-        for batch in DataLoader(stream, batch_size=None, collate_fn=_unchanged, **self._options):
+        # Without a generator it would draw from the global one.
+        options = {"batch_size": None, "collate_fn": _unchanged, "generator": torch.Generator()}
+        for batch in DataLoader(stream, **options, **self._options):
             self._num_done += 1
             yield batch
 

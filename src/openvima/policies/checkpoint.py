@@ -81,14 +81,17 @@ def write_checkpoint(
     tokenizer: Tokenizer | None = None,
     *,
     dtype: torch.dtype = torch.float32,
+    weights: Mapping[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write the files of a checkpoint into a folder that is still being filled; see `save_checkpoint`."""
+    """Write the files of a checkpoint into a folder that is still being filled; see `save_checkpoint`.
+
+    `weights` replaces those of the network where it holds but a part of them.
+    """
     precision = described(dtype)
     if precision not in _PRECISIONS:
         raise CheckpointError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
-    tensors = {
-        name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in network.state_dict().items()
-    }
+    weights = network.state_dict() if weights is None else weights
+    tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
     save_file(tensors, folder / WEIGHTS_FILE)
     values = {
         "policy": _KIND,

@@ -6,7 +6,11 @@ from pathlib import Path
 from openvima.training.config import TrainingConfig
 
 
-def train(config: TrainingConfig, report: Callable[[int, int, str], None] | None = None) -> Path:
+def train(
+    config: TrainingConfig,
+    report: Callable[[int, int, str], None] | None = None,
+    rollout: Callable[[Path], dict[str, float]] | None = None,
+) -> Path:
     """Train a policy on demonstrations, or go on with a run; see `openvima.training.loop.train`.
 
     Raises:
@@ -17,7 +21,7 @@ def train(config: TrainingConfig, report: Callable[[int, int, str], None] | None
     require_torch("training")
     from openvima.training import loop
 
-    return loop.train(config, report)
+    return loop.train(config, report, rollout)
 
 
 __all__ = ["TrainingConfig", "train"]

@@ -3,9 +3,11 @@
 Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 import torch
 
 from openvima.policies.inputs import HistoryBatch
@@ -13,6 +15,7 @@ from openvima.render.camera import VIEWS
 from openvima.training.dataset import Batch
 
 NUM_VIEWS = len(VIEWS)
+MOST_SLOTS = 256  # numbers drawn for a step; more than there are ids
 _LAST = 1e6  # sorts after every slot
 
 
@@ -21,7 +24,7 @@ def augmented(
     layout: Literal["objects", "views", "frames"],
     *,
     probability: float,
-    generator: torch.Generator,
+    rngs: Sequence[np.random.Generator],
 ) -> Batch:
     """Add false detections, and shuffle objects where their order means nothing.
 
@@ -31,18 +34,34 @@ def augmented(
             them. With a token for each view they keep their order, as in the published policies, and a false
             detection comes anywhere among them. Whole frames stay as they are.
         probability: Chance that a view of a step shows an object that is none.
-        generator: Draws both.
+        rngs: One for each demonstration. What it draws does not depend on the others of the batch, nor on
+            how much they are padded.
 
     Returns:
         The batch with two more slots for objects; targets follow their objects.
     """
     if layout == "frames":
         return batch
-    shows_BTV = torch.rand(*batch.history.steps_BT.shape, NUM_VIEWS, generator=generator) < probability
+    drawn = _drawn(batch.history, rngs)
+    shows_BTV = drawn[..., :NUM_VIEWS] < probability
     shows_BTV &= batch.history.steps_BT[..., None]
     if layout == "views":
-        return _with_spurious_in_views(batch, shows_BTV, generator)
-    return _shuffled(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), generator)
+        return _with_spurious_in_views(batch, shows_BTV, drawn[..., NUM_VIEWS : 2 * NUM_VIEWS])
+    history = batch.history
+    is_slot = torch.arange(history.positions_BTN2.shape[2]) < history.counts_BT[..., None]
+    keys_BTN = torch.cat(  # padding of the batch stays at the end
+        [torch.where(is_slot, drawn[..., 2 * NUM_VIEWS :], _LAST), drawn[..., NUM_VIEWS : 2 * NUM_VIEWS]], -1
+    )
+    return _shuffled(replace(batch, history=_with_spurious_objects(batch, shows_BTV)), keys_BTN)
+
+
+def _drawn(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
+    """Numbers from 0 to 1 for all views and slots of each step, shape (B, T, 2 V + N), float32."""
+    num_steps, num_slots = history.steps_BT.shape[1], history.positions_BTN2.shape[2]
+    drawn = np.zeros((len(rngs), num_steps, 2 * NUM_VIEWS + num_slots), np.float32)
+    for b, (rng, count) in enumerate(zip(rngs, history.steps_BT.sum(dim=1).tolist(), strict=True)):
+        drawn[b, :count] = rng.random((count, MOST_SLOTS), np.float32)[:, : drawn.shape[2]]
+    return torch.from_numpy(drawn)
 
 
 def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:
@@ -64,7 +83,7 @@ def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatc
     )
 
 
-def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, generator: torch.Generator) -> Batch:
+def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: torch.Tensor) -> Batch:
     """Put false detections anywhere among the visible slots of their view.
 
     The numbers of slots become what `EpisodeReader` would make of such detections: each is an object that one
@@ -72,7 +91,7 @@ def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, generator: to
     """
     history = _with_spurious_objects(batch, shows_BTV)
     num_visible_BTV = batch.history.masks_BTVN.sum(dim=3)
-    place_BTV = (torch.rand(shows_BTV.shape, generator=generator) * (num_visible_BTV + 1)).floor() - 0.5
+    place_BTV = (drawn_BTV * (num_visible_BTV + 1)).floor() - 0.5
     num_slots = history.masks_BTVN.shape[3]
     rank_BTVN = torch.arange(num_slots).expand(history.masks_BTVN.shape).to(torch.float32)
     rank_BTVN = torch.where(history.masks_BTVN, rank_BTVN, rank_BTVN + _LAST)
@@ -85,10 +104,10 @@ def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, generator: to
     return replace(batch, history=replace(views, counts_BT=counts_BT))
 
 
-def _shuffled(batch: Batch, generator: torch.Generator) -> Batch:
-    """Shuffle the objects of every step."""
+def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
+    """Put the objects of every step into the order of numbers drawn for them."""
     history = batch.history
-    order_BTN = torch.rand(history.positions_BTN2.shape[:3], generator=generator).argsort(dim=-1)
+    order_BTN = keys_BTN.argsort(dim=-1, stable=True)
     place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
     order_BTN2 = order_BTN[..., None].expand_as(history.positions_BTN2)
     views = _in_order(history, order_BTN[:, :, None].expand_as(history.crops_BTVN))

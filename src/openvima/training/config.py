@@ -2,18 +2,25 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
 
 MATCHING_STEPS = 400  # of presets with an appearance embedding
+PRECISIONS = ("float32", "bfloat16")
+SHARDINGS = ("ddp", "fsdp")
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {
     "steps": (1, None),
+    "epochs": (0.001, None),
     "batch": (1, None),
+    "accumulate": (1, None),
     "learning_rate": (0, 1),
+    "final_learning_rate": (0, 1),
     "warmup_steps": (0, None),
+    "decay_steps": (1, None),
     "weight_decay": (0, None),
     "clip_norm": (0, None),
     "spurious_probability": (0, 1),
@@ -22,9 +29,15 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "pretraining_batch": (2, None),
     "pretraining_learning_rate": (0, 1),
     "temperature": (1e-3, None),
+    "bucket": (0, None),
     "seed": (0, 2**63 - 1),
     "validation_share": (0, 0.9),
+    "validation_episodes": (1, None),
     "checkpoint_every": (1, None),
+    "keep_every": (1, None),
+    "rollout_every": (1, None),
+    "rollout_episodes": (1, None),
+    "loader_workers": (0, 1024),
     "threads": (1, 1024),
 }
 
@@ -36,12 +49,17 @@ class TrainingConfig:
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder: checkpoints, settings, metrics.
-        tokens: Folder of the token cache; None keeps it beside the demonstrations.
-        preset: Network and sizes, such as "nano" or "gato-nano"; `openvima policies` lists them.
+        preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
+            "module:function" for a `Learner` of your own.
         steps: Steps of behaviour cloning.
-        batch: Demonstrations a step.
+        epochs: Passes over the demonstrations, instead of `steps`.
+        batch: Demonstrations a step, of all processes together; at most as many as there are.
+        accumulate: Parts in which each process takes its share of a batch, one after the other, to save
+            memory.
         learning_rate: Highest learning rate of cloning.
-        warmup_steps: Steps over which the learning rate rises from 0; afterwards it falls along a cosine.
+        final_learning_rate: Where the learning rate ends.
+        warmup_steps: Steps over which the learning rate rises from 0, at most a third of the run.
+        decay_steps: Steps over which it then falls along a cosine; None is to the end of the run.
         weight_decay: Decay of weight matrices, as in AdamW.
         clip_norm: Largest norm of the gradient.
         spurious_probability: How often each view of each step shows an object that is none.
@@ -53,14 +71,27 @@ class TrainingConfig:
         pretraining_learning_rate: Highest learning rate of that.
         temperature: Divisor of similarities in the matching loss.
         tune_crops: Go on training the crop encoder while cloning. Slower: each step encodes its crops anew.
+        bucket: Batches among which demonstrations are sorted by length, to pad less; 0 draws each batch
+            from all.
         t5: Where presets that read prompts with T5 take its weights and tokenizer from: a folder, or an id on
             the Hugging Face Hub such as "t5-base".
         assets: Asset pack to draw the pairs with: "procedural", or the folder of the original one.
         seed: Decides weights, order and augmentation.
         validation_share: Share of the demonstrations that only serve to choose the best checkpoint.
-        checkpoint_every: Steps between checkpoints.
+        validation_episodes: At most so many of them.
+        checkpoint_every: Steps between checkpoints, each with a validation.
+        keep_every: Steps between checkpoints that are kept; None keeps the latest and the best only.
+        rollout_every: Steps between trials in the simulator; None leaves them out.
+        rollout_episodes: Episodes of each task of a trial.
+        device: "auto" takes a GPU where there is one; or "cpu", "cuda".
+        precision: "float32", or "bfloat16" for products of matrices, with weights in float32.
+        compile: Compile the network with torch.compile: slow to start, then faster on a GPU.
+        sharding: With several processes "ddp" keeps the network whole in each, "fsdp" divides it.
+        loader_workers: Processes that read batches ahead.
         threads: Threads to compute with; equal numbers give equal weights. The nano network gains a fifth
             from a second one, and loses much when other programs need that core.
+        tensorboard: Write events for TensorBoard too, if it is installed.
+        tokens: Folder of the token cache; None keeps it beside the demonstrations.
         force: Throw away what is in the run folder if it belongs to other settings.
     """
 
@@ -68,9 +99,13 @@ class TrainingConfig:
     out: Path
     preset: str = "nano"
     steps: int = 400
+    epochs: float | None = None
     batch: int = 64
+    accumulate: int = 1
     learning_rate: float = 1e-3
+    final_learning_rate: float = 0.0
     warmup_steps: int = 50
+    decay_steps: int | None = None
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
@@ -80,25 +115,37 @@ class TrainingConfig:
     pretraining_learning_rate: float = 1e-3
     temperature: float = 0.07
     tune_crops: bool = False
+    bucket: int = 0
     t5: str | None = None
     assets: str = "procedural"
     seed: int = 0
     validation_share: float = 0.05
+    validation_episodes: int = 4096
     checkpoint_every: int = 100
+    keep_every: int | None = None
+    rollout_every: int | None = None
+    rollout_episodes: int = 10
+    device: str = "auto"
+    precision: Literal["float32", "bfloat16"] = "float32"
+    compile: bool = False
+    sharding: Literal["ddp", "fsdp"] = "ddp"
+    loader_workers: int = 0
     threads: int = 1
+    tensorboard: bool = True
     tokens: Path | None = None
     force: bool = False
 
     def __post_init__(self) -> None:
         problems = []
-        if self.preset not in PRESETS:
+        if self.preset not in PRESETS and ":" not in self.preset:
             hint = "`openvima policies` lists all."
             problems.append(unknown_name("preset", self.preset, PRESETS, hint))
+        for name, allowed in (("precision", PRECISIONS), ("sharding", SHARDINGS)):
+            if getattr(self, name) not in allowed:
+                problems.append(unknown_name(name, getattr(self, name), allowed))
         for name, (low, high) in _BOUNDS.items():
-            if name == "pretraining_steps" and self.pretraining_steps is None:
-                continue
             value = getattr(self, name)
-            if not (low <= value and (high is None or value <= high)):
+            if value is not None and not (low <= value and (high is None or value <= high)):
                 allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"
                 problems.append(f"{name} is {value:g}; it must be {allowed}.")
         if problems:

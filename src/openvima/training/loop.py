@@ -1,6 +1,7 @@
 """The training loop: stages one after the other, checkpoints, and going on where a run stopped."""
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,41 +10,70 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
-from openvima.data.tokens.cache import open_tokens
+from openvima.data.tokens.cache import TokenCache, open_tokens
 from openvima.errors import ConfigError
-from openvima.policies.config import PolicyConfig
 from openvima.policies.inputs import Reader
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.network import PolicyNetwork, build_network
+from openvima.policies.network import build_network
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
+from openvima.training.board import Board
 from openvima.training.config import MATCHING_STEPS, TrainingConfig
-from openvima.training.dataset import read_examples, token_kind
+from openvima.training.learner import Learner, PolicyLearner, make_learner
+from openvima.training.parallel import Parallel, joined, set_whole_state, whole_state
 from openvima.training.pretrain import render_pairs
-from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, RunFolder
-from openvima.training.schedule import learning_rate_share, step_seed
-from openvima.training.stages import Cloning, Matching, Metrics, Stage
+from openvima.training.provenance import provenance
+from openvima.training.run_folder import (
+    METRICS_FILE,
+    SESSIONS_FILE,
+    TIMINGS_FILE,
+    RunFolder,
+    TrainedState,
+)
+from openvima.training.schedule import learning_rate_at, step_seed
+from openvima.training.source import check_words, split_examples
+from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops
 
 Report = Callable[[int, int, str], None]
+# A trial in the simulator: checkpoint folder to metrics. It is handed in, since training needs no simulation.
+Rollout = Callable[[Path], Metrics]
 
 LOG_EVERY = 20  # steps
-# Where files are, with how many threads it runs and how often it saves does not make it another run.
-_NOT_SETTINGS = ("data", "out", "tokens", "t5", "threads", "force", "checkpoint_every")
+# Where files are, and how the work is done, does not make it another run.
+_NOT_SETTINGS = (
+    "data",
+    "out",
+    "tokens",
+    "t5",
+    "device",
+    "compile",
+    "sharding",
+    "loader_workers",
+    "threads",
+    "tensorboard",
+    "force",
+    "checkpoint_every",
+    "keep_every",
+    "rollout_every",
+    "rollout_episodes",
+)
 
 
-def train(config: TrainingConfig, report: Report | None = None) -> Path:
+def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout | None = None) -> Path:
     """Train a policy on demonstrations, or go on with a run that was interrupted.
 
-    With the same settings and number of threads an interrupted run ends with the very weights of one that was
-    not.
+    With the same settings and number of threads an interrupted run on a processor ends with the very weights
+    of one that was not. Started by `torchrun`, all its processes train together.
 
     Args:
         config: All settings.
         report: Called with steps done, steps in all, and a note.
+        rollout: Called with a checkpoint every `config.rollout_every` steps; returns what to log.
 
     Returns:
         The run folder; `load_policy` takes it.
@@ -53,24 +83,37 @@ def train(config: TrainingConfig, report: Report | None = None) -> Path:
         DatasetError: There are no demonstrations.
         CheckpointError: The last checkpoint is damaged, or T5 is not where the settings say, or of other
             sizes.
+        PromptError: A prompt has a word that the policy's vocabulary lacks.
         MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
-    sizes = preset(config.preset)
-    config = _resolved(config, sizes)
+    config = _resolved(config)
     load_assets(config.assets)  # what is wrong is found before there is a run folder
     dataset = Dataset(config.data)
-    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, config.t5))
-    with _threads(config.threads):
-        model = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
-        if config.t5:
-            load_t5(model, config.t5)
-        run = RunFolder(config.out, _settings(config, dataset), force=config.force)
-        _Trainer(config, dataset, model, reader, run, report or _ignore).train()
+    with _threads(config.threads), joined(config.device, config.sharding) as parallel:
+        learner = _learner(config)
+        run = RunFolder(
+            config.out,
+            _settings(config, dataset, learner),
+            force=config.force,
+            keep_every=config.keep_every,
+            is_first=parallel.is_first,
+        )
+        parallel.wait()
+        trainer = _Trainer(config, dataset, learner, run, parallel, report or _ignore, rollout)
+        try:
+            trainer.train()
+        finally:
+            trainer.board.close()
     return run.path
 
 
-def _resolved(config: TrainingConfig, sizes: PolicyConfig) -> TrainingConfig:
+def _resolved(config: TrainingConfig) -> TrainingConfig:
     """Fill in what the settings leave to the preset, and check that both fit together."""
+    if ":" in config.preset:
+        if config.pretraining_steps or config.t5:
+            raise ConfigError("a learner of your own knows neither pretraining_steps nor t5; leave them out.")
+        return replace(config, pretraining_steps=0)
+    sizes = preset(config.preset)
     reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
     if reads_with_t5 and config.t5 is None:
         raise ConfigError(
@@ -90,6 +133,20 @@ def _resolved(config: TrainingConfig, sizes: PolicyConfig) -> TrainingConfig:
     return config
 
 
+def _learner(config: TrainingConfig) -> Learner:
+    if ":" in config.preset:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(step_seed(config.seed, "weights", 0))
+            return make_learner(config.preset)
+    sizes = preset(config.preset)
+    tokenizer = tokenizer_for(sizes.prompt, config.t5)
+    network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+    if config.t5:
+        load_t5(network, config.t5)
+    reader = Reader.of(sizes.images, tokenizer)
+    return PolicyLearner(network, reader, spurious_probability=config.spurious_probability)
+
+
 class _Trainer:
     """One run in progress."""
 
@@ -97,19 +154,30 @@ class _Trainer:
         self,
         config: TrainingConfig,
         dataset: Dataset,
-        model: PolicyNetwork,
-        reader: Reader,
+        learner: Learner,
         run: RunFolder,
+        parallel: Parallel,
         report: Report,
+        rollout: Rollout | None,
     ) -> None:
-        self.config, self.dataset, self.model, self.reader = config, dataset, model, reader
-        self.run, self.report = run, report
+        self.config, self.dataset, self.learner, self.run = config, dataset, learner, run
+        self.parallel, self.report, self.rollout = parallel, report, rollout
+        self.board = Board(run.path, wanted=config.tensorboard and parallel.is_first)
         self.started = time.monotonic()
-        self.progress = run.resume(model)
-        self.stages = [(config.steps, self._cloning)]
+        self.progress = run.resume(learner)
+        learner.to(parallel.device)
+        self.module: nn.Module = learner
+        self.cloning_steps = config.steps
+        if config.epochs is not None:
+            self.cloning_steps = self._steps_of_epochs(config.epochs)
+        self.stages: list[tuple[int, Callable[[], Stage]]] = [(self.cloning_steps, self._cloning)]
         if config.pretraining_steps:
             self.stages.insert(0, (config.pretraining_steps, self._matching))
         self.num_steps = sum(steps for steps, _ in self.stages)
+        if parallel.is_first:
+            run.forget_after(self.progress)
+            here = {"stage": self.progress.stage, "step": self.progress.step}
+            run.append(SESSIONS_FILE, {**here, "processes": parallel.num_ranks, **provenance(dataset)})
 
     def train(self) -> None:
         """Run what is left of the stages."""
@@ -124,38 +192,58 @@ class _Trainer:
             self._run_stage(make(), num_steps)
 
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
-        optimizer = _optimizer(self.model, stage, self.config)
+        optimizer = _optimizer(self.learner, stage, self.config)
         if self.progress.step:
-            self.run.resume_optimizer(optimizer)
+            self._load_optimizer(optimizer)
         window: list[Metrics] = []
         for step in range(self.progress.step, num_steps):
             window.append(self._step(stage, optimizer, step, num_steps))
             self.progress = replace(self.progress, step=step + 1)
             saves = (step + 1) % self.config.checkpoint_every == 0 or step + 1 == num_steps
             if saves or (step + 1) % LOG_EVERY == 0:
-                self._log(stage, _mean(window))
+                self._log(stage, self.parallel.mean(_mean(window)))
                 window = []
             if saves:
                 self._save(stage, optimizer)
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
-        share = learning_rate_share(step, steps=num_steps, warmup_steps=self.config.warmup_steps)
+        config = self.config
+        rate = learning_rate_at(
+            step,
+            highest=stage.learning_rate,
+            steps=num_steps,
+            warmup_steps=config.warmup_steps,
+            decay_steps=config.decay_steps,
+            final=config.final_learning_rate,
+        )
         for group in optimizer.param_groups:
-            group["lr"] = stage.learning_rate * share
+            group["lr"] = rate
         optimizer.zero_grad(set_to_none=True)
-        self.model.train()
-        with torch.random.fork_rng(devices=[]):  # dropout draws from torch's global generator
-            torch.manual_seed(step_seed(self.config.seed, f"dropout of {stage.name}", step))
+        self.module.train()
+        device, rank = self.parallel.device, self.parallel.rank
+        purpose = f"dropout of {stage.name}" + (f" in process {rank}" if rank else "")
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            torch.manual_seed(
+                step_seed(config.seed, purpose, step)
+            )  # dropout draws from the global generator
             metrics = stage.backward(step)
-        torch.nn.utils.clip_grad_norm_(stage.parameters, self.config.clip_norm)
+        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))
+        if not math.isfinite(norm):
+            raise ConfigError(
+                f"the gradient is {norm} at step {step} of {stage.name}, with learning_rate {rate:g} and "
+                f"precision {config.precision}; lower learning_rate, or take float32. The last checkpoint "
+                "is from before."
+            )
         optimizer.step()
-        return metrics
+        return {**metrics, "gradient_norm": norm}
 
     def _log(self, stage: Stage, metrics: Metrics) -> None:
         here = {"stage": self.progress.stage, "step": self.progress.step}
-        self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
-        seconds = round(time.monotonic() - self.started, 2)
-        self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
+        if self.parallel.is_first:
+            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
+            seconds = round(time.monotonic() - self.started, 2)
+            self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
+            self.board.add(stage.name, metrics, self.progress.step)
         note = "  ".join(f"{name} {value:.3f}" for name, value in list(metrics.items())[:3])
         self._report(f"{stage.name}: {note}")
 
@@ -165,59 +253,116 @@ class _Trainer:
         With few held-out demonstrations scores are noisy, and later checkpoints have learnt at smaller rates:
         a later one counts as the best unless it is worse by more than the score's standard error.
         """
-        self.model.eval()
+        self.module.eval()
         metrics = stage.validate()
-        if metrics:
-            here = {"stage": self.progress.stage, "step": self.progress.step}
-            names = {f"validation_{name}": value for name, value in metrics.items()}
-            self.run.append(METRICS_FILE, {**here, "name": stage.name, **names})
+        self._note(stage, {f"validation_{name}": value for name, value in metrics.items()})
         name = f"{stage.name}-{self.progress.step:06d}"
         is_last_stage = self.progress.stage == len(self.stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
         best = self.progress.best_score
         if is_last_stage and (best is None or score >= best - error):
             self.progress = replace(self.progress, best_score=max(score, best or 0.0), best_checkpoint=name)
-        self.run.save(name, self.model, optimizer, self.progress, self.reader.tokenizer)
+        state = self._state(optimizer)
+        if self.parallel.is_first:
+            self.run.save(name, self.learner, state, self.progress)
+            every = self.config.rollout_every
+            if self.rollout and every and is_last_stage and self.progress.step % every == 0:
+                scores = self.rollout(self.run.checkpoints / name)
+                self._note(stage, {f"rollout_{key}": value for key, value in scores.items()})
+        self.parallel.wait()
+
+    def _note(self, stage: Stage, metrics: Metrics) -> None:
+        if metrics and self.parallel.is_first:
+            here = {"stage": self.progress.stage, "step": self.progress.step}
+            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
+            self.board.add(stage.name, metrics, self.progress.step)
+
+    def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
+        if self.parallel.is_sharded:
+            return TrainedState(*whole_state(self.learner, optimizer))
+        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
+        optimizer_state = {names[id(parameter)]: values for parameter, values in optimizer.state.items()}
+        return TrainedState(self.learner.state_dict(), optimizer_state)
+
+    def _load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
+        state = self.run.optimizer_state()
+        if self.parallel.is_sharded:
+            set_whole_state(self.learner, optimizer, state)
+            return
+        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
+        ordered = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
+        values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
+
+    def _tokens(self) -> TokenCache:
+        """Open the token cache; the first process makes it if need be."""
+        kind, folder = self.learner.token_kind, self.config.tokens
+        if self.parallel.is_first:
+            open_tokens(self.dataset, kind, folder=folder, report=self._say)
+        self.parallel.wait()
+        return TokenCache(self.dataset, kind, folder)
+
+    def _steps_of_epochs(self, epochs: float) -> int:
+        """Steps of so many passes over what is left to learn from when some is kept for validation."""
+        training, _ = self._split(self._tokens())
+        return max(1, round(epochs * len(training) / min(self.config.batch, len(training))))
+
+    def _split(self, tokens: TokenCache):  # two `ExampleSource`
+        config = self.config
+        return split_examples(
+            tokens,
+            validation_share=config.validation_share,
+            validation_episodes=config.validation_episodes,
+        )
 
     def _matching(self) -> Stage:
+        assert isinstance(self.learner, PolicyLearner)  # `_resolved` has seen to it
         tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
-        num_scenes, assets = self.config.pretraining_scenes, self.config.assets
         pairs = render_pairs(
-            tasks, num_scenes=num_scenes, seed=self.config.seed, assets=assets, report=self._say
+            tasks,
+            num_scenes=self.config.pretraining_scenes,
+            seed=self.config.seed,
+            assets=self.config.assets,
+            report=self._say,
         )
-        return Matching(self.model, self.config, pairs)
+        return Matching(self.learner.network, self.config, pairs.to(self.parallel.device))
 
     def _cloning(self) -> Stage:
         self._report(f"reading {len(self.dataset)} demonstrations")
-        tokens = open_tokens(
-            self.dataset, token_kind(self.reader), folder=self.config.tokens, report=self._say
-        )
-        examples = read_examples(tokens, self.reader, validation_share=self.config.validation_share)
-        return Cloning(self.model, self.config, examples, self.reader)
+        tokens, config = self._tokens(), self.config
+        if isinstance(self.learner, PolicyLearner):
+            check_words(tokens, self.learner.reader)
+            if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
+                freeze_crops(self.learner, tokens)
+        self.module = self.parallel.wrap(self.learner)
+        if config.compile:
+            self.module.compile(dynamic=True)
+        return Cloning(self.learner, self.module, config, *self._split(tokens), self.parallel)
 
     def _say(self, done: int, total: int, note: str) -> None:
         self._report(f"{note or 'cutting out objects'}, {done} of {total}")
 
     def _report(self, note: str) -> None:
-        before = sum(steps for steps, _ in self.stages[: self.progress.stage])
-        self.report(before + self.progress.step, self.num_steps, note)
+        if self.parallel.is_first:
+            before = sum(steps for steps, _ in self.stages[: self.progress.stage])
+            self.report(before + self.progress.step, self.num_steps, note)
 
 
-def _optimizer(model: PolicyNetwork, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
+def _optimizer(learner: Learner, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
     """AdamW; vectors (biases, norms) and tables do not decay."""
-    tables = {id(m.weight) for m in model.modules() if isinstance(m, torch.nn.Embedding)}
+    tables = {id(m.weight) for m in learner.modules() if isinstance(m, nn.Embedding)}
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]
     groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True)
 
 
-def _settings(config: TrainingConfig, dataset: Dataset) -> dict[str, Any]:  # Any: plain YAML values
+def _settings(config: TrainingConfig, dataset: Dataset, learner: Learner) -> dict[str, Any]:  # Any: YAML
     """Everything that decides the weights: settings, network sizes, and which demonstrations there are."""
     index = hashlib.blake2b((config.data / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
     values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
     demonstrations = {"episodes": len(dataset), "index": index}
-    return {"training": values, "demonstrations": demonstrations, "policy": preset(config.preset).to_dict()}
+    return {"training": values, "demonstrations": demonstrations, "policy": learner.description()}
 
 
 @contextmanager

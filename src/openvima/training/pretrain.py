@@ -44,6 +44,10 @@ class Pairs:
     looks: torch.Tensor
     scenes: torch.Tensor
 
+    def to(self, device: torch.device) -> "Pairs":
+        """Return the pairs on another device."""
+        return Pairs(*(getattr(self, name).to(device) for name in self.__slots__))
+
     def select(self, rows: torch.Tensor) -> "Pairs":
         """Return some of the pairs."""
         return Pairs(
@@ -102,15 +106,15 @@ def matching_loss(
 
     Source: InfoNCE (van den Oord et al. 2018), symmetric as in CLIP.
     """
-    mixing = colour_mixing(generator)
+    mixing = colour_mixing(generator).to(pairs.prompt_crops.device)
     prompt = embed_looks(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
     scene = embed_looks(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
     scores = prompt @ scene.T / temperature
     count = len(scores)
-    diagonal = torch.eye(count, dtype=torch.bool)
+    diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
     same_look = (pairs.looks[:, None] == pairs.looks[None, :]) & ~diagonal
     scores = scores.masked_fill(same_look, torch.finfo(scores.dtype).min)
-    target = torch.arange(count)
+    target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
     with torch.no_grad():
         accuracy = (scores.argmax(1) == target).to(scores.dtype).mean()
@@ -120,7 +124,7 @@ def matching_loss(
 @torch.no_grad()
 def scene_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) -> float:
     """Share of prompt images whose object is the most similar one of its scene; what a policy needs."""
-    rows = [torch.arange(len(pairs.looks))[i : i + chunk] for i in range(0, len(pairs.looks), chunk)]
+    rows = torch.arange(len(pairs.looks), device=pairs.looks.device).split(chunk)
     parts = [pairs.select(row) for row in rows]
     prompt = torch.cat([embed_looks(encoder, p.prompt_crops, p.prompt_masks) for p in parts])
     scene = torch.cat([embed_looks(encoder, p.scene_crops, p.scene_masks) for p in parts])

@@ -3,6 +3,8 @@
     RUN/config.yaml                                   settings, resolved
     RUN/metrics.jsonl                                 one line of metrics every few steps
     RUN/timings_log.jsonl                             when they were reached; differs between machines
+    RUN/sessions_log.jsonl                            versions, git commit and data of each start
+    RUN/tensorboard_log/                              the metrics for TensorBoard, if it is installed
     RUN/checkpoints/2-cloning-000400/model.safetensors, config.yaml, optimizer.safetensors, state.json
     RUN/checkpoints/best.txt                          name of the best checkpoint
 
@@ -11,25 +13,25 @@ Every file and checkpoint is written under a temporary name and renamed when it 
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from openvima.errors import CheckpointError, ConfigError
 from openvima.files import write_whole
-from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE
-from openvima.policies.checkpoint import load_weights, write_checkpoint
-from openvima.policies.network import PolicyNetwork
-from openvima.policies.tokenizer import Tokenizer
+from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
+from openvima.training.board import BOARD_FOLDER
+from openvima.training.learner import Learner, read_tensors
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 TIMINGS_FILE = "timings_log.jsonl"
+SESSIONS_FILE = "sessions_log.jsonl"
 OPTIMIZER_FILE = "optimizer.safetensors"
 STATE_FILE = "state.json"
 _PARTIAL = ".partial"
@@ -52,6 +54,19 @@ class Progress:
     best_checkpoint: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class TrainedState:
+    """What a checkpoint holds.
+
+    Args:
+        weights: Name to tensor.
+        optimizer: Name of a parameter to the optimizer's state of it.
+    """
+
+    weights: Mapping[str, torch.Tensor]
+    optimizer: Mapping[str, Mapping[str, torch.Tensor]]
+
+
 class RunFolder:
     """Reads and writes one run.
 
@@ -59,14 +74,26 @@ class RunFolder:
         path: The folder; it is made if it does not exist.
         settings: Plain values that decide the run.
         force: Throw away what is there if it belongs to other settings.
+        keep_every: Steps between checkpoints that are never deleted; None keeps the latest and the best only.
+        is_first: Whether this process looks after the folder; others only read.
 
     Raises:
         ConfigError: The folder belongs to a run with other settings.
     """
 
-    def __init__(self, path: Path, settings: dict[str, Any], *, force: bool = False) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        settings: dict[str, Any],
+        *,
+        force: bool = False,
+        keep_every: int | None = None,
+        is_first: bool = True,
+    ) -> None:
+        self.path, self._keep_every = path, keep_every
         self.checkpoints = path / CHECKPOINTS_FOLDER
+        if not is_first:
+            return
         differing = self._differences(settings)
         if differing and not force:
             raise ConfigError(
@@ -88,38 +115,42 @@ class RunFolder:
     def save(
         self,
         name: str,
-        model: PolicyNetwork,
-        optimizer: torch.optim.Optimizer,
+        learner: Learner,
+        state: TrainedState,
         progress: Progress,
-        tokenizer: Tokenizer | None = None,
     ) -> None:
-        """Write a checkpoint and delete those that are neither the latest nor the best.
+        """Write a checkpoint and delete those that are neither the latest, nor the best, nor to be kept.
 
         Args:
             name: Name of the checkpoint's folder; later ones sort behind earlier ones.
-            model: The network.
-            optimizer: Its optimizer.
+            learner: Writes its weights.
+            state: Weights and the state of the optimizer.
             progress: How far the run has come.
-            tokenizer: Stored beside the weights if the network reads prompts with that of T5.
         """
         partial = self.checkpoints / f"{name}{_PARTIAL}"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        write_checkpoint(model, partial, tokenizer)
-        save_file(_optimizer_tensors(optimizer), partial / OPTIMIZER_FILE)
-        state = {field: getattr(progress, field) for field in Progress.__slots__}
-        (partial / STATE_FILE).write_text(json.dumps(state), encoding="utf-8")
+        learner.write(partial, state.weights)
+        tensors = {
+            f"{parameter}|{name}": tensor.detach().cpu().contiguous()
+            for parameter, values in state.optimizer.items()
+            for name, tensor in values.items()
+        }
+        save_file(tensors, partial / OPTIMIZER_FILE)
+        progressed = {field: getattr(progress, field) for field in Progress.__slots__}
+        (partial / STATE_FILE).write_text(json.dumps(progressed), encoding="utf-8")
         final = self.checkpoints / name
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
         if progress.best_checkpoint:
             write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
         for other in self.checkpoints.iterdir():
-            if other.is_dir() and other.name not in (name, progress.best_checkpoint):
+            is_used = other.name in (name, progress.best_checkpoint) or self._is_kept(other.name)
+            if other.is_dir() and not is_used:
                 shutil.rmtree(other)
 
-    def resume(self, model: PolicyNetwork) -> Progress:
-        """Load the weights of the last checkpoint, if there is one, and forget what was logged after it.
+    def resume(self, learner: Learner) -> Progress:
+        """Load the weights of the last checkpoint, if there is one.
 
         Returns:
             How far the run had come.
@@ -130,13 +161,11 @@ class RunFolder:
         checkpoint = self.latest()
         progress = _read_progress(checkpoint) if checkpoint else Progress()
         if checkpoint:
-            file = checkpoint / WEIGHTS_FILE
-            load_weights(model, _read_tensors(file), source=str(file))
-        self._forget_after(progress)
+            learner.read(checkpoint)
         return progress
 
-    def resume_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
-        """Load the optimizer's state from the last checkpoint.
+    def optimizer_state(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Read the optimizer's state of the last checkpoint: name of the parameter to its state.
 
         Raises:
             CheckpointError: There is none, or it is damaged.
@@ -144,18 +173,18 @@ class RunFolder:
         checkpoint = self.latest()
         if checkpoint is None:
             raise CheckpointError(f"{self.checkpoints} holds no checkpoint to go on from.")
-        values: dict[int, dict[str, torch.Tensor]] = {}
-        for key, tensor in _read_tensors(checkpoint / OPTIMIZER_FILE).items():
-            index, _, name = key.partition(".")
-            values.setdefault(int(index), {})[name] = tensor
-        optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
+        state: dict[str, dict[str, torch.Tensor]] = {}
+        for key, tensor in read_tensors(checkpoint / OPTIMIZER_FILE).items():
+            parameter, _, name = key.partition("|")
+            state.setdefault(parameter, {})[name] = tensor
+        return state
 
     def append(self, file: str, values: dict[str, Any]) -> None:
         """Add one line to `METRICS_FILE` or `TIMINGS_FILE`."""
         with (self.path / file).open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(values) + "\n")
 
-    def _forget_after(self, progress: Progress) -> None:
+    def forget_after(self, progress: Progress) -> None:
         """Drop the metrics of steps that come after a checkpoint, since they are going to be repeated."""
         file = self.path / METRICS_FILE
         if not file.is_file():
@@ -188,8 +217,13 @@ class RunFolder:
         if not (self.path / CONFIG_FILE).is_file():
             raise ConfigError(f"{self.path} holds other files and no training run; give another --out.")
         shutil.rmtree(self.checkpoints, ignore_errors=True)
-        for name in (METRICS_FILE, TIMINGS_FILE, CONFIG_FILE):
+        shutil.rmtree(self.path / BOARD_FOLDER, ignore_errors=True)
+        for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
             (self.path / name).unlink(missing_ok=True)
+
+    def _is_kept(self, name: str) -> bool:
+        step = name.rpartition("-")[2]
+        return self._keep_every is not None and step.isdigit() and int(step) % self._keep_every == 0
 
 
 def _read_progress(checkpoint: Path) -> Progress:
@@ -198,23 +232,6 @@ def _read_progress(checkpoint: Path) -> Progress:
         return Progress(**json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
-
-
-def _read_tensors(file: Path) -> dict[str, torch.Tensor]:
-    try:
-        return load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{file} cannot be read ({error}); delete {file.parent} and repeat the command."
-        ) from error
-
-
-def _optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
-    return {
-        f"{index}.{name}": tensor.contiguous()
-        for index, values in optimizer.state_dict()["state"].items()
-        for name, tensor in values.items()
-    }
 
 
 def _flattened(values: Any, prefix: str = "") -> dict[str, Any]:

@@ -6,24 +6,34 @@ import math
 import torch
 
 
-def learning_rate_share(step: int, *, steps: int, warmup_steps: int) -> float:
-    """Share of the highest learning rate at one step.
+def learning_rate_at(
+    step: int,
+    *,
+    highest: float,
+    steps: int,
+    warmup_steps: int,
+    decay_steps: int | None = None,
+    final: float = 0.0,
+) -> float:
+    """Learning rate of one step.
 
-    It rises linearly over the warm-up and falls along half a cosine to 0 at the end of the run.
+    It rises linearly over the warm-up, falls along half a cosine, and then stays where it is.
 
     Args:
         step: Steps done, from 0.
+        highest: Learning rate after the warm-up.
         steps: Steps of the whole run.
         warmup_steps: Steps of the rise; at most a third of the run counts.
-
-    Returns:
-        Between 0 and 1.
+        decay_steps: Steps of the fall; None, or more than are left, is to the end of the run.
+        final: Where the fall ends; at most `highest`.
     """
     warmup_steps = min(warmup_steps, steps // 3)
     if step < warmup_steps:
-        return (step + 1) / (warmup_steps + 1)
-    progress = (step - warmup_steps) / max(1, steps - warmup_steps)
-    return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+        return highest * (step + 1) / (warmup_steps + 1)
+    left = max(1, steps - warmup_steps)
+    progress = min(1.0, (step - warmup_steps) / min(left, decay_steps or left))
+    final = min(final, highest)
+    return final + (highest - final) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
 def step_seed(seed: int, purpose: str, step: int) -> int:

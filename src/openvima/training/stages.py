@@ -1,28 +1,28 @@
 """The two stages of a run: matching prompt and scene crops, then behaviour cloning."""
 
 import math
-from dataclasses import replace
-from typing import Protocol
+from collections.abc import Iterator
+from typing import Any, Protocol
 
+import numpy as np
 import torch
+from torch import nn
+from torch.utils.data import DataLoader
 
-from openvima.policies.heads.base import HeadInputs
-from openvima.policies.inputs import Reader
+from openvima.data.tokens.cache import TokenCache
+from openvima.data.torch_dataset import BatchStream
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
-from openvima.training.augment import augmented
-from openvima.training.collate import Collator
 from openvima.training.config import TrainingConfig
-from openvima.training.dataset import (
-    Batch,
-    Examples,
-    groups_of_equal_length,
-    rows_of_step,
-)
+from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.parallel import Parallel
 from openvima.training.pretrain import Pairs, matching_loss, scene_accuracy
 from openvima.training.schedule import step_generator
+from openvima.training.source import ExampleSource, Parts, by_length, order_of
 
 Metrics = dict[str, float]
+CHUNK = 64  # demonstrations whose images are encoded together
+MAX_FEATURES = 500_000  # images that are encoded once and kept, rather than in every step
 
 
 class Stage(Protocol):
@@ -48,7 +48,7 @@ class Stage(Protocol):
 
 
 class Matching:
-    """Trains the crop encoder and the appearance embedding on rendered pairs."""
+    """Trains the crop encoder and the appearance embedding on rendered pairs; each process the same."""
 
     name = "1-matching"
 
@@ -56,7 +56,7 @@ class Matching:
         self.learning_rate = config.pretraining_learning_rate
         assert isinstance(model.images, ObjectEncoder)  # the loop has seen to it
         self.encoder = model.images
-        self.parameters = _crop_parameters(model)
+        self.parameters = crop_parameters(model)
         held_out = pairs.scenes >= int(pairs.scenes.max()) * 0.95
         self._training = pairs.select(torch.nonzero(~held_out)[:, 0])
         self._validation = pairs.select(torch.nonzero(held_out)[:, 0])
@@ -68,6 +68,7 @@ class Matching:
         generator = step_generator(config.seed, self.name, step)
         count = len(self._training.looks)
         rows = torch.randperm(count, generator=generator)[: config.pretraining_batch]
+        rows = rows.to(self._training.looks.device)
         loss, metrics = matching_loss(
             self.encoder, self._training.select(rows), temperature=config.temperature, generator=generator
         )
@@ -81,100 +82,138 @@ class Matching:
 
 
 class Cloning:
-    """Behaviour cloning: the loss of the action head over whole demonstrations.
+    """Behaviour cloning: the loss of a learner over whole demonstrations, read from the token cache.
 
-    After a matching stage the crop encoder stays as it is and each crop is encoded once, unless crops are to
-    be tuned. Without such a stage the image encoder is trained here; each step encodes its images, each once.
+    Args:
+        learner: What is trained.
+        module: What to call for its loss: the learner, perhaps wrapped for several processes.
+        config: All settings.
+        training: Demonstrations to learn from.
+        validation: Demonstrations that choose the best checkpoint.
+        parallel: The processes of the run.
     """
 
     name = "2-cloning"
 
     def __init__(
-        self, model: PolicyNetwork, config: TrainingConfig, examples: Examples, reader: Reader
+        self,
+        learner: Learner,
+        module: nn.Module,
+        config: TrainingConfig,
+        training: ExampleSource,
+        validation: ExampleSource,
+        parallel: Parallel,
     ) -> None:
         self.learning_rate = config.learning_rate
-        self.model = model
-        self._collate = Collator(reader)
-        self._config = config
-        self._examples = examples
-        self._features: torch.Tensor | None = None
-        tunes = config.tune_crops or not config.pretraining_steps  # a fresh encoder must be trained here
-        frozen = set() if tunes else set(_crop_parameters(model))
-        self.parameters = [p for p in model.parameters() if p.requires_grad and p not in frozen]
-        if not tunes:
-            self._features = encode_in_chunks(model, examples.images)
+        self.parameters = [p for p in learner.parameters() if p.requires_grad]
+        self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
+        self._training, self._validation = training, validation
+        self._order = order_of(
+            training,
+            batch=config.batch,
+            seed=config.seed,
+            bucket=config.bucket,
+            rank=parallel.rank,
+            num_ranks=parallel.num_ranks,
+        )
+        self._batches: Iterator[list[tuple[Any, int]]] = iter(())
+        self._next_step = -1
 
     def backward(self, step: int) -> Metrics:
-        """Take the step's demonstrations, in groups of like length, and add their gradients."""
-        config = self._config
-        training = self._examples.training
-        rows = rows_of_step(len(training), batch=config.batch, step=step, seed=config.seed)
-        generator = step_generator(config.seed, "augmentation", step)
-        chosen = [training[row] for row in rows]
-        total = sum(example.tokens.num_steps for example in chosen)
+        """Take the step's demonstrations, in parts of like length, and add their gradients."""
+        if step != self._next_step:
+            self._batches = self._from(step)
+        self._next_step = step + 1
+        parts = next(self._batches)
+        total = self._training.num_steps(self._order.rows_of_all(step))
         sums: Metrics = {}
-        for group in groups_of_equal_length(chosen):
-            batch = augmented(
-                self._collate(group),
-                self._collate.reader.layout,
-                probability=config.spurious_probability,
-                generator=generator,
-            )
-            share = sum(example.tokens.num_steps for example in group) / total
-            loss, metrics = self._loss(batch)
-            (loss * share).backward()
-            for name, value in {"loss": loss, **metrics}.items():
-                sums[name] = sums.get(name, 0.0) + value.item() * share
+        for number, (batch, num_steps) in enumerate(parts):
+            # Processes average their gradients: each counts by its share of the steps of all.
+            share = num_steps * self._parallel.num_ranks / total
+            with self._parallel.shares(self._module, last=number == len(parts) - 1):
+                loss, metrics = self._call(batch)
+                (loss * share).backward()
+            _add(sums, {"loss": loss, **metrics}, share)
         return sums
 
     @torch.no_grad()
     def validate(self) -> Metrics:
-        """Loss and metrics on the held-out demonstrations; the score is the accuracy that the head names."""
-        examples = self._examples.validation
-        if not examples:
+        """Loss and metrics on the held-out demonstrations; the learner names which accuracy is the score."""
+        source, collate = self._validation, self._learner.collator()
+        if not len(source):
             return {}
-        total = sum(example.tokens.num_steps for example in examples)
+        total = source.num_steps(np.arange(len(source)))
+        size = max(1, self._order.batch // self._parallel.num_ranks // self._config.accumulate)
         sums: Metrics = {}
-        for group in groups_of_equal_length(examples):
-            for start in range(0, len(group), self._config.batch):
-                part = group[start : start + self._config.batch]
-                share = sum(example.tokens.num_steps for example in part) / total
-                loss, metrics = self._loss(self._collate(part))
-                for name, value in {"loss": loss, **metrics}.items():
-                    sums[name] = sums.get(name, 0.0) + value.item() * share
-        score = sums[self.model.head.score]
-        return {**sums, "score": score, "score_error": math.sqrt(score * (1 - score) / total)}
+        # Sorted by length, so that little is padded; processes take parts in turn.
+        rows = np.lexsort(source.lengths.T[::-1])
+        for number, start in enumerate(range(0, len(rows), size)):
+            examples = [source[int(row)] for row in rows[start : start + size]]
+            mine = number % self._parallel.num_ranks == self._parallel.rank
+            if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes at once
+                continue
+            for group in by_length(examples):
+                loss, metrics = self._call(collate(group, None))
+                share = sum(e.tokens.num_steps for e in group) / total
+                _add(sums, {"loss": loss, **metrics}, share * mine * self._parallel.num_ranks)
+        sums = self._parallel.mean(sums)
+        score = sums[self._learner.score]
+        return {**sums, "score": score, "score_error": math.sqrt(max(0.0, score * (1 - score)) / total)}
 
-    def _loss(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        features, batch = (self._features, batch) if self._features is not None else self._encoded(batch)
-        return self.model.head.loss(self._inputs(batch, features), batch.targets)
+    def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
+        config = self._config
+        largest = -(-self._order.batch // self._parallel.num_ranks // config.accumulate)
+        parts = Parts(self._learner.collator(), config.seed, max(1, largest))
+        stream = BatchStream(self._training, self._order, first=step, transform=parts)
+        loader = DataLoader(
+            stream,
+            batch_size=None,
+            num_workers=config.loader_workers,
+            collate_fn=_unchanged,
+            generator=torch.Generator(),  # else it draws from the one that dropout draws from
+        )
+        return iter(loader)
 
-    def _inputs(self, batch: Batch, features: torch.Tensor) -> HeadInputs:
-        memory = self.model.encode_prompts(batch.prompts, features)
-        return self.model(memory, batch.history, features, batch.targets.actions_BTC)
-
-    def _encoded(self, batch: Batch) -> tuple[torch.Tensor, Batch]:
-        """Encode the crops of a batch, each once, and number them anew."""
-        prompts, history = batch.prompts, batch.history
-        numbers = torch.cat([prompts.crops_VS.flatten(), history.crops_BTVN.flatten()])
-        used, places = numbers.unique(return_inverse=True)
-        prompt_places, history_places = places.split([prompts.crops_VS.numel(), history.crops_BTVN.numel()])
-        prompts = replace(prompts, crops_VS=prompt_places.view_as(prompts.crops_VS))
-        history = replace(history, crops_BTVN=history_places.view_as(history.crops_BTVN))
-        features = self.model.encode_images(self._examples.images[used])
-        return features, replace(batch, prompts=prompts, history=history)
-
-
-@torch.no_grad()
-def encode_in_chunks(model: PolicyNetwork, images: torch.Tensor, *, chunk: int = 1024) -> torch.Tensor:
-    """Encode many images without gradients, shape (K, F)."""
-    return torch.cat([model.encode_images(part) for part in images.split(chunk)])
+    def _call(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: a learner's own
+        device = self._parallel.device
+        kind = torch.bfloat16 if self._config.precision == "bfloat16" else None
+        with torch.autocast(device.type, kind, enabled=kind is not None):
+            return self._module(batch if device.type == "cpu" else batch.to(device))
 
 
-def _crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
+def freeze_crops(learner: PolicyLearner, cache: TokenCache) -> None:
+    """Leave the crop encoder as it is; where there are not too many images, encode each once and for all."""
+    for parameter in crop_parameters(learner.network):
+        parameter.requires_grad_(False)
+    count = int(cache.image_counts().sum())
+    if count > MAX_FEATURES:
+        return
+    device = next(learner.parameters()).device
+    height, width = learner.reader.image_size
+    parts = [np.zeros((1, 3, height, width), np.uint8)]  # number 0 is black
+    features = []
+    with torch.no_grad():
+        for start in range(0, len(cache), CHUNK):
+            parts += [episode.images for episode in cache[start : start + CHUNK]]
+            images = torch.from_numpy(np.concatenate(parts)).to(device)
+            features.append(learner.network.encode_images(images))
+            parts = []
+    learner.features = torch.cat(features)
+
+
+def crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
     """What the first stage trains, and cloning leaves alone."""
     images = model.images
     if not isinstance(images, ObjectEncoder):
         return list(images.frame_encoder.parameters())
     appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
     return [*images.crop_encoder.parameters(), *appearance]
+
+
+def _add(sums: Metrics, values: dict[str, torch.Tensor], share: float) -> None:
+    for name, value in values.items():
+        sums[name] = sums.get(name, 0.0) + value.item() * share
+
+
+def _unchanged(batch: Any) -> Any:  # Any: see `BatchStream`; PyTorch's default would turn tuples into lists
+    return batch

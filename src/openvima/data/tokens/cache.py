@@ -73,9 +73,21 @@ class TokenCache(Sequence[TokenEpisode]):
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
-        of_file = {source.name: self._file(source.name).lengths() for source in sources(self.dataset)}
+        return self._gathered(TokenFile.lengths, 2)
+
+    def image_counts(self) -> np.ndarray:
+        """Return the number of images of each episode, shape (N,), int64."""
+        return self._gathered(TokenFile.image_counts, 1)[:, 0]
+
+    def texts(self) -> set[str]:
+        """Return the different prompts, with their placeholders."""
+        return {text for name in self.dataset.shard_names() for text in self._file(name).texts()}
+
+    def _gathered(self, column: Callable[[TokenFile], np.ndarray], width: int) -> np.ndarray:
+        """Read a column of numbers of all files, and put it into the order of the episodes."""
+        of_file = {name: column(self._file(name)) for name in self.dataset.shard_names()}
         places = [self.dataset.locate(index) for index in range(len(self))]
-        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, 2)
+        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, width)
 
     def _file(self, name: str) -> TokenFile:
         if name not in self._files:

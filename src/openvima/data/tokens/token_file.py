@@ -153,6 +153,14 @@ class TokenFile:
         except (pa.ArrowInvalid, OSError, ValueError) as error:
             raise ShardError(_unfit(self.path, f"images of row {row}: {error}")) from None
 
+    def image_counts(self) -> np.ndarray:
+        """Return the number of images of each episode, shape (rows,), int32."""
+        return self._num_images
+
+    def texts(self) -> set[str]:
+        """Return the different prompts."""
+        return set(self._texts.to_pylist())
+
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the objects in view in all of them, shape (rows, 2), int64."""
         return np.stack([self._tables["steps"].lengths(), self._tables["objects"].lengths()], axis=1)

@@ -77,6 +77,11 @@ class ActionTargets:
     place_BT: torch.Tensor
     steps_BT: torch.Tensor
 
+    def to(self, device: torch.device | str) -> "ActionTargets":
+        """Return the targets on another device."""
+        tensors = (self.actions_BTC, self.pick_BT, self.place_BT, self.steps_BT)
+        return ActionTargets(*(tensor.to(device) for tensor in tensors))
+
 
 def likeliest(scores: torch.Tensor) -> torch.Tensor:
     """Choose the class of the highest score, the lowest one among equals."""

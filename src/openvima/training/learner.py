@@ -1,0 +1,201 @@
+"""What `train` fits: something that makes batches of demonstrations and a loss of a batch."""
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from openvima.data.tokens.episode import TokenKind
+from openvima.errors import CheckpointError, ConfigError
+from openvima.policies.base import WEIGHTS_FILE
+from openvima.policies.checkpoint import load_weights, write_checkpoint
+from openvima.policies.inputs import Reader
+from openvima.policies.network import PolicyNetwork
+from openvima.training.augment import augmented
+from openvima.training.collate import Collator
+from openvima.training.dataset import Batch, Example, stack_images, token_kind
+
+# From examples and, while training, one generator for each of them, to a batch.
+Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
+
+
+class Learner(nn.Module):
+    """Base of all that can be trained; a policy of your own needs two methods.
+
+    Attributes:
+        token_kind: What its images show: "objects" or "frames".
+        score: The metric that chooses the best checkpoint, the larger the better, a share of 1.
+    """
+
+    token_kind: TokenKind = "objects"
+    score = "accuracy"
+
+    def collator(self) -> Collate:
+        """Return what makes a batch of demonstrations; it is sent to processes that read ahead.
+
+        It is called with examples and one random generator for each, or None when validating, where nothing
+        may be drawn. What it draws must follow from the example's generator alone, so that neither the other
+        examples of the batch nor the number of processes matter. A batch is a tensor, or has a method `to`.
+        """
+        raise NotImplementedError
+
+    def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: its own batch
+        """Return the loss, a mean over all steps of the batch, and metrics by name, likewise."""
+        raise NotImplementedError
+
+    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
+        """Write a checkpoint into a folder that is still being filled.
+
+        Args:
+            folder: The folder.
+            weights: The state of the learner; gathered, if several processes each hold a part.
+        """
+        tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
+        save_file(tensors, folder / WEIGHTS_FILE)
+
+    def read(self, folder: Path) -> None:
+        """Load the weights of a checkpoint.
+
+        Raises:
+            CheckpointError: It is damaged or does not fit.
+        """
+        try:
+            self.load_state_dict(load_file(folder / WEIGHTS_FILE))
+        except (OSError, RuntimeError, ValueError) as error:
+            raise CheckpointError(f"{folder / WEIGHTS_FILE} cannot be loaded: {error}") from None
+
+    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+        """Return what decides the network, for the run's `config.yaml`."""
+        return {"learner": f"{type(self).__module__}:{type(self).__qualname__}"}
+
+
+class PolicyLearner(Learner):
+    """A network of the family, by behaviour cloning.
+
+    Args:
+        network: The network; it is trained in place.
+        reader: How it sees prompts and observations.
+        spurious_probability: How often each view of each step shows an object that is none.
+    """
+
+    def __init__(self, network: PolicyNetwork, reader: Reader, *, spurious_probability: float = 0.0) -> None:
+        super().__init__()
+        self.network = network
+        self.reader = reader
+        self.token_kind = token_kind(reader)
+        self.score = network.head.score
+        self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
+        self._spurious_probability = spurious_probability
+
+    def collator(self) -> "PolicyCollate":
+        """Return what makes batches; see `Learner`."""
+        return PolicyCollate(self.reader, self._spurious_probability, with_images=self.features is None)
+
+    def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the loss of the action head, and its metrics."""
+        network, features = self.network, self.features
+        if batch.images is not None:
+            features = network.encode_images(batch.images)
+        assert features is not None  # batches without images are made only where there are features
+        memory = network.encode_prompts(batch.prompts, features)
+        inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
+        return network.head.loss(inputs, batch.targets)
+
+    def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
+        """Write a checkpoint that `load_policy` takes."""
+        prefix = "network."
+        own = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
+        write_checkpoint(self.network, folder, self.reader.tokenizer, weights=own)
+
+    def read(self, folder: Path) -> None:
+        """Load the weights of a checkpoint."""
+        file = folder / WEIGHTS_FILE
+        load_weights(self.network, read_tensors(file), source=str(file))
+
+    def description(self) -> dict[str, Any]:  # Any: plain YAML values
+        """Return all sizes of the network."""
+        return self.network.config.to_dict()
+
+
+class PolicyCollate:
+    """Makes batches for a network of the family.
+
+    Args:
+        reader: How the network sees prompts and observations.
+        spurious_probability: How often each view of each step shows an object that is none.
+        with_images: Put the images that are used into the batch, each once. Without, numbers count through
+            the images of all demonstrations.
+    """
+
+    def __init__(self, reader: Reader, spurious_probability: float, *, with_images: bool) -> None:
+        self._collate = Collator(reader)
+        self._probability, self._with_images = spurious_probability, with_images
+
+    def __call__(
+        self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
+    ) -> Batch:
+        """Make a batch; see `Learner.collator`."""
+        reader, stack = self._collate.reader, None
+        if self._with_images:
+            examples, stack = stack_images([example.tokens for example in examples], reader)
+        batch = self._collate(examples)
+        if rngs is not None:
+            batch = augmented(batch, reader.layout, probability=self._probability, rngs=rngs)
+        return batch if stack is None else _with_used_images(batch, stack)
+
+
+def make_learner(name: str) -> Learner:
+    """Make a learner of one's own.
+
+    Args:
+        name: "module:function"; the function takes nothing and returns a `Learner`.
+
+    Raises:
+        ConfigError: There is no such module or function, or it returns something else.
+    """
+    module, _, function = name.partition(":")
+    try:
+        learner = getattr(importlib.import_module(module), function)()
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"preset is {name!r}; it must name a function as module:function ({error})."
+        ) from None
+    if not isinstance(learner, Learner):
+        raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
+    return learner
+
+
+def read_tensors(file: Path) -> dict[str, torch.Tensor]:
+    """Read a file of tensors.
+
+    Raises:
+        CheckpointError: It is missing or damaged.
+    """
+    from safetensors import SafetensorError
+
+    try:
+        return load_file(file)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{file} cannot be read ({error}); delete {file.parent} and repeat the command."
+        ) from error
+
+
+def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:
+    """Keep the images that the batch shows, each once, and number them anew."""
+    prompts, history = batch.prompts, batch.history
+    numbers = torch.cat([prompts.crops_VS.flatten(), history.crops_BTVN.flatten()])
+    used, places = numbers.unique(return_inverse=True)
+    prompt_places, history_places = places.split([prompts.crops_VS.numel(), history.crops_BTVN.numel()])
+    return replace(
+        batch,
+        prompts=replace(prompts, crops_VS=prompt_places.view_as(prompts.crops_VS)),
+        history=replace(history, crops_BTVN=history_places.view_as(history.crops_BTVN)),
+        images=stack[used],
+    )

@@ -1,0 +1,171 @@
+"""One process or many: who this process is, how gradients are shared, and what only one of them does.
+
+`torchrun` starts the processes and tells each its number; without it there is one. Data parallel keeps the
+whole network in every process (DDP); sharded, each keeps a part of weights, gradients and optimizer (FSDP2).
+"""
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+from openvima.errors import ConfigError
+
+Sharding = Literal["ddp", "fsdp"]
+
+
+@dataclass(frozen=True, slots=True)
+class Parallel:
+    """The processes of a run.
+
+    Args:
+        rank: Number of this process.
+        num_ranks: How many there are.
+        device: Where this process computes.
+        sharding: "ddp" or "fsdp".
+    """
+
+    rank: int
+    num_ranks: int
+    device: torch.device
+    sharding: Sharding = "ddp"
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process writes files and reports."""
+        return self.rank == 0
+
+    @property
+    def is_sharded(self) -> bool:
+        """Whether each process holds but a part of the weights."""
+        return self.sharding == "fsdp" and self.num_ranks > 1
+
+    def wrap(self, module: nn.Module) -> nn.Module:
+        """Return what to call for training: it shares gradients between the processes."""
+        if self.num_ranks == 1:
+            return module
+        if self.is_sharded:
+            return _sharded(module, self.device)
+        ids = [self.device.index] if self.device.type == "cuda" else None
+        return nn.parallel.DistributedDataParallel(module, device_ids=ids)
+
+    @contextlib.contextmanager
+    def shares(self, module: nn.Module, *, last: bool) -> Iterator[None]:
+        """Share gradients with the last backward pass of a step only.
+
+        Args:
+            module: What `wrap` returned.
+            last: Whether the passes of this step end with the block.
+        """
+        if self.num_ranks == 1:
+            yield
+        elif self.is_sharded:
+            module.set_requires_gradient_sync(last)  # type: ignore[operator]
+            yield
+        elif last:
+            yield
+        else:
+            with module.no_sync():  # type: ignore[operator]
+                yield
+
+    def mean(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Average named numbers over all processes."""
+        if self.num_ranks == 1:
+            return dict(values)
+        names = sorted(values)
+        numbers = torch.tensor([values[name] for name in names], dtype=torch.float64, device=self.device)
+        dist.all_reduce(numbers)
+        return dict(zip(names, (numbers / self.num_ranks).tolist(), strict=True))
+
+    def wait(self) -> None:
+        """Wait until all processes have come here."""
+        if self.num_ranks > 1:
+            dist.barrier()
+
+
+@contextlib.contextmanager
+def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
+    """Join the processes that `torchrun` has started, if it has.
+
+    Args:
+        device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
+        sharding: "ddp" or "fsdp".
+
+    Raises:
+        ConfigError: There is no such device.
+    """
+    rank, num_ranks = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        chosen = torch.device(device)
+    except RuntimeError:
+        raise ConfigError(f"device is {device!r}; it must be auto, cpu, cuda or cuda:NUMBER.") from None
+    if chosen.type == "cuda":
+        if not torch.cuda.is_available():
+            raise ConfigError("device is 'cuda', but no GPU can be used here; take cpu, or auto.")
+        local = int(os.environ.get("LOCAL_RANK", 0)) if chosen.index is None else chosen.index
+        chosen = torch.device("cuda", local)
+        torch.cuda.set_device(chosen)
+    if num_ranks == 1:
+        yield Parallel(0, 1, chosen, sharding)
+        return
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    try:
+        yield Parallel(rank, num_ranks, chosen, sharding)
+        dist.barrier()  # else gloo aborts where one process ends earlier than another
+    finally:
+        dist.destroy_process_group()
+
+
+def whole_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Collect the weights and the optimizer's state of a sharded module; every process must call it.
+
+    Returns:
+        Name of the parameter to tensor, and name of the parameter to its state; on the first process. Others
+        get empty ones.
+    """
+    from torch.distributed.checkpoint.state_dict import (
+        StateDictOptions,
+        get_model_state_dict,
+        get_optimizer_state_dict,
+    )
+
+    options = StateDictOptions(full_state_dict=True, cpu_offload=True)
+    weights = get_model_state_dict(module, options=options)
+    state: dict[str, Any] = get_optimizer_state_dict(module, optimizer, options=options)
+    return weights, state.get("state", {})
+
+
+def set_whole_state(
+    module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Mapping[str, torch.Tensor]]
+) -> None:
+    """Give a sharded module's optimizer its state; every process must call it with the whole."""
+    from torch.distributed.checkpoint.state_dict import (
+        StateDictOptions,
+        get_optimizer_state_dict,
+        set_optimizer_state_dict,
+    )
+
+    groups = get_optimizer_state_dict(module, optimizer, options=StateDictOptions(full_state_dict=True))
+    whole = {"state": dict(state), "param_groups": groups["param_groups"]}
+    set_optimizer_state_dict(module, optimizer, whole, options=StateDictOptions(full_state_dict=True))
+
+
+def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
+    """Shard the layers of the largest stacks one by one, and the rest together."""
+    from torch.distributed.device_mesh import init_device_mesh
+    from torch.distributed.fsdp import fully_shard
+
+    mesh = init_device_mesh(device.type, (dist.get_world_size(),))
+    for part in module.modules():
+        if isinstance(part, nn.ModuleList):
+            for layer in part:
+                if any(True for _ in layer.parameters()):
+                    fully_shard(layer, mesh=mesh)
+    return fully_shard(module, mesh=mesh)

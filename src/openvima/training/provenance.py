@@ -1,0 +1,59 @@
+"""What a run was made with, for whoever reads its results later."""
+
+import hashlib
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import openvima
+from openvima.data.manifest import MANIFEST_NAME
+from openvima.data.reader import Dataset
+
+_PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
+
+
+def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
+    """Return versions, the git commit of the package if it lies in a checkout, and which data were used."""
+    content = (dataset.path / MANIFEST_NAME).read_bytes()
+    return {
+        "versions": {"openvima": openvima.__version__, **_versions()},
+        "git": git_state(Path(openvima.__file__).parent),
+        "data": {
+            "content_hash": dataset.manifest["content_hash"],
+            "manifest_sha256": hashlib.sha256(content).hexdigest(),
+            "counts": dataset.manifest["counts"],
+        },
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON
+    """Return the commit of the checkout that a folder lies in, and whether files differ from it.
+
+    Returns:
+        `commit` and `changed`; None where the folder is no part of a checkout, or git is missing.
+    """
+
+    def ask(*words: str) -> str | None:
+        try:
+            result = subprocess.run(
+                ["git", "-C", str(folder), *words], capture_output=True, text=True, check=True, timeout=10
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return result.stdout.strip()
+
+    commit = ask("rev-parse", "HEAD")
+    if commit is None or ask("ls-files", "--error-unmatch", ".") is None:  # installed inside a checkout
+        return None
+    return {"commit": commit, "changed": bool(ask("status", "--porcelain", "--untracked-files=no"))}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

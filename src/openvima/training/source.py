@@ -1,0 +1,140 @@
+"""The demonstrations of a run, out of the token cache: those to learn from, and those kept for validation."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from openvima.data.batching import BatchOrder
+from openvima.data.tokens.cache import TokenCache
+from openvima.data.tokens.episode import pieces_of
+from openvima.errors import DatasetError
+from openvima.policies.inputs import Reader
+from openvima.training.dataset import Example
+from openvima.training.learner import Collate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExampleSource(Sequence[Example]):
+    """Some demonstrations of a cache, by number.
+
+    Args:
+        cache: The tokens of all.
+        rows: Which of them, shape (N,), int64.
+        bases: Images of all demonstrations before each one, shape (all,), int64.
+        lengths: Steps of each one and objects in view in all of them, shape (N, 2), int64.
+    """
+
+    cache: TokenCache
+    rows: np.ndarray
+    bases: np.ndarray
+    lengths: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> Example:  # type: ignore[override]  # nobody slices
+        row = int(self.rows[index])
+        return Example(self.cache[row], int(self.bases[row]), row)
+
+    def num_steps(self, indices: np.ndarray) -> int:
+        """Return the steps of some demonstrations together."""
+        return int(self.lengths[indices, 0].sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """How a process works off its share of a batch: in parts of demonstrations of like length.
+
+    Args:
+        collate: Makes a batch of each part.
+        seed: Of the run; every example has a generator of its own for every batch.
+        largest: Demonstrations of a part.
+    """
+
+    collate: Collate
+    seed: int
+    largest: int
+
+    def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
+        """Return the batches of one step, each with its number of steps in demonstrations."""
+        parts = []
+        for group in by_length(examples):
+            for start in range(0, len(group), self.largest):
+                part = group[start : start + self.largest]
+                rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
+                parts.append((self.collate(part, rngs), sum(e.tokens.num_steps for e in part)))
+        return parts
+
+
+def split_examples(
+    cache: TokenCache, *, validation_share: float, validation_episodes: int
+) -> tuple[ExampleSource, ExampleSource]:
+    """Divide demonstrations into those to learn from and those for validation.
+
+    Whether one is kept follows from its task and seed, so that it stays there when data are added.
+
+    Args:
+        cache: The tokens of all.
+        validation_share: Share to keep.
+        validation_episodes: At most so many are used; which ones follows from task and seed, too.
+
+    Raises:
+        DatasetError: There is none to learn from.
+    """
+    index = cache.dataset.index
+    names = zip(index.column("task").to_pylist(), index.column("seed").to_pylist(), strict=True)
+    lots = np.array([_lot(f"{task}/{seed}") for task, seed in names], np.float64)
+    counts = cache.image_counts()
+    bases = np.cumsum(counts) - counts
+    lengths = cache.lengths()
+    training, kept = np.flatnonzero(lots >= validation_share), np.flatnonzero(lots < validation_share)
+    if not len(training):
+        raise DatasetError(
+            "there is no demonstration to learn from; generate some, or lower validation_share."
+        )
+    kept = np.sort(kept[np.argsort(lots[kept], kind="stable")[:validation_episodes]])
+    first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
+    return first, second
+
+
+def check_words(cache: TokenCache, reader: Reader) -> None:
+    """Look at every text before training rather than in the middle of it.
+
+    Raises:
+        PromptError: A prompt has a word that the vocabulary lacks.
+    """
+    for text in cache.texts():
+        for piece in pieces_of(text):
+            if isinstance(piece, str):
+                reader.tokenizer.encode(piece)
+
+
+def order_of(
+    source: ExampleSource, *, batch: int, seed: int, bucket: int, rank: int, num_ranks: int
+) -> BatchOrder:
+    """Return which demonstrations each step takes; a batch is never larger than there are."""
+    batch = min(batch, len(source) // num_ranks * num_ranks)
+    return BatchOrder(
+        len(source),
+        batch=batch,
+        seed=seed,
+        lengths=source.lengths if bucket else None,
+        bucket=max(1, bucket),
+        rank=rank,
+        num_ranks=num_ranks,
+    )
+
+
+def by_length(examples: Sequence[Example]) -> list[list[Example]]:
+    """Sort examples into those of one step, of two or three, and longer ones, so that little is padded."""
+    groups: dict[int, list[Example]] = {}
+    for example in examples:
+        groups.setdefault(min(2, example.tokens.num_steps // 2), []).append(example)
+    return [groups[key] for key in sorted(groups)]
+
+
+def _lot(name: str) -> float:
+    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
+    return int.from_bytes(digest, "little") / 2**64

@@ -1,0 +1,102 @@
+"""Named settings, files of settings, and what the command line makes of them."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytest.importorskip("torch")
+
+from openvima.cli.main import main
+from openvima.errors import ConfigError
+from openvima.training import TrainingConfig
+from openvima.training.recipes import (
+    RECIPES,
+    default_recipe,
+    read_settings,
+    recipe_settings,
+)
+
+
+@pytest.fixture
+def trained(monkeypatch) -> list[TrainingConfig]:
+    """What the command line would train."""
+    configs: list[TrainingConfig] = []
+
+    def train(config, report, rollout) -> Path:
+        configs.append(config)
+        return config.out
+
+    monkeypatch.setattr("openvima.training.train", train)
+    return configs
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_is_a_run_that_could_be(name: str) -> None:
+    config = TrainingConfig(data=Path("demos"), out=Path("run"), **recipe_settings(name))
+    assert config.batch % config.accumulate == 0
+
+
+def test_the_paper_recipe_is_that_of_the_paper() -> None:
+    config = TrainingConfig(data=Path("demos"), out=Path("run"), **recipe_settings("paper"))
+    assert (config.learning_rate, config.weight_decay, config.clip_norm) == (1e-4, 0.0, 1.0)
+    assert (config.warmup_steps, config.decay_steps, config.final_learning_rate) == (7000, 17000, 1e-7)
+    assert (config.batch, config.epochs, config.spurious_probability) == (128, 10, 0.05)
+
+
+def test_small_presets_and_own_learners_have_the_small_recipe() -> None:
+    assert default_recipe("vima-nano") == default_recipe("mine:learner") == "nano"
+    assert default_recipe("vima-20m") == default_recipe(None) == "paper"
+    with pytest.raises(ConfigError, match="Did you mean 'paper'"):
+        recipe_settings("papper")
+
+
+def test_what_is_given_counts_more_than_the_file_and_that_more_than_the_recipe(trained, tmp_path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("learning_rate: 0.5\nbatch: 7\ndata: demos\n")
+    words = ["train", "--config", str(file), "--recipe", "paper", "--preset", "nano", "--batch", "9"]
+    assert main([*words, "--out", "run"]) == 0
+    (config,) = trained
+    assert (config.batch, config.learning_rate, config.warmup_steps) == (9, 0.5, 7000)
+    assert (config.data, config.out, config.preset) == (Path("demos"), Path("run"), "nano")
+
+
+def test_the_preset_decides_on_the_recipe(trained) -> None:
+    for preset in ("nano", "vima-20m"):
+        assert main(["train", "--data", "demos", "--out", "run", "--preset", preset]) == 0
+    assert [config.learning_rate for config in trained] == [1e-3, 1e-4]
+    assert [config.preset for config in trained] == ["nano", "vima-20m"]
+    assert main(["train", "--data", "demos", "--out", "run"]) == 0
+    assert trained[-1] == trained[0]
+
+
+def test_the_settings_of_another_run_can_be_taken(trained, tmp_path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump({"training": {"steps": 5, "epochs": None}, "policy": {}}))
+    assert main(["train", "--config", str(file), "--data", "demos", "--out", "run"]) == 0
+    assert trained[0].steps == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("stepps: 3", "there is no setting in .* called 'stepps'. Did you mean 'steps'"),
+        ("- 3", "must hold settings"),
+        ("a: [", "cannot be read as YAML"),
+    ],
+)
+def test_a_file_that_holds_no_settings_is_named(text: str, message: str, tmp_path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_settings(file)
+    with pytest.raises(ConfigError, match=r"gone\.yaml cannot be read"):
+        read_settings(tmp_path / "gone.yaml")
+
+
+def test_what_is_missing_or_unknown_is_wrong_usage(capsys) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["train", "--out", "run"])
+    assert caught.value.code == 2
+    assert "--data" in capsys.readouterr().err
+    assert main(["train", "--recipe", "papper", "--data", "d", "--out", "r"]) == 2
