@@ -26,6 +26,8 @@ from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 
+NEAR_TIE = 1e-4  # scores of two classes this near may change places by rounding in float32
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Episodes:
@@ -38,6 +40,8 @@ class _Episodes:
         memory: Their prompts.
         state: What the trunk has read of them.
         actions_BC: Their last actions, metres and quaternions, float32; None before the first.
+        margins_B: How far the best class of their last action lay above the next, in its tightest choice;
+            None before the first.
         features: Features of the images that were encoded for the last step, by the bytes of the images.
     """
 
@@ -47,6 +51,7 @@ class _Episodes:
     memory: Memory
     state: TrunkState
     actions_BC: torch.Tensor | None
+    margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]
 
     def at(self, places: Sequence[int]) -> "_Episodes":
@@ -61,6 +66,7 @@ class _Episodes:
             self.memory.select(rows),
             self.state.select(rows),
             None if self.actions_BC is None else self.actions_BC[rows],
+            None if self.margins_B is None else self.margins_B[rows],
             self.features,
         )
 
@@ -140,6 +146,7 @@ class NetworkPolicy(Policy):
             memory=memory,
             state=self.network.begin(memory),
             actions_BC=None,
+            margins_B=None,
             features={},
         )
         self._num_prompts = len(prompts)
@@ -185,6 +192,25 @@ class NetworkPolicy(Policy):
         self._episodes = episodes
         return actions
 
+    def new_session(self) -> "NetworkPolicy":
+        """Return a policy that shares the network with this one and has episodes of its own."""
+        other = copy(self)
+        other._num_prompts, other._episodes = 0, None  # never changed in place, so nothing else is shared
+        return other
+
+    @property
+    def near_ties(self) -> list[bool]:
+        """For each episode whether rounding may have chosen its last action; False where it has ended.
+
+        It may where two classes scored within `NEAR_TIE` of each other.
+        """
+        near = [False] * self._num_prompts
+        if self._episodes is not None and self._episodes.margins_B is not None:
+            margins = self._episodes.margins_B.tolist()
+            for place, margin in zip(self._episodes.places, margins, strict=True):
+                near[place] = margin < NEAR_TIE
+        return near
+
     @staticmethod
     def from_pretrained(
         path_or_hub_id: str | Path,
@@ -222,9 +248,17 @@ class NetworkPolicy(Policy):
             episodes.memory, episodes.state, history, features_KF, previous_BC[:, None], has_previous_B1
         )
         choose = drawing(episodes.generators, self._temperature) if self._temperature else likeliest
+        margins: list[torch.Tensor] = []
         # The history holds actions as they are sent.
-        actions_BC = self.network.head.decide(inputs, choose)[:, 0].to(torch.float32)
-        return replace(episodes, readers=readers, state=state, actions_BC=actions_BC, features=features)
+        actions_BC = self.network.head.decide(inputs, _noting(choose, margins))[:, 0].to(torch.float32)
+        return replace(
+            episodes,
+            readers=readers,
+            state=state,
+            actions_BC=actions_BC,
+            margins_B=torch.stack(margins).amin(0) if margins else None,
+            features=features,
+        )
 
     def _encode(
         self, images: np.ndarray, known: Mapping[bytes, torch.Tensor]
@@ -254,6 +288,18 @@ def _usable_device(device: torch.device | str) -> torch.device:
             "which torch is installed."
         ) from error
     return found
+
+
+def _noting(choose: Choose, margins: list[torch.Tensor]) -> Choose:
+    """Make the same choice, and note how far the best class of each row lies above the next, shape (B,)."""
+
+    def noted(scores: torch.Tensor) -> torch.Tensor:
+        if scores.shape[-1] > 1:
+            best, second = scores.topk(2).values.unbind(-1)
+            margins.append((best - second).flatten(1).amin(1))
+        return choose(scores)
+
+    return noted
 
 
 def drawing(generators: Sequence[torch.Generator], temperature: float) -> Choose:
