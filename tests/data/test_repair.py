@@ -22,6 +22,7 @@ from openvima.data import (
     verify,
 )
 from openvima.data.encoding import ShardInfo
+from openvima.data.tokens.cache import open_tokens
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OpenVimaError, ShardError
 from openvima.scene import Outcome
@@ -303,6 +304,20 @@ def test_records_without_anything_that_says_what_they_are_stay_where_they_are(me
     with pytest.raises(ShardError, match=rf"{STACK} has 3 whole records, but its schema and its footer"):
         repair(merged, LOOK)
     assert contents(merged) == before
+
+
+def test_tokens_that_are_not_those_of_the_demonstrations_are_found_and_deleted(folder: Path) -> None:
+    first, second = (path for path in sorted(open_tokens(Dataset(folder)).folder.glob("rotate-*")))
+    assert verify(folder, LOOK).is_clean
+    flip(first, 2 * first.stat().st_size // 3)
+    cut(second, 100)
+    names = [str(path.relative_to(folder)) for path in (first, second)]
+    assert sorted({problem.file for problem in verify(folder, LOOK).problems}) == names
+    done = repair(folder, LOOK)
+    assert done.after.is_clean, done.after.problems
+    assert done.deleted == tuple(names)
+    open_tokens(Dataset(folder))
+    assert verify(folder, LOOK).is_clean
 
 
 def test_the_command_says_what_it_did(folder: Path, capsys: pytest.CaptureFixture) -> None:

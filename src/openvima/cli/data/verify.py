@@ -75,6 +75,7 @@ def _deeds(done: "Repair") -> Iterator[str]:
         ("generated again", done.made_anew),
         ("whole records kept", done.rewritten),
         ("lost", done.lost),
+        ("deleted", done.deleted),
     ):
         if names:
             yield deed
@@ -84,8 +85,8 @@ def _deeds(done: "Repair") -> Iterator[str]:
 
 def _findings(found: "Verification") -> Iterator[str]:
     yield (
-        f"{found.folder}: {found.num_shards} shards, {found.num_episodes} episodes compared with their "
-        f"hashes, {found.num_replayed} played again"
+        f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
+        f"hashes, {found.num_replayed:,} played again"
     )
     yield from (f"note: {note}" for note in found.notes)
     yield "nothing is wrong" if found.is_clean else f"{len(found.problems)} problems"

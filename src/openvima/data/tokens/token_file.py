@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from openvima.data.reader import ODD_ERRORS
 from openvima.data.tokens.episode import (
     ACTION_PARTS,
     IMAGE_SIZES,
@@ -110,7 +111,9 @@ class TokenFile:
             self.source: str = about["source"]
             fits = about["version"] == TOKENS_VERSION and self.kind in KINDS and reader.schema.equals(COLUMNS)
             batch = reader.get_batch(0) if fits else None
-        except (pa.ArrowInvalid, OSError, KeyError, TypeError, ValueError) as error:
+            if batch is not None:
+                batch.validate(full=True)  # offsets that lead out of a buffer would end the process
+        except ODD_ERRORS as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         if batch is None:
             raise ShardError(_unfit(path, "of another version"))
@@ -150,7 +153,7 @@ class TokenFile:
         try:
             pixels = self._codec.decompress(packed, decompressed_size=size) if size else b""
             return np.frombuffer(pixels, np.uint8).reshape(self._shape)
-        except (pa.ArrowInvalid, OSError, ValueError) as error:
+        except ODD_ERRORS as error:
             raise ShardError(_unfit(self.path, f"images of row {row}: {error}")) from None
 
     def image_counts(self) -> np.ndarray:

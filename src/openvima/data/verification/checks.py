@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ShardSummary, compose
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ShardSummary, compose, joint_hash
 from openvima.data.planning import FAILED_FOLDER
 from openvima.data.verification.findings import Problem, Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
+from openvima.data.verification.token_files import check_tokens
 from openvima.processes import in_processes
 
 DEFAULT = VerifyConfig()
@@ -18,7 +19,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     """Look for everything that is wrong with a data set; nothing is changed.
 
     Args:
-        folder: Folder of demonstrations. Its `failed` episodes are looked at too.
+        folder: Folder of demonstrations. Its `failed` episodes and its tokens are looked at too.
         config: How thoroughly to look.
         report: Called with episodes done, episodes in all, and what is being done.
 
@@ -32,7 +33,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     folder = Path(folder)
     found = _verify(folder, folder, config, report)
     failed = folder / FAILED_FOLDER
-    if failed.is_dir() and any(failed.iterdir()):
+    if (failed / MANIFEST_NAME).is_file() or any(failed.glob("*.arrow")):
         found = found.joined(_verify(failed, folder, config, report))
     return found
 
@@ -40,15 +41,12 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
 def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | None) -> Verification:
     inventory = take_inventory(folder)
     tasks = _tasks(inventory, root)
-    results: dict[str, ShardFindings] = {}
-    episodes = [0 if task.index is None else task.index.num_rows for task in tasks]
-    watch = None if report is None else (lambda done: report(done, sum(episodes), "comparing"))
-    for task, findings in in_processes(check_shard, tasks, config.workers, report=watch):
-        results[task.path.name] = findings
+    results = dict(_checked(tasks, config, report))
     found = [results[task.path.name] for task in tasks]
     replayed = replay(inventory, results, config, report)
-    place = "" if folder == root else f"{folder.relative_to(root)}/"
     own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems]
+    own += check_tokens(folder, _joint_hashes(found), config.workers, report)
+    place = "" if folder == root else f"{folder.relative_to(root)}/"
     problems = [Problem(place + problem.file, problem.cause, problem.remedy) for problem in own]
     problems += [problem for findings in found for problem in findings.problems]
     return Verification(
@@ -60,6 +58,22 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
         num_replayed=replayed.num_episodes,
         damaged=tuple(place + task.path.name for task in tasks if results[task.path.name].is_damaged),
     )
+
+
+def _checked(
+    tasks: Sequence[ShardTask], config: VerifyConfig, report: Report | None
+) -> Iterator[tuple[str, ShardFindings]]:
+    """Yield the name of each shard with what was found in it."""
+    total = sum(0 if task.index is None else task.index.num_rows for task in tasks)
+    watch = None if report is None else (lambda done: report(done, max(done, total), "comparing"))
+    for task, findings in in_processes(check_shard, tasks, config.workers, report=watch):
+        yield task.path.name, findings
+
+
+def _joint_hashes(found: Sequence[ShardFindings]) -> dict[str, str]:
+    """Name of each whole shard to the hash of its episodes together."""
+    summaries = [f.summary for f in found if f.summary is not None and not f.is_damaged]
+    return {summary.name: joint_hash(summary.index.column("content_hash")) for summary in summaries}
 
 
 def _tasks(inventory: Inventory, root: Path) -> list[ShardTask]:

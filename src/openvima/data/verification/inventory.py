@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ORIGIN_TYPES, parse_index, parse_manifest
 from openvima.data.planning import COMMAND, FAILED_FOLDER
-from openvima.data.reader import remedy
+from openvima.data.reader import remedy, why_no_data_set
 from openvima.data.verification.findings import Problem
 from openvima.errors import DatasetError
 
@@ -87,7 +87,7 @@ def take_inventory(folder: Path) -> Inventory:
     """
     shards = sorted(path.name for path in folder.glob("*.arrow"))
     if not shards and not (folder / MANIFEST_NAME).is_file():
-        raise DatasetError(f"{folder} holds no data set: neither {MANIFEST_NAME} nor shards.")
+        raise DatasetError(why_no_data_set(folder))
     problems: list[Problem] = []
     manifest, index = None, None
     found = Inventory(folder, None, None, (), ())

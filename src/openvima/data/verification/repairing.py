@@ -11,6 +11,7 @@ import pyarrow as pa
 from openvima.data.manifest import finish_folder
 from openvima.data.planning import COMMAND, FAILED_FOLDER, GenerateConfig
 from openvima.data.reader import Shard
+from openvima.data.tokens.cache import CACHE_FOLDER
 from openvima.data.verification.checks import DEFAULT, verify
 from openvima.data.verification.findings import Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
@@ -36,6 +37,7 @@ class Repair:
         made_anew: Shards that were generated again.
         rewritten: Shards of which the whole records were kept.
         lost: Episodes that are gone: what the index tells of each.
+        deleted: Files of tokens that were not those of the demonstrations; they are made anew when needed.
     """
 
     before: Verification
@@ -43,10 +45,11 @@ class Repair:
     made_anew: tuple[str, ...] = ()
     rewritten: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
+    deleted: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:  # Any: JSON
         """Return everything as plain values."""
-        did = {name: list(getattr(self, name)) for name in ("made_anew", "rewritten", "lost")}
+        did = {name: list(getattr(self, name)) for name in ("made_anew", "rewritten", "lost", "deleted")}
         return {**self.after.record(), "repaired": {"before": self.before.record(), **did}}
 
 
@@ -73,13 +76,21 @@ def repair(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     before = verify(folder, replace(config, replay=0), report)
     if before.is_clean:
         return Repair(before, verify(folder, config, report))
+    deleted = _delete_tokens(before)
     inventory = take_inventory(folder)
     origin = inventory.manifest or inventory.doubtful
     if origin is None or origin["command"] == COMMAND:
         made_anew = _regenerate(inventory, before.damaged, config, report)
-        return Repair(before, verify(folder, config, report), made_anew=made_anew)
+        return Repair(before, verify(folder, config, report), made_anew=made_anew, deleted=deleted)
     rewritten, lost = _salvage(inventory, origin, before.damaged)
-    return Repair(before, verify(folder, config, report), rewritten=rewritten, lost=lost)
+    return Repair(before, verify(folder, config, report), (), rewritten, lost, deleted)
+
+
+def _delete_tokens(found: Verification) -> tuple[str, ...]:
+    names = sorted({p.file for p in found.problems if p.file.startswith(f"{CACHE_FOLDER}/")})
+    for name in names:
+        (found.folder / name).unlink(missing_ok=True)
+    return tuple(names)
 
 
 def _regenerate(

@@ -1,0 +1,99 @@
+"""Checking the token cache: that it holds what would be cut out of the demonstrations now."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from openvima.data.reader import Shard
+from openvima.data.tokens.cache import CACHE_FOLDER
+from openvima.data.tokens.episode import TokenEpisode, tokens_of
+from openvima.data.tokens.token_file import TokenFile
+from openvima.data.verification.findings import Problem, Report, by_cause
+from openvima.errors import OpenVimaError, ShardError
+from openvima.processes import in_processes
+
+
+@dataclass(frozen=True, slots=True)
+class TokenTask:
+    """A file of tokens to look at.
+
+    Args:
+        path: The file.
+        shard: The shard of which it was made.
+        content_hash: Of the episodes of that shard together.
+        shown_as: Its name in messages, relative to the data folder.
+    """
+
+    path: Path
+    shard: Path
+    content_hash: str
+    shown_as: str
+
+
+def check_tokens(
+    folder: Path, content_hashes: dict[str, str], num_workers: int, report: Report | None = None
+) -> list[Problem]:
+    """Compare the token cache of a data set with the demonstrations, episode by episode.
+
+    Args:
+        folder: The data folder.
+        content_hashes: Name of each whole shard to the hash of its episodes together.
+        num_workers: Number of processes.
+        report: Called with episodes done, episodes in all, and what is being done.
+    """
+    files = sorted((folder / CACHE_FOLDER).glob("*/*.arrow"))
+    tasks = [
+        TokenTask(path, folder / path.name, content_hashes[path.name], str(path.relative_to(folder)))
+        for path in files
+        if path.name in content_hashes
+    ]
+    total = sum(len(Shard(task.shard)) for task in tasks)
+    watch = None if report is None else (lambda done: report(done, total, "comparing tokens"))
+    remedy = "Delete it; `openvima data tokens` makes it anew."
+    problems = []
+    for task, causes in in_processes(check_token_file, tasks, num_workers, report=watch):
+        problems += [Problem(task.shown_as, cause, remedy) for cause in causes]
+    return problems
+
+
+def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[str]:
+    """Compare a file of tokens with its shard.
+
+    Args:
+        task: The file.
+        count: Called with the number of episodes compared so far.
+
+    Returns:
+        What is wrong; nothing where the file is out of date, for then it is made anew before it is used.
+    """
+    try:
+        tokens = TokenFile(task.path)
+    except ShardError as error:
+        return [str(error).removeprefix(f"{task.path} ").split(". ")[0]]
+    if tokens.source != task.content_hash:
+        return []
+    shard = Shard(task.shard)
+    if len(tokens) != len(shard):
+        return [f"it has {len(tokens)} of {len(shard)} episodes"]
+    return by_cause(_differences(tokens, shard, count), len(shard))
+
+
+def _differences(tokens: TokenFile, shard: Shard, count: Callable[[int], None]) -> Iterator[tuple[int, str]]:
+    for row in range(len(shard)):
+        try:
+            is_same = _is_same(tokens[row], tokens_of(shard[row], tokens.kind))
+        except OpenVimaError as error:
+            yield row, f"its tokens cannot be compared: {error}"
+            continue
+        if not is_same:
+            yield row, "its tokens are not those of the demonstration"
+        count(row + 1)
+
+
+def _is_same(ours: TokenEpisode, theirs: TokenEpisode) -> bool:
+    return all(
+        np.array_equal(getattr(ours, field.name), getattr(theirs, field.name))
+        for field in fields(TokenEpisode)
+    )
