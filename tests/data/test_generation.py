@@ -249,6 +249,10 @@ def test_folders_that_are_no_data_set_are_refused(whole: Path, tmp_path: Path) -
         Dataset(tmp_path / "gone")
     with pytest.raises(DatasetError, match="holds no data set"):
         Dataset(tmp_path)
+    with pytest.raises(DatasetError, match="arrow is a file; give the folder"):
+        Dataset(whole / "rotate-train-00000.arrow")
+    with pytest.raises(DatasetError, match=f"but these do: {whole}"):
+        Dataset(whole.parent)
     (tmp_path / "dataset.json").write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
         Dataset(tmp_path)

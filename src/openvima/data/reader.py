@@ -280,12 +280,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         DatasetError: There is none, or it is damaged or of another version.
     """
     path = folder / MANIFEST_NAME
-    if not folder.is_dir():
-        raise DatasetError(f"there is no folder {folder}; `openvima generate --out {folder}` makes one.")
     if not path.is_file():
-        begun = any(folder.glob("*.arrow"))
-        fault = "is not finished: repeat its `openvima generate` command" if begun else "holds no data set"
-        raise DatasetError(f"{folder} {fault} ({MANIFEST_NAME} is missing).")
+        raise DatasetError(why_no_data_set(folder))
     try:
         return parse_manifest(path.read_bytes())
     except DatasetError as error:
@@ -295,6 +291,19 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
 def remedy(folder: Path) -> str:
     """Return a sentence that says what makes a damaged folder whole."""
     return f"`openvima data verify {folder} --repair` makes it anew, or keeps what is whole."
+
+
+def why_no_data_set(folder: Path) -> str:
+    """Say what is wrong with a path where no manifest is, and what helps."""
+    if folder.is_file():
+        return f"{folder} is a file; give the folder that holds the data set, such as {folder.parent}."
+    if not folder.is_dir():
+        return f"there is no folder {folder}; `openvima generate --out {folder}` makes one."
+    if any(folder.glob("*.arrow")):
+        return f"{folder} is not finished: repeat the command that writes it ({MANIFEST_NAME} is missing)."
+    inner = sorted(str(path.parent) for path in folder.glob(f"*/{MANIFEST_NAME}"))
+    hint = f", but these do: {', '.join(inner[:5])}{', …' if len(inner) > 5 else ''}" if inner else ""
+    return f"{folder} holds no data set ({MANIFEST_NAME} is missing){hint}."
 
 
 def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:

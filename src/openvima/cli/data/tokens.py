@@ -35,6 +35,6 @@ def tokens(
 
     with progress_bar("tokens") as report:
         cache = open_tokens(Dataset(folder), kind, folder=out, workers=workers, report=report)
-    print(f"tokens of {len(cache)} demonstrations are ready.", file=sys.stderr)
+    print(f"tokens of {len(cache):,} demonstrations are ready.", file=sys.stderr)
     print(cache.folder)
     return 0
