@@ -20,6 +20,7 @@ ORDER = (
     "env",
     "data",
     "policies",
+    "serving",
     "training",
     "evaluation",
     "cli",
@@ -33,6 +34,7 @@ FORBIDDEN = {
     "tasks": {"mujoco", "torch", "openvima.sim"},
     "env": {"torch"},
     "policies": {"mujoco", "openvima.sim", "openvima.env"},
+    "serving": {"mujoco", "torch", "openvima.sim", "openvima.env"},
     "training": {"mujoco", "openvima.sim", "openvima.env"},
 }
 

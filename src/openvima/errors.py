@@ -111,6 +111,14 @@ class ConfigError(OpenVimaError, ValueError):
     """A setting outside its allowed range, or settings that contradict each other."""
 
 
+class MessageError(OpenVimaError, ValueError):
+    """A message between a policy server and a client cannot be read, or comes in the wrong order."""
+
+
+class ServerError(OpenVimaError, ConnectionError):
+    """A policy server cannot be reached, was lost, refuses a request or speaks another protocol."""
+
+
 class MissingExtraError(OpenVimaError, ImportError):
     """An optional dependency is not installed; the message names the extra."""
 

@@ -69,6 +69,10 @@ class RandomPolicy(Policy):
         self.seed = seed
         self._rngs: list[np.random.Generator] = []
 
+    def new_session(self) -> "RandomPolicy":
+        """Return a policy that draws as this one does and has episodes of its own."""
+        return RandomPolicy(self.seed)
+
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         """Begin a batch of episodes."""
         self._rngs = [

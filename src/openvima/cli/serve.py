@@ -1,0 +1,84 @@
+"""`openvima serve`: let a policy be scored over the network, or from programs in other languages."""
+
+import logging
+import os
+import sys
+from typing import Annotated
+
+import tyro
+
+
+def main(
+    policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")],
+    *,
+    port: int = 8000,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    name: str | None = None,
+    device: str = "cpu",
+    threads: int = 1,
+    max_connections: int = 16,
+    max_episodes: int = 256,
+    max_message_mb: int = 128,
+    idle_s: float = 600.0,
+) -> int:
+    """Serve a policy until Ctrl-C; `openvima evaluate --policy ws://HOST:PORT` scores it.
+
+    Messages are MessagePack with arrays over a WebSocket; docs/serving.md describes them for programs in
+    other languages. Several clients may use the policy at once, each with episodes of its own.
+
+    Example: openvima serve runs/first --port 8000
+
+    Args:
+        policy: The folder of a training run, a published file, an id on the Hugging Face Hub, a preset,
+            random or untrained.
+        port: TCP port; 0 takes a free one. The address is printed once the server answers.
+        host: Interface to listen on. Any but the loopback interface needs a token.
+        token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,
+            which, unlike an option, other users of this machine do not see. Clients read it from there, too.
+        name: Name that clients are told; by default that of the folder or file.
+        device: Where a network computes: cpu, in float64, or cuda, in float32.
+        threads: Threads that a network computes with on the cpu. More than one are faster for large networks,
+            and may change the last bits of what it gives.
+        max_connections: Clients at the same time; `openvima evaluate` has one for each worker.
+        max_episodes: Episodes that a client plays at once.
+        max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
+        idle_s: Seconds after which a client is dropped that sends nothing.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.evaluation.protocol import policy_sources
+    from openvima.evaluation.versions import versions
+    from openvima.policies import load_policy
+    from openvima.serving import ServerConfig, serve
+    from openvima.serving.packing import require_extra
+    from openvima.serving.protocol import TOKEN_VARIABLE
+
+    require_extra()  # before the seconds that loading takes
+    config = ServerConfig(
+        host=host,
+        port=port,
+        token=token or os.environ.get(TOKEN_VARIABLE) or None,
+        max_message_bytes=max_message_mb * 2**20,
+        max_episodes=max_episodes,
+        max_connections=max_connections,
+        idle_s=idle_s,
+        num_threads=threads,
+    )
+    (source,) = policy_sources([f"{name}={policy}" if name else policy])
+    loaded = load_policy(policy, device=device)
+    found = versions(with_torch=source.kind != "random")
+    about = {
+        "policy": {"name": source.name, **source.record(), "device": device},
+        "versions": {
+            package: found[package] for package in ("openvima", "numpy", "torch") if package in found
+        },
+    }
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
+    try:
+        serve(loaded, config, about=about, ready=lambda url: print(url, flush=True))
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    return 0

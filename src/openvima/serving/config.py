@@ -1,0 +1,68 @@
+"""Settings of a policy server."""
+
+import ipaddress
+from dataclasses import dataclass, field
+
+from openvima.errors import ConfigError
+from openvima.serving.packing import MAX_LENGTH
+from openvima.serving.protocol import TOKEN_VARIABLE, check_token
+
+
+@dataclass(frozen=True, slots=True)
+class ServerConfig:
+    """Where a policy is served, and what its clients may ask for.
+
+    Args:
+        host: Interface to listen on. Any but the loopback interface needs a token.
+        port: TCP port; 0 takes a free one.
+        token: Clients must know it. None lets in everyone who reaches the port.
+        max_message_bytes: Size of the largest message. A prompt image takes 0.26 MB, and so does an
+            observation; 128 MiB are enough for batches of 64 episodes.
+        max_episodes: Episodes of the largest batch.
+        max_connections: Clients at the same time.
+        idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
+            answer.
+        num_threads: Threads that a network computes with. One gives the last bits of `openvima evaluate`.
+
+    Raises:
+        ConfigError: A setting is out of its range, or the server would be open to others without a token.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8000
+    token: str | None = field(default=None, repr=False)
+    max_message_bytes: int = 128 * 2**20
+    max_episodes: int = 256
+    max_connections: int = 16
+    idle_s: float = 600.0
+    num_threads: int = 1
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value:g}; it must lie within {least:,} and {most:,}."
+            for name, value, least, most in (
+                ("port", self.port, 0, 65535),
+                ("max_message_bytes", self.max_message_bytes, 1024, 2**32),
+                ("max_episodes", self.max_episodes, 1, MAX_LENGTH),
+                ("max_connections", self.max_connections, 1, 10_000),
+                ("idle_s", self.idle_s, 0.01, 10**6),
+                ("num_threads", self.num_threads, 1, 1024),
+            )
+            if not least <= value <= most
+        ]
+        if self.token is None and not is_loopback(self.host):
+            problems.append(
+                f"host is {self.host!r}, which other machines may reach; give a token with --token or "
+                f"{TOKEN_VARIABLE}, or serve on 127.0.0.1 and let clients in through `ssh -L`."
+            )
+        if problems:
+            raise ConfigError(" ".join(problems))
+        check_token(self.token)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address is certain to mean this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,228 @@
+"""What a policy server and its clients say to each other; docs/serving.md tells it for other languages."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from openvima.errors import ConfigError, MessageError
+from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+
+# The number counts versions that do not understand each other: whatever is added, removed or changes its
+# meaning makes a new one, as both sides refuse what they do not know.
+PROTOCOL = "openvima-policy/1"
+TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
+SCHEMES = ("ws://", "wss://")
+
+_KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
+_RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
+
+
+def is_remote(source: str) -> bool:
+    """Whether the name of a policy is the address of a server."""
+    return source.startswith(SCHEMES)
+
+
+def check_token(token: str | None) -> None:
+    """Check that a token can be sent in a header.
+
+    Raises:
+        ConfigError: It is empty, or holds spaces or other than plain characters.
+    """
+    if token is not None and not (token and token.isascii() and token.isprintable() and " " not in token):
+        raise ConfigError("the token must be of printable ASCII characters without spaces, and not empty.")
+
+
+def encode_prompt(prompt: RenderedPrompt) -> dict[str, Any]:  # Any: plain values and arrays
+    """Turn a prompt into plain values and arrays."""
+    return {"text": prompt.text, "images": [_encode_image(image) for image in prompt.images.values()]}
+
+
+def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
+    """Read a prompt out of a message.
+
+    Args:
+        message: What was sent.
+        where: How to name it in errors.
+
+    Raises:
+        MessageError: It is no prompt; the message says what is wrong.
+    """
+    fields = _map(message, where, required=("text",), optional=("images",))
+    text = _typed(fields["text"], str, f"{where}: text")
+    images = [
+        _decode_image(image, f"{where}: image {number}")
+        for number, image in enumerate(_typed(fields.get("images", []), list, f"{where}: images"))
+    ]
+    by_name = {image.name: image for image in images}
+    if len(by_name) < len(images):
+        raise MessageError(f"{where}: two images have one name; each placeholder has one image.")
+    return RenderedPrompt(text, by_name)
+
+
+def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:  # Any: see `encode_prompt`
+    """Turn an observation (`rgb`, `segm`, `ee`) into plain values and arrays; None stays None."""
+    if observation is None:
+        return None
+    views = {part: dict(observation[part]) for part in ("rgb", "segm") if part in observation}
+    return {**views, "ee": int(observation["ee"])}
+
+
+def decode_observation(message: object, where: str = "observation") -> dict[str, Any] | None:
+    """Read an observation out of a message; None stands for an episode that has ended.
+
+    Args:
+        message: What was sent.
+        where: How to name it in errors.
+
+    Raises:
+        MessageError: It is no observation; the message says what is wrong.
+    """
+    if message is None:
+        return None
+    fields = _map(message, where, required=("rgb", "ee"), optional=("segm",))
+    _check_views(fields, where)
+    if type(fields["ee"]) is not int:  # a bool is no number of a tool
+        raise MessageError(f"{where}: ee is {_shown(fields['ee'])}; it must be a whole number.")
+    return fields
+
+
+def encode_action(action: Mapping | None) -> dict[str, np.ndarray] | None:
+    """Turn an action into arrays; None stays None."""
+    return None if action is None else {str(key): np.asarray(value) for key, value in action.items()}
+
+
+def decode_action(message: object, where: str = "action") -> dict[str, np.ndarray] | None:
+    """Read an action out of a message. Whether it is one that can be done, the environment says.
+
+    Args:
+        message: What was sent.
+        where: How to name it in errors.
+
+    Raises:
+        MessageError: It is no map of arrays.
+    """
+    if message is None:
+        return None
+    for key, value in _typed(message, dict, where).items():
+        _typed(value, np.ndarray, f"{where}: {_shown(key)}")
+    return message  # type: ignore[return-value]  # checked
+
+
+def read_request(message: object, kind: str, field: str, max_length: int) -> list:
+    """Take the list out of a request or reply.
+
+    Args:
+        message: What was sent: {"type": kind, field: [...]}.
+        kind: The type that it has, which was looked at before.
+        field: Name of the list.
+        max_length: Entries that it may have at most.
+
+    Raises:
+        MessageError: The list is missing or too long, or there is something else.
+    """
+    fields = _map(message, kind, required=("type", field), optional=("protocol",))
+    values = _typed(fields[field], list, f"{kind}: {field}")
+    if len(values) > max_length:
+        raise MessageError(f"{kind} has {len(values)} {field}; at most {max_length} are allowed.")
+    return values
+
+
+def check_protocol(protocol: object, *, theirs: str, ours: str) -> None:
+    """Check that both sides speak the same version of the protocol.
+
+    Args:
+        protocol: What the other side says that it speaks.
+        theirs: How to name the other side in the error.
+        ours: How to name this side.
+
+    Raises:
+        MessageError: It is another one, or none that is known.
+    """
+    if protocol != PROTOCOL:
+        raise MessageError(
+            f"{theirs} speaks {_shown(protocol)}, {ours} {PROTOCOL!r}; use versions of openvima that speak "
+            "the same on both sides."
+        )
+
+
+def type_of(message: object) -> object:
+    """The type of a request or reply; None where it names none."""
+    return message.get("type") if isinstance(message, dict) else None
+
+
+def _encode_image(image: PromptImage) -> dict[str, Any]:  # Any: see `encode_prompt`
+    records = [{key: getattr(record, key) for key in _RECORD_TYPES} for record in image.objects]
+    rgb, segm = dict(image.rgb), dict(image.segm)
+    return {"name": image.name, "kind": image.kind, "rgb": rgb, "segm": segm, "objects": records}
+
+
+def _decode_image(message: object, where: str) -> PromptImage:
+    fields = _map(message, where, required=("name", "kind", "rgb", "segm"), optional=("objects",))
+    name = _typed(fields["name"], str, f"{where}: name")
+    kind: Literal["object", "scene"] | None = next((k for k in _KINDS if k == fields["kind"]), None)
+    if kind is None:
+        raise MessageError(f"{where}: kind is {_shown(fields['kind'])}; allowed: {', '.join(_KINDS)}.")
+    _check_views(fields, where)
+    records = _typed(fields.get("objects", []), list, f"{where}: objects")
+    objects = tuple(_decode_record(record, f"{where}: object {n}") for n, record in enumerate(records))
+    return PromptImage(name, kind, fields["rgb"], fields["segm"], objects)
+
+
+def _decode_record(message: object, where: str) -> ObjectRecord:
+    fields = _map(message, where, required=tuple(_RECORD_TYPES))
+    for key, kind in _RECORD_TYPES.items():
+        _typed(fields[key], kind, f"{where}: {key}")
+    return ObjectRecord(**fields)
+
+
+def _check_views(fields: Mapping[str, Any], where: str) -> None:  # Any: what was sent
+    """Check `rgb` and `segm`: uint8 images of any size, which for one view is the same in both."""
+    sizes: dict[object, tuple[int, ...]] = {}
+    for part in (part for part in ("rgb", "segm") if part in fields):
+        for view, image in _typed(fields[part], dict, f"{where}: {part}").items():
+            array = _typed(image, np.ndarray, f"{where}: {part} {_shown(view)}")
+            lead = (3,) if part == "rgb" else ()
+            size = array.shape[len(lead) :]
+            whole = array.dtype == np.uint8 and len(size) == 2 and array.shape[: len(lead)] == lead
+            if not whole or sizes.setdefault(view, size) != size:
+                wanted = "(3, height, width)" if lead else "(height, width), as rgb has them"
+                raise MessageError(
+                    f"{where}: {part} {_shown(view)} is {array.dtype} {array.shape}; it must be uint8 "
+                    f"{wanted}."
+                )
+
+
+def _map(
+    message: object, where: str, *, required: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, Any]:  # Any: what was sent
+    """Check that something is a map with these entries and no others."""
+    fields = _typed(message, dict, where)
+    missing = [key for key in required if key not in fields]
+    unknown = [key for key in fields if key not in required + optional]
+    if missing or unknown:
+        problems = [*(["it lacks " + _listed(missing)] if missing else [])]
+        problems += [f"it has {_listed(unknown)}, which nobody knows"] if unknown else []
+        raise MessageError(f"{where}: {' and '.join(problems)}; entries: {', '.join(required + optional)}.")
+    return fields
+
+
+def _typed(value: object, kind: type, where: str) -> Any:  # Any: of type `kind`
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        names = {dict: "a map", list: "a list", str: "a text", int: "a whole number", np.ndarray: "an array"}
+        raise MessageError(f"{where} is {_shown(value)}; it must be {names[kind]}.")
+    return value
+
+
+def _listed(keys: Iterable[object]) -> str:
+    shown = [_shown(key) for key in keys]
+    return ", ".join(shown[:5]) + (" …" if len(shown) > 5 else "")
+
+
+def _shown(value: object) -> str:
+    """Name a value in an error: short, whatever was sent."""
+    if value is None or isinstance(value, bool | int | float):
+        return repr(value)
+    if isinstance(value, str | bytes):
+        return repr(value[:40])
+    return f"a {type(value).__name__}"
