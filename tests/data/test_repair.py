@@ -325,7 +325,7 @@ def test_the_command_says_what_it_did(folder: Path, capsys: pytest.CaptureFixtur
     words = ["data", "verify", str(folder), "--replay", "0", "--repair"]
     assert main(words) == 0
     shown = capsys.readouterr().out
-    assert f"1 problems before\n  {LAST}: it is missing" in shown
+    assert f"before: 1 problem\n  {LAST}: it is missing" in shown
     assert f"generated again\n  {LAST}" in shown
     assert "nothing is wrong" in shown
     (folder / LAST).unlink()

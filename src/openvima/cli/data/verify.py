@@ -69,7 +69,7 @@ def _number(replay: str) -> int | None:
 
 def _deeds(done: "Repair") -> Iterator[str]:
     """Say what a repair found and did."""
-    yield f"{len(done.before.problems)} problems before"
+    yield f"before: {_number_of_problems(done.before)}"
     yield from (f"  {problem.file}: {problem.cause}" for problem in done.before.problems)
     for deed, names in (
         ("generated again", done.made_anew),
@@ -89,7 +89,13 @@ def _findings(found: "Verification") -> Iterator[str]:
         f"hashes, {found.num_replayed:,} played again"
     )
     yield from (f"note: {note}" for note in found.notes)
-    yield "nothing is wrong" if found.is_clean else f"{len(found.problems)} problems"
+    yield _number_of_problems(found)
     for problem in found.problems:
         yield f"  {problem.file}: {problem.cause}"
     yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
+
+
+def _number_of_problems(found: "Verification") -> str:
+    if found.is_clean:
+        return "nothing is wrong"
+    return "1 problem" if len(found.problems) == 1 else f"{len(found.problems)} problems"
