@@ -18,7 +18,10 @@ class Env:
         self.end_effector = end_effector
         self.prompt = RenderedPrompt("Wait.", {})
         self.actions = []
-        self.episode = SimpleNamespace(num_redraws=2)
+        goals = (SimpleNamespace(object_id=5), SimpleNamespace(object_id=6))
+        problem = SimpleNamespace(goals=goals, oracle_first=(), num_required=None)
+        self.episode = SimpleNamespace(num_redraws=2, oracle_max_steps=1, problem=problem)
+        self.progress = SimpleNamespace(open_goals=(1,))
 
     def reset(self, seed):
         self.steps = 0
@@ -55,6 +58,9 @@ class Player:
     def decide(self, observations):
         self.asked.append([observation is not None for observation in observations])
         return [None if observation is None else self.decision for observation in observations]
+
+    def near_ties(self):
+        return ()
 
 
 def test_success_failure_and_step_limit_are_told_apart():

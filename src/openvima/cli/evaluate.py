@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -18,18 +18,24 @@ def main(
     policy: str,
     tasks: str = "all",
     levels: str = "L1,L2,L3,L4",
-    episodes: int = 50,
+    episodes: int = 200,
     seed: int = 0,
-    workers: int = 1,
+    workers: int | None = None,
     out: Path = Path("evaluation"),
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
+    controls: str = "",
+    boxes: str | None = None,
     batch: int = 16,
+    engine: Literal["processes", "ray"] = "processes",
+    address: str | None = None,
     videos: int = 1,
+    film: str = "",
     report: bool = True,
     force: bool = False,
     device: str = "cpu",
+    precision: Literal["float64", "float32", "bfloat16"] | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Score policies on tasks and levels, and write results.json and report.html.
@@ -37,25 +43,34 @@ def main(
     The numbers depend on neither the number of workers nor the machine's load. An interrupted evaluation
     goes on where it stopped.
 
-    Example: openvima evaluate --policy mine=runs/first,oracle,random --levels L1,L2 --workers 2
+    Example: openvima evaluate --policy mine=runs/first --controls all --levels L1,L2 --workers 2
 
     Args:
-        policy: One or more of oracle, random, untrained, presets, folders of training runs, published files
-            and ids on the Hugging Face Hub, with commas in between; NAME=FOLDER gives a folder another name.
+        policy: One or more of oracle, random, untrained, presets, folders of training runs, published files,
+            ids on the Hugging Face Hub and policy servers (ws://HOST:PORT, see `openvima serve`), with commas
+            in between; NAME=FOLDER and NAME=ws://… give another name.
         tasks: Names of tasks with commas in between, or all. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
-        episodes: Episodes for each policy, task and level.
+        episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
-        workers: Processes.
+        workers: Processes; by default one, or all processors of the Ray cluster at --address.
         out: Folder to write to.
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
         difficulty: easy, as for all published results, medium or hard.
+        controls: What to play besides, to show what the score is made of, with commas in between: no_prompt,
+            other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
+        boxes: Detector for detected_boxes: MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
         batch: Episodes that are played together; a policy decides for all of them at once.
+        engine: processes of this machine, or ray.
+        address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         videos: Solved episodes to film, and unsolved ones, of each trained policy and task.
+        film: Episodes to film besides, of every policy, with commas in between: TASK/SEED or TASK/LEVEL/SEED.
         report: Whether to film episodes and write report.html.
         force: Overwrite the results of another evaluation in that folder.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
+        precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
+            such episodes are listed as near_ties.
         as_json: Print the rows as JSON instead of a table.
 
     Returns:
@@ -78,13 +93,25 @@ def main(
         report=report,
         force=force,
         device=device,
+        precision=precision,
+        controls=_words(controls),
+        boxes=boxes,
+        film=_words(film),
+        engine=engine,
+        address=address,
     )
     with progress_bar("evaluation") as bar:
         path = evaluate(config, bar)
+    results = Results.read(path)
     if as_json:
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
     else:
-        print_results(Results.read(path))
+        print_results(results)
+    if num_near := sum(len(row.near_ties) for row in results.rows):
+        print(
+            f"Rounding may have decided {num_near} episodes; each row lists its own as near_ties.",
+            file=sys.stderr,
+        )
     print(
         f"Results: {path}" + (f"   Report: {path.with_name('report.html')}" if report else ""),
         file=sys.stderr,
@@ -97,17 +124,17 @@ def print_results(results: "Results") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    policies = results.policy_names()
-    means = {(mean.policy, mean.level): mean for mean in results.level_means()}
+    columns = list(dict.fromkeys((row.policy, row.control) for row in results.rows))
+    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
     table = Table("level", title="solved episodes in per cent (95 % interval)")
     table.add_column("task", overflow="fold", min_width=12)
-    for policy in policies:
-        table.add_column(policy, justify="right", no_wrap=True)
+    for policy, control in columns:
+        table.add_column(f"{policy}\n{control.replace('_', ' ')}".strip(), justify="right", no_wrap=True)
     for level in results.levels():
         for task in results.tasks(level):
-            rows = (results.row(policy, task, level) for policy in policies)
+            rows = (results.row(policy, task, level, control) for policy, control in columns)
             table.add_row(level, task, *(_cell(row.rate, row.interval) if row else "–" for row in rows))
-        level_means = (means.get((policy, level)) for policy in policies)
+        level_means = (means.get((*column, level)) for column in columns)
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
         table.add_row(level, "mean", *cells, style="bold", end_section=True)
     Console().print(table)

@@ -1,20 +1,29 @@
 """What follows an evaluation's results: films of a few episodes, and the report."""
 
 import importlib.util
+import re
 import shlex
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from openvima.errors import MissingExtraError
+from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation.clips import Clip, load_clips, png, save_clips
-from openvima.evaluation.protocol import DEFAULT_BATCH, Batch, EvaluationConfig, PolicySource, policy_sources
+from openvima.evaluation.protocol import (
+    DEFAULT_BATCH,
+    DEFAULT_DEVICE,
+    Batch,
+    EvaluationConfig,
+    PolicySource,
+    cells,
+)
 from openvima.evaluation.results import Results, Row
 from openvima.processes import in_processes
 
 REPORT_NAME = "report.html"
 _METRICS = "metrics.jsonl"  # what a training run writes into its folder
+_EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +32,11 @@ class FilmJob:
 
     batch: Batch
     fingerprint: str
+
+    @property
+    def episode(self) -> tuple[str, str, str, int]:
+        """Policy, task, level and seed."""
+        return self.batch.policy, self.batch.task, self.batch.level, self.batch.first_seed
 
 
 def require_extra() -> None:
@@ -52,24 +66,56 @@ def finish(config: EvaluationConfig, results: Results, note: Callable[[str], Non
     """
     from openvima.evaluation.report import write_report
 
-    clips = load_clips(config.out)
     jobs = film_jobs(config, results)
-    if not clips and jobs:
-        filmed = {}
-        for job, clip in in_processes(film, jobs, config.workers):
-            filmed[job] = clip
-            if note is not None:
-                note(f"filmed {len(filmed)} of {len(jobs)}")
-        clips = [filmed[job] for job in jobs]
-        save_clips(clips, config.out)
-    sources = policy_sources(config.policies)
+    clips = _filmed(jobs, config, note)
     return write_report(
         results,
         config.out / REPORT_NAME,
         command=command_of(config),
-        metrics=find_metrics(sources),
+        metrics=find_metrics(config.sources),
         clips=clips,
     )
+
+
+def _filmed(
+    jobs: Sequence[FilmJob], config: EvaluationConfig, note: Callable[[str], None] | None
+) -> list[Clip]:
+    """Film the episodes that were not filmed before."""
+    clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
+    missing = [job for job in jobs if job.episode not in clips]
+    for number, (job, clip) in enumerate(in_processes(film, missing, config.workers or 1), 1):
+        clips[job.episode] = clip
+        if note is not None:
+            note(f"filmed {number} of {len(missing)}")
+    wanted = [clips.pop(job.episode) for job in jobs]
+    found = [*wanted, *clips.values()]  # those of an earlier command stay
+    if missing:
+        save_clips(found, config.out)
+    return found
+
+
+def chosen_episodes(config: EvaluationConfig) -> list[tuple[str, str, int]]:
+    """Read the episodes that `config.film` names: task, level, seed.
+
+    Raises:
+        ConfigError: A name cannot be read, or the episode is not played.
+    """
+    played = cells(config)
+    chosen = []
+    for text in config.film:
+        found = _EPISODE.fullmatch(text)
+        if found is None:
+            raise ConfigError(f"film is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3.")
+        task, wanted, seed = found[1], found[2], int(found[3])
+        level = next((level for name, level in played if name == task and wanted in (None, level)), None)
+        last = config.seed + config.episodes - 1
+        if level is None or not config.seed <= seed <= last:
+            raise ConfigError(
+                f"film is {text!r}, which is not played; tasks and levels are those of this evaluation, and "
+                f"seeds {config.seed} to {last}."
+            )
+        chosen.append((task, level, seed))
+    return chosen
 
 
 def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
@@ -77,10 +123,10 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
 
     Of each task at the first level that holds it: the first `config.videos` solved episodes of every trained
     policy and of the oracle, and as many unsolved ones of trained policies. Where there are neither trained
-    policies nor the oracle, of all policies.
+    policies nor the oracle, of all policies. And the episodes that were chosen by hand, of every policy.
     """
-    sources = policy_sources(config.policies)
-    worth = [source for source in sources if source.kind in ("run", "oracle")] or sources
+    sources = config.sources
+    worth = [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources
     jobs = []
     for source in worth:
         for task in results.tasks():
@@ -90,7 +136,13 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
                 seeds = _seeds_to_film(row, config.videos, unsolved=source.kind != "oracle")
                 fingerprint = str(results.policies.get(source.name))
                 jobs += [FilmJob(_single(row, source, seed, config), fingerprint) for seed in seeds]
-    return jobs
+    for source in sources:
+        for task, level, seed in chosen_episodes(config):
+            row = results.row(source.name, task, level)
+            if row is not None:
+                fingerprint = str(results.policies.get(source.name))
+                jobs.append(FilmJob(_single(row, source, seed, config), fingerprint))
+    return list(dict.fromkeys(jobs))
 
 
 def film(job: FilmJob, count: Callable[[int], None]) -> Clip:
@@ -137,6 +189,10 @@ def command_of(config: EvaluationConfig) -> str:
         f"--seed {config.seed}",
         *config.setup.words(),
         *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
+        *([f"--controls {','.join(config.controls)}"] if config.controls else []),
+        *([f"--boxes {shlex.quote(config.boxes)}"] if config.boxes else []),
+        *([] if config.device == DEFAULT_DEVICE else [f"--device {config.device}"]),
+        *([f"--precision {config.precision}"] if config.precision else []),
         "--out DIR",
     ]
     return " ".join(words)
@@ -159,4 +215,14 @@ def _seeds_to_film(row: Row, number: int, *, unsolved: bool) -> list[int]:
 
 
 def _single(row: Row, source: PolicySource, seed: int, config: EvaluationConfig) -> Batch:
-    return Batch(row.policy, source.source, row.task, row.level, seed, 1, config.setup)
+    return Batch(
+        row.policy,
+        source.source,
+        row.task,
+        row.level,
+        seed,
+        1,
+        config.setup,
+        device=config.device,
+        precision=config.precision or "",
+    )

@@ -7,8 +7,12 @@ from typing import Any, Protocol
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
+from openvima.evaluation.boxes import load_finder
+from openvima.evaluation.controls import Sight, sight
 from openvima.evaluation.protocol import ORACLE, Batch
 from openvima.scene import Action
+from openvima.serving.client import RemotePolicy
+from openvima.serving.protocol import is_remote
 
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Decision = Mapping[str, Any] | Action | OracleError | None
@@ -28,6 +32,10 @@ class Player(Protocol):
         """
         ...
 
+    def near_ties(self) -> Sequence[bool]:
+        """Say of each environment whether rounding may have chosen its last action; empty if not known."""
+        ...
+
 
 class OraclePlayer:
     """The scripted oracle, which knows the scene."""
@@ -44,24 +52,37 @@ class OraclePlayer:
         pairs = zip(self._envs, observations, strict=True)
         return [None if observation is None else _oracle(env) for env, observation in pairs]
 
+    def near_ties(self) -> Sequence[bool]:
+        """Say nothing: the oracle does not weigh scores."""
+        return ()
+
 
 class PolicyPlayer:
     """A policy, which sees prompts and observations only.
 
     Args:
         policy: Follows the `Policy` protocol of `openvima.policies`.
+        control: What is taken from it, one of `openvima.evaluation.controls`; empty for nothing.
     """
 
-    def __init__(self, policy: Any) -> None:  # Any: policies of third parties need no base class
+    def __init__(self, policy: Any, control: str = "") -> None:  # Any: third parties need no base class
         self._policy = policy
+        self._control = control
+        self._sights: list[Sight] = []
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Tell the policy the prompts."""
-        self._policy.reset([env.prompt for env in envs])
+        self._sights = [sight(env, self._control) for env in envs]
+        self._policy.reset([seen.prompt for seen in self._sights])
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Let the policy act."""
-        return self._policy.act(observations)
+        pairs = zip(self._sights, observations, strict=True)
+        return self._policy.act([None if image is None else seen.observation(image) for seen, image in pairs])
+
+    def near_ties(self) -> Sequence[bool]:
+        """Say what the policy says, if it knows, as `NetworkPolicy` does."""
+        return getattr(self._policy, "near_ties", ())
 
 
 def load_player(batch: Batch, fingerprint: str = "") -> Player:
@@ -75,16 +96,19 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
     Raises:
         UnknownPolicyError: There is no such policy or run folder.
         CheckpointError: The checkpoint is damaged.
+        ConfigError: There is no such detector.
+        ServerError: No policy server answers at the address.
     """
     if batch.source == ORACLE:
         return OraclePlayer()
-    return PolicyPlayer(_load_policy(batch.source, fingerprint, batch.device))
+    policy = _load_policy(batch.source, fingerprint, batch.device, batch.precision, batch.boxes)
+    return PolicyPlayer(policy, batch.control)
 
 
 @contextmanager
 def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    if batch.source in ("oracle", "random"):  # no network
+    if batch.source in ("oracle", "random") or is_remote(batch.source):  # no network, or not here
         yield
         return
     from openvima.policies.base import require_torch
@@ -101,10 +125,21 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 
 @lru_cache(maxsize=1)
-def _load_policy(source: str, fingerprint: str, device: str) -> Any:  # Any: see `PolicyPlayer`
+def _load_policy(
+    source: str, fingerprint: str, device: str, precision: str, boxes: str
+) -> Any:  # Any: see `PolicyPlayer`
     from openvima.policies import load_policy
 
-    return load_policy(source, device=device)
+    if is_remote(source):
+        return RemotePolicy(source)
+    options: dict[str, Any] = {"device": device}  # Any: of several kinds
+    if precision:
+        import torch
+
+        options["dtype"] = getattr(torch, precision)
+    if boxes:
+        options["finder"] = load_finder(boxes)
+    return load_policy(source, **options)
 
 
 def _oracle(env: TabletopEnv) -> Action | OracleError:

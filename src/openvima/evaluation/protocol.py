@@ -7,21 +7,32 @@ take whole batches, so their number changes neither the batches nor the results.
 import hashlib
 import json
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlsplit
 
+from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
+from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES
 from openvima.policies.base import find_checkpoint
 from openvima.policies.hub import is_hub_id
 from openvima.policies.presets import PRESETS
+from openvima.serving.client import describe
+from openvima.serving.protocol import is_remote
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
 ORACLE = "oracle"
-NAMED_POLICIES = (ORACLE, "random", "untrained")
+RANDOM = "random"
+NAMED_POLICIES = (ORACLE, RANDOM, "untrained")
+POLICY_CONTROLS = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
+DEFAULT_EPISODES = 200  # as in the published tables
+PRECISIONS = ("float64", "float32", "bfloat16")
+Engine = Literal["processes", "ray"]
 DEFAULT_DEVICE = "cpu"
 DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
@@ -33,13 +44,15 @@ class EvaluationConfig:
 
     Args:
         policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: a preset, a run
-            folder, a published file, an id on the Hugging Face Hub. A folder can be given a name as
-            "name=path", by default it has its own.
+            folder, a published file, an id on the Hugging Face Hub; or the address of a policy server such as
+            "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by default it has
+            its own.
         tasks: Names of tasks, or ("all",) for every task that the level holds.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
-        workers: Processes; the results do not depend on their number.
+        workers: Processes; the results do not depend on their number. None means one, or as many as the Ray
+            cluster at `address` has processors.
         out: Folder to write to.
         setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         batch: Episodes that are played together, so that a policy decides for all of them at once.
@@ -48,14 +61,28 @@ class EvaluationConfig:
         force: Overwrite results of another evaluation in `out`.
         device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
             float64, does the division into batches not change what they decide.
+        precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a processor, float32
+            elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
+        controls: What to play besides, to show what a score is made of: names of
+            `openvima.evaluation.controls.CONTROLS`, of which each policy that reads prompts plays all;
+            "random" and "oracle", which then are played too; or ("all",).
+        boxes: For the control "detected_boxes": "module:function" or "file.py:function", which makes the
+            `ObjectFinder` to plug in. "all" takes this control in only where boxes are given.
+        film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
+            levels that holds the task, or "task/level/seed".
+        engine: "processes" of this machine, or "ray".
+        address: Ray cluster; None starts Ray on this machine. See `openvima.cluster`.
+
+    Raises:
+        ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
     """
 
     policies: tuple[str, ...]
     tasks: tuple[str, ...] = ("all",)
     levels: tuple[str, ...] = ("L1", "L2", "L3", "L4")
-    episodes: int = 50
+    episodes: int = DEFAULT_EPISODES
     seed: int = 0
-    workers: int = 1
+    workers: int | None = None
     out: Path = Path("evaluation")
     setup: Setup = DEFAULT_SETUP
     batch: int = DEFAULT_BATCH
@@ -63,6 +90,12 @@ class EvaluationConfig:
     report: bool = True
     force: bool = False
     device: str = DEFAULT_DEVICE
+    precision: str | None = None
+    controls: tuple[str, ...] = ()
+    boxes: str | None = None
+    film: tuple[str, ...] = ()
+    engine: Engine = "processes"
+    address: str | None = None
 
     def __post_init__(self) -> None:
         problems = [
@@ -74,7 +107,7 @@ class EvaluationConfig:
                 ("batch", self.batch, 1),
                 ("videos", self.videos, 0),
             )
-            if value < least
+            if value is not None and value < least
         ]
         if self.seed + self.episodes - 1 > MAX_SEED:
             problems.append(f"seed is {self.seed}; seeds of all episodes must lie within 0 to 2**63 - 1.")
@@ -83,13 +116,55 @@ class EvaluationConfig:
             for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
             if not values
         ]
-        if problems:
+        if problems := [*problems, *self._unknown_names(), *self._contradictions()]:
             raise ConfigError(" ".join(problems))
+
+    def _unknown_names(self) -> Iterator[str]:
+        allowed = ("all", *CONTROLS, *POLICY_CONTROLS)
+        yield from (unknown_name("control", name, allowed) for name in self.controls if name not in allowed)
+        if self.precision is not None and self.precision not in PRECISIONS:
+            yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
+        if self.engine not in ("processes", "ray"):
+            yield f"engine is {self.engine!r}; allowed are processes and ray."
+
+    def _contradictions(self) -> Iterator[str]:
+        if self.address is not None and self.engine == "processes":
+            yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
+        if DETECTED_BOXES in self.controls and self.boxes is None:
+            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, as MODULE:FUNCTION."
+        if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.controls):
+            yield f"boxes is {self.boxes!r}, which only the control {DETECTED_BOXES} plugs in; ask for it."
+        if self.film and not self.report:
+            yield "film names episodes, but no report is asked for; films are part of it."
+
+    @property
+    def sources(self) -> "tuple[PolicySource, ...]":
+        """The policies that are played, those that the controls add last.
+
+        Raises:
+            ConfigError: As for `policy_sources`.
+        """
+        given = policy_sources(self.policies)
+        asked = POLICY_CONTROLS if "all" in self.controls else self.controls
+        there = {source.source for source in given}
+        added = [name for name in POLICY_CONTROLS if name in asked and name not in there]
+        return policy_sources((*self.policies, *added)) if added else given
+
+    def controls_of(self, source: "PolicySource") -> tuple[str, ...]:
+        """Return the controls under which a policy is played, besides the plain score.
+
+        Oracle and random policy read no prompts, and a policy server finds its objects by itself.
+        """
+        if source.kind in (ORACLE, RANDOM):
+            return ()
+        asked = CONTROLS if "all" in self.controls else self.controls
+        usable = self.boxes is not None and source.kind != "remote"
+        return tuple(name for name in CONTROLS if name in asked and (name != DETECTED_BOXES or usable))
 
     def record(self) -> dict[str, object]:
         """Settings that the results depend on, as plain JSON values; no paths, workers or videos."""
         return {
-            "policies": [source.name for source in policy_sources(self.policies)],
+            "policies": [source.name for source in self.sources],
             "tasks": list(self.tasks),
             "levels": list(self.levels),
             "episodes": self.episodes,
@@ -98,6 +173,9 @@ class EvaluationConfig:
             "batch": self.batch,
             **self.setup.record(),
             **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
+            **({"precision": self.precision} if self.precision else {}),
+            **({"controls": list(self.controls)} if self.controls else {}),
+            **({"boxes": self.boxes} if self.boxes else {}),
         }
 
 
@@ -107,7 +185,8 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset, or what else `load_policy` takes.
+        source: "oracle", "random", "untrained", the name of a preset, what else `load_policy` takes, or the
+            address of a policy server.
     """
 
     name: str
@@ -115,18 +194,23 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset's name) or "run" (all else)."""
+        """What it is: "oracle", "random", "untrained" (also for a preset), "remote" or "run" (all else)."""
+        if is_remote(self.source):
+            return "remote"
         if self.source in PRESETS:
             return "untrained"
         return self.source if self.source in NAMED_POLICIES else "run"
 
-    def record(self) -> dict[str, str]:
-        """What the policy is; for a trained one with a hash of its weights.
+    def record(self) -> dict[str, Any]:  # Any: plain values
+        """What the policy is; for a trained one with a hash of its weights, for a remote one what it says.
 
         Raises:
             UnknownPolicyError: There is no such run folder.
             CheckpointError: The run folder holds no weights.
+            ServerError: No policy server answers at the address.
         """
+        if self.kind == "remote":
+            return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "run":
             return {"kind": "run", "sha256": weights_hash(self.source)}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
@@ -140,7 +224,7 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     """
     sources = []
     for given in policies:
-        name, equals, source = given.partition("=")
+        name, equals, source = ("", "", given) if is_remote(given) else given.partition("=")
         sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
     if unfinished := [source.name for source in sources if not source.source]:
         raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
@@ -189,6 +273,9 @@ class Batch:
         episodes: How many.
         setup: As in `EvaluationConfig`.
         device: As in `EvaluationConfig`.
+        control: What is taken from the policy; empty for nothing.
+        precision: As in `EvaluationConfig`; empty for the policy's own.
+        boxes: What makes the detector; empty for boxes of the segmentation.
     """
 
     policy: str
@@ -199,6 +286,9 @@ class Batch:
     episodes: int
     setup: Setup = DEFAULT_SETUP
     device: str = DEFAULT_DEVICE
+    control: str = ""
+    precision: str = ""
+    boxes: str = ""
 
     @property
     def seeds(self) -> range:
@@ -209,10 +299,21 @@ class Batch:
         """Name for the batch's stored outcomes: changes with anything that they depend on.
 
         Args:
-            fingerprint: Text that stands for the policy's weights and the package's version.
+            fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
         """
-        content = json.dumps([asdict(self), fingerprint], sort_keys=True)
+        content = json.dumps([{**asdict(self), "source": ""}, fingerprint], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:24]
+
+    def with_whole_paths(self) -> "Batch":
+        """Return the batch for a process with another working directory."""
+        source, assets, boxes = self.source, self.setup.assets, self.boxes
+        if PolicySource(self.policy, source).kind == "run" and Path(source).exists():
+            source = str(Path(source).absolute())
+        if assets not in ASSET_PACKS:
+            assets = str(Path(assets).expanduser().absolute())
+        if ".py:" in boxes:
+            boxes = str(Path(boxes).absolute())
+        return replace(self, source=source, setup=replace(self.setup, assets=assets), boxes=boxes)
 
 
 def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
@@ -246,23 +347,39 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
 
 
 def plan(config: EvaluationConfig) -> list[Batch]:
-    """Divide an evaluation into batches: by policy, level and task, then by `config.batch` seeds."""
+    """Divide an evaluation into batches: by policy, control, level and task, then by `config.batch` seeds.
+
+    Raises:
+        ConfigError: A control fits none of the policies.
+    """
+    played = [(source, control) for source in config.sources for control in ("", *config.controls_of(source))]
+    asked = [name for name in config.controls if name in CONTROLS]
+    if useless := [name for name in asked if name not in {control for _, control in played}]:
+        raise ConfigError(
+            f"control {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "
+            "that reads prompts, or leave the control out."
+        )
     return [
         Batch(
-            policy=policy.name,
-            source=policy.source,
+            policy=source.name,
+            source=source.source,
             task=task,
             level=level,
             first_seed=config.seed + offset,
             episodes=min(config.batch, config.episodes - offset),
             setup=config.setup,
             device=config.device,
+            control=control,
+            precision=config.precision or "",
+            boxes=(config.boxes or "") if control == DETECTED_BOXES else "",
         )
-        for policy in policy_sources(config.policies)
+        for source, control in played
         for task, level in cells(config)
         for offset in range(0, config.episodes, config.batch)
     ]
 
 
 def _default_name(source: str) -> str:
+    if is_remote(source):
+        return re.sub(r"[^\w.-]+", "-", urlsplit(source).netloc).strip("-")
     return source if source in NAMED_POLICIES else Path(source).name

@@ -9,6 +9,7 @@ from openvima.evaluation.players import Decision, Player
 from openvima.evaluation.results import EpisodeOutcome, failure_kind
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
+WRONG_PICKED = "only wrong objects were picked up within the step limit"
 OUT_OF_STEPS = "not done within the step limit"
 BAD_ACTION = "invalid action"
 NO_ORACLE_ACTION = "the oracle has no action"
@@ -21,7 +22,8 @@ class _Seat:
         self.env = env
         self.seed = seed
         self.steps = 0
-        self.has_grasped = False
+        self.grasped: set[int] = set()
+        self.near_ties = 0
         self.outcome: EpisodeOutcome | None = None
         self.observation: dict[str, Any] | None = env.reset(seed=seed)[0]  # None once the episode is over
 
@@ -36,24 +38,42 @@ class _Seat:
         except ActionError as error:
             return self._end(str(error), BAD_ACTION)
         self.steps += 1
-        self.has_grasped |= info["grasped"] != 0
+        self.grasped |= {info["grasped"]} - {0}
         if info["success"]:
             self.observation, self.outcome = None, self._outcome(True)
         elif terminated:
             self._end(info["reason"], failure_kind(info["reason"]))
         elif truncated:
-            picks = info["end_effector"] == "suction"
-            reason = NOTHING_PICKED if picks and not self.has_grasped else OUT_OF_STEPS
-            self._end(reason, reason)
+            self._end(*self._why_not_done(info["end_effector"] == "suction"))
         return None
+
+    def _why_not_done(self, picks: bool) -> tuple[str, str]:
+        """Say what was lacking at the end of the steps, with numbers and without."""
+        if picks and not self.grasped:
+            return NOTHING_PICKED, NOTHING_PICKED
+        problem = self.env.episode.problem
+        right = {goal.object_id for goal in (*problem.goals, *problem.oracle_first)}
+        if picks and not self.grasped & right:
+            return WRONG_PICKED, WRONG_PICKED
+        num_met = len(problem.goals) - len(self.env.progress.open_goals)
+        needed = problem.num_required or len(problem.goals)
+        return f"{OUT_OF_STEPS}: {num_met} of {needed} goals were met", OUT_OF_STEPS
 
     def _end(self, reason: str, kind: str) -> None:
         self.observation = None
         self.outcome = self._outcome(False, reason, kind)
 
     def _outcome(self, success: bool, reason: str = "", kind: str = "") -> EpisodeOutcome:
+        episode = self.env.episode
         return EpisodeOutcome(
-            self.seed, success, self.steps, reason, kind, redraws=self.env.episode.num_redraws
+            self.seed,
+            success,
+            self.steps,
+            reason,
+            kind,
+            redraws=episode.num_redraws,
+            oracle_max_steps=episode.oracle_max_steps,
+            near_ties=self.near_ties,
         )
 
 
@@ -84,8 +104,10 @@ def play(
         decisions = player.decide([seat.observation for seat in seats])
         if len(decisions) != len(seats):
             raise PolicyError(f"the policy gave {len(decisions)} actions for {len(seats)} observations.")
-        for seat, decision in zip(seats, decisions, strict=True):
+        near_ties = player.near_ties() or [False] * len(seats)
+        for seat, decision, is_near_tie in zip(seats, decisions, near_ties, strict=True):
             if seat.outcome is None:
+                seat.near_ties += is_near_tie
                 seat.step(decision)
                 if after_step is not None:
                     after_step(seat.env)

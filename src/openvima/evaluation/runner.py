@@ -3,17 +3,18 @@
 import json
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError
+from openvima.evaluation.boxes import finder_maker
 from openvima.evaluation.clips import FOLDER
-from openvima.evaluation.finish import finish, require_extra
+from openvima.evaluation.finish import chosen_episodes, finish, require_extra
 from openvima.evaluation.players import load_player, one_thread
-from openvima.evaluation.protocol import Batch, EvaluationConfig, plan, policy_sources
+from openvima.evaluation.protocol import Batch, EvaluationConfig, plan
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row
 from openvima.evaluation.versions import versions
 from openvima.files import write_whole
@@ -27,11 +28,14 @@ _PARTS = "parts"
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A batch to play, with what its outcomes depend on and where they go."""
+    """A batch to play, and what its outcomes depend on besides."""
 
     batch: Batch
     fingerprint: str
-    part: Path
+
+    def part(self, folder: Path) -> Path:
+        """Where the outcomes are kept until all are there."""
+        return folder / _PARTS / f"{self.batch.key(self.fingerprint)}.json"
 
 
 def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
@@ -49,12 +53,16 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
+        MissingExtraError: Something is not installed that networks, films or Ray need.
         WorkerError: A worker process died; what was finished is kept.
     """
     if config.report:
         require_extra()
+    if config.boxes is not None:
+        finder_maker(config.boxes)  # a mistake there is named before anything is played
     batches = plan(config)
-    policies = {source.name: source.record() for source in policy_sources(config.policies)}
+    chosen_episodes(config)
+    policies = {source.name: source.record() for source in config.sources}
     found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
@@ -90,37 +98,46 @@ def _earlier(
 def _play_all(
     config: EvaluationConfig,
     batches: Sequence[Batch],
-    policies: Mapping[str, Mapping[str, str]],
+    policies: Mapping[str, Mapping[str, Any]],
     found: Mapping[str, str],
     report: Report | None,
 ) -> dict[Batch, tuple[EpisodeOutcome, ...]]:
     """Play what has not been played yet."""
-    parts = config.out / _PARTS
-    parts.mkdir(parents=True, exist_ok=True)
+    (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # films of other results
-    jobs = []
-    for batch in batches:
-        fingerprint = json.dumps([policies[batch.policy], dict(found)], sort_keys=True)
-        jobs.append(Job(batch, fingerprint, parts / f"{batch.key(fingerprint)}.json"))
-    total, done = sum(batch.episodes for batch in batches), 0
-    outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
-    for job in jobs:
-        if (kept := _kept(job)) is not None:
-            outcomes[job.batch] = kept
-            done += job.batch.episodes
+    prints = {name: json.dumps([what, dict(found)], sort_keys=True) for name, what in policies.items()}
+    jobs = [Job(batch, prints[batch.policy]) for batch in batches]
+    kept = {job.batch: _kept(job, config.out) for job in jobs}
+    outcomes = {batch: played for batch, played in kept.items() if played is not None}
+    total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in outcomes)
     if report is not None:
         report(done, total, "")
-    todo = [job for job in jobs if job.batch not in outcomes]
-    for job, played in in_processes(play_batch, todo, config.workers):
+    for job, played in _played(config, [job for job in jobs if job.batch not in outcomes]):
+        records = [asdict(outcome) for outcome in played]
+        write_whole(job.part(config.out), json.dumps(records, ensure_ascii=False) + "\n")
         outcomes[job.batch] = played
         done += job.batch.episodes
         if report is not None:
-            report(done, total, f"{job.batch.policy} {job.batch.task} {job.batch.level}")
+            words = (job.batch.policy, job.batch.control, job.batch.task, job.batch.level)
+            report(done, total, " ".join(filter(None, words)))
     return outcomes
 
 
+def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tuple[EpisodeOutcome, ...]]]:
+    """Play batches with the engine that was asked for; yields them as they finish."""
+    if config.engine == "processes":
+        yield from in_processes(play_batch, jobs, config.workers or 1)
+        return
+    from openvima.cluster import on_cluster
+
+    sent = {Job(job.batch.with_whole_paths(), job.fingerprint): job for job in jobs}
+    workers = config.workers or (1 if config.address is None else None)
+    for job, played in on_cluster(play_batch, list(sent), workers, address=config.address):
+        yield sent[job], played
+
+
 def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, ...]:
-    """Play one batch and keep its outcomes; runs in a worker process."""
+    """Play one batch; runs in a worker process, maybe of another machine."""
     from openvima.evaluation.rollout import play
 
     batch = job.batch
@@ -129,14 +146,13 @@ def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, 
         envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         outcomes = tuple(play(envs, batch.seeds, player))
     count(len(outcomes))
-    write_whole(job.part, json.dumps([asdict(outcome) for outcome in outcomes], ensure_ascii=False) + "\n")
     return outcomes
 
 
-def _kept(job: Job) -> tuple[EpisodeOutcome, ...] | None:
+def _kept(job: Job, folder: Path) -> tuple[EpisodeOutcome, ...] | None:
     """Outcomes of a batch from an interrupted run; None if there are none, or no usable ones."""
     try:
-        records = json.loads(job.part.read_text(encoding="utf-8"))
+        records = json.loads(job.part(folder).read_text(encoding="utf-8"))
         outcomes = tuple(EpisodeOutcome(**record) for record in records)
     except (OSError, ValueError, TypeError):
         return None
@@ -144,13 +160,14 @@ def _kept(job: Job) -> tuple[EpisodeOutcome, ...] | None:
 
 
 def _rows(batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]) -> tuple[Row, ...]:
-    """Join the batches of each policy, task and level."""
-    joined: dict[tuple[str, str, str], list[EpisodeOutcome]] = {}
+    """Join the batches of each policy, control, task and level."""
+    joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
     for batch in batches:
-        joined.setdefault((batch.policy, batch.task, batch.level), []).extend(outcomes[batch])
+        cell = (batch.policy, batch.control, batch.task, batch.level)
+        joined.setdefault(cell, []).extend(outcomes[batch])
     return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played))
-        for (policy, task, level), played in joined.items()
+        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
+        for (policy, control, task, level), played in joined.items()
     )
 
 
@@ -160,7 +177,8 @@ def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> No
     record = {
         "episodes": episodes,
         "seconds": round(seconds, 3),
+        "engine": config.engine,
         "workers": config.workers,
-        "policies": {source.name: source.source for source in policy_sources(config.policies)},
+        "policies": {source.name: source.source for source in config.sources},
     }
     write_whole(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")

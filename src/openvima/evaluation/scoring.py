@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from openvima.evaluation.players import PolicyPlayer
-from openvima.evaluation.protocol import EvaluationConfig, plan
+from openvima.evaluation.protocol import DEFAULT_EPISODES, EvaluationConfig, plan
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.rollout import play
 from openvima.evaluation.versions import versions
@@ -16,7 +16,7 @@ def score(
     *,
     tasks: tuple[str, ...] = ("all",),
     levels: tuple[str, ...] = ("L1", "L2", "L3", "L4"),
-    episodes: int = 50,
+    episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
 ) -> Results:
     """Play the episodes of `openvima evaluate` with policies that exist as objects only.

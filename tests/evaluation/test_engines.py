@@ -1,0 +1,87 @@
+"""Who plays the batches does not change a byte of the results: processes, Ray, batches of another size."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from openvima.errors import ConfigError
+from openvima.evaluation import EvaluationConfig, Results, evaluate
+
+pytest.importorskip("torch")
+
+NETWORK = EvaluationConfig(
+    ("untrained",),
+    ("visual_manipulation", "rearrange"),
+    ("L1",),
+    episodes=4,
+    seed=7,
+    batch=2,
+    report=False,
+    controls=("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", "random"),
+)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return evaluate(replace(NETWORK, out=tmp_path_factory.mktemp("whole")))
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Path, workers: int) -> None:
+    assert evaluate(replace(NETWORK, out=tmp_path, workers=workers)).read_bytes() == whole.read_bytes()
+
+
+def test_ray_gives_the_same_bytes_and_is_stopped(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = pytest.importorskip("ray")
+    monkeypatch.chdir(tmp_path)
+    path = evaluate(replace(NETWORK, out=Path("here"), workers=2, engine="ray"))
+    assert path.read_bytes() == whole.read_bytes()
+    assert not ray.is_initialized()
+
+
+def test_batches_of_one_give_the_same_outcomes(whole: Path, tmp_path: Path) -> None:
+    single = Results.read(evaluate(replace(NETWORK, out=tmp_path, batch=1)))
+    assert single.rows == Results.read(whole).rows
+
+
+def test_each_control_has_rows_of_its_own(whole: Path) -> None:
+    results = Results.read(whole)
+    played = list(dict.fromkeys((row.policy, row.control) for row in results.rows))
+    assert played == [
+        ("untrained", ""),
+        *(("untrained", control) for control in NETWORK.controls[:4]),
+        ("random", ""),
+    ]
+    seeds = {tuple(outcome.seed for outcome in row.outcomes) for row in results.rows}
+    assert seeds == {(7, 8, 9, 10)}
+    assert results.config["controls"] == list(NETWORK.controls)
+
+
+def test_a_policy_that_looks_at_no_ids_plays_alike_with_shuffled_objects(whole: Path) -> None:
+    results = Results.read(whole)
+    for task in NETWORK.tasks:
+        plain, shuffled = (
+            results.row("untrained", task, "L1", control) for control in ("", "shuffled_objects")
+        )
+        assert plain is not None and shuffled is not None
+        assert shuffled.outcomes == plain.outcomes
+
+
+def test_an_address_without_a_cluster_is_refused_before_anything_is_played(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match="no Ray cluster answers"):
+        evaluate(replace(NETWORK, out=tmp_path, engine="ray", address="127.0.0.1:1"))
+
+
+def test_a_policy_server_gives_the_same_outcomes(whole: Path, tmp_path: Path) -> None:
+    pytest.importorskip("websockets")
+    pytest.importorskip("msgpack")
+    from openvima.policies import load_policy
+    from openvima.serving import serve_in_thread
+
+    with serve_in_thread(load_policy("untrained")) as address:
+        path = evaluate(replace(NETWORK, policies=(f"untrained={address}",), out=tmp_path))
+    assert Results.read(path).rows == Results.read(whole).rows
