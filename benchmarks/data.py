@@ -38,6 +38,7 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.records import package_versions
 from openvima.data.schema import ARRAYS, VIEWS
+from openvima.data.tokens.cache import open_tokens
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError, SamplingError
 from openvima.tasks import list_tasks
@@ -268,9 +269,26 @@ def anonymous_megabytes() -> float:
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon")), 0.0)
 
 
-def measure_tokens(folders: Sequence[Path]) -> Numbers:
-    """Measure the token cache of data folders: not done yet."""
-    return {}
+def measure_tokens(folders: Sequence[Path], num_rounds: int) -> Numbers:
+    """Make the token caches of data folders, and read their episodes in random order, the folders mixed."""
+    datasets = [Dataset(folder) for folder in folders]
+    making, caches = timed(lambda: [open_tokens(dataset) for dataset in datasets])
+    episodes = [(cache, number) for cache in caches for number in range(len(cache))]
+    order = np.random.default_rng(0).permutation(len(episodes)).tolist()
+    num_steps = sum(int(dataset.index.column("steps").to_numpy().sum()) for dataset in datasets)
+    times = []
+    for _ in range(num_rounds + 1):
+        seconds, _ = timed(
+            lambda: [len(cache[number].images) for cache, number in map(episodes.__getitem__, order)]
+        )
+        times.append(seconds)
+    num_bytes = sum(path.stat().st_size for cache in caches for path in cache.folder.iterdir())
+    return {
+        "episodes": len(episodes),
+        "bytes": round(num_bytes / len(episodes)),
+        "making_ms": round(1000 * making / len(episodes), 3),
+        "training_steps_per_s": round(num_steps / statistics.median(times[1:])),
+    }
 
 
 def measure_all(tasks: Sequence[str], num_episodes: int, num_rounds: int, folder: Path) -> Numbers:
@@ -373,7 +391,7 @@ def main() -> None:
         results = measure_all(tasks, num_episodes, options.rounds, folder)
         means = summary(results)
         means["memory"] = measure_memory(Dataset(folder / tasks[0]), 400 if options.quick else 4000)
-        means["tokens"] = measure_tokens([folder / task for task in tasks])
+        means["tokens"] = measure_tokens([folder / task for task in tasks], options.rounds)
     for key, value in means.items():
         print(f"{key}: {value}")
     if options.json:
