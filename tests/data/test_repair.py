@@ -195,6 +195,16 @@ def test_a_shard_that_comes_out_otherwise_replaces_nothing(
     assert contents(folder) == before
 
 
+def test_a_shard_that_was_damaged_before_it_was_listed_is_repaired_too(folder: Path, whole: Path) -> None:
+    flip(folder / FIRST, offset(folder, 0) + 10_000)
+    (folder / "dataset.json").unlink()
+    generate(GenerateConfig(out=folder, tasks=TASKS, episodes=3, shard_size=2, keep_failed=True))
+    problem, *_ = verify(folder, LOOK).problems
+    assert problem.file == FIRST
+    assert repair(folder, LOOK).after.is_clean
+    assert contents(folder) == contents(whole)
+
+
 def test_a_repair_that_is_stopped_changes_nothing_and_can_be_repeated(folder: Path, whole: Path) -> None:
     flip(folder / FIRST, 9000)
     before = contents(folder)

@@ -122,11 +122,7 @@ def make_anew(
         _write([_staged(block, staging) for block in blocks], settings.workers or 1, report)
         written = [name for name in sorted(names) if (staging / name).is_file()]
         for name in written:
-            if name in checksums and fingerprint(staging / name)["sha256"] != checksums[name]:
-                raise DatasetError(
-                    f"{settings.out / name} was generated again, but not with the bytes that the manifest "
-                    "tells. Nothing was changed."
-                )
+            _check_bytes(staging / name, settings.out / name, checksums.get(name))
         for name in written:
             (settings.out / name).parent.mkdir(exist_ok=True)
             os.replace(staging / name, settings.out / name)
@@ -139,6 +135,23 @@ def finish_anew(settings: GenerateConfig, versions: Mapping[str, str]) -> None:
     """Write indexes and manifests of a generated folder whose shards are all there."""
     blocks = [replace(b, info=replace(b.info, versions=dict(versions))) for b in plan(settings)]
     finish(settings, blocks)
+
+
+def _check_bytes(written: Path, place: Path, sha256: str | None) -> None:
+    """Refuse a shard that is not what it was.
+
+    One that is as the manifest says and yet damaged was damaged before it was listed: then nothing tells.
+
+    Raises:
+        DatasetError: Its bytes are others than the manifest says.
+    """
+    if sha256 is None or fingerprint(written)["sha256"] == sha256:
+        return
+    if not place.is_file() or fingerprint(place)["sha256"] != sha256:
+        raise DatasetError(
+            f"{place} was generated again, but not with the bytes that the manifest tells. "
+            "Nothing was changed."
+        )
 
 
 def _has_failed(folder: Path) -> bool:
