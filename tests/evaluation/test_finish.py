@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from openvima.errors import MissingExtraError
+from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation import EvaluationConfig, evaluate, finish
-from openvima.evaluation.protocol import PolicySource
+from openvima.evaluation.clips import load_clips
+from openvima.evaluation.sources import PolicySource
 
 
 def test_solved_episodes_are_filmed_and_of_trained_policies_unsolved_ones_too(results, monkeypatch):
@@ -31,6 +32,33 @@ def test_where_nobody_is_trained_all_are_filmed(results):
 
 def test_no_films_are_made_where_none_are_asked_for(results):
     assert finish.film_jobs(EvaluationConfig(("oracle",), videos=0), results) == []
+
+
+def test_episodes_chosen_by_name_are_filmed_of_every_policy(results):
+    settings = {"tasks": ("rotate",), "levels": ("L1", "L3"), "episodes": 10}
+    config = EvaluationConfig(
+        ("mine=runs/a", "oracle"), **settings, videos=0, film=("rotate/4", "rotate/L3/5")
+    )
+    assert [job.episode for job in finish.film_jobs(config, results)] == [
+        *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+        *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+    ]
+
+
+@pytest.mark.parametrize("text", ["rotate", "rotate/L1", "rotate/10", "twist/3", "rotate/L2/3", "rotate/-1"])
+def test_episodes_to_film_that_are_not_played_are_refused(text):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=10, film=(text,))
+    with pytest.raises(ConfigError, match=f"film is '{text}'"):
+        finish.chosen_episodes(config)
+
+
+def test_films_of_more_episodes_are_added_to_those_that_are_there(tmp_path):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=2, out=tmp_path, videos=0)
+    notes = []
+    evaluate(replace(config, film=("rotate/1",)))
+    evaluate(replace(config, film=("rotate/0",)), lambda done, total, note: notes.append(note))
+    assert notes == ["filmed 1 of 1"]
+    assert [clip.seed for clip in load_clips(tmp_path)] == [0, 1]
 
 
 def test_the_command_names_run_folders_and_what_differs_from_the_defaults():

@@ -29,6 +29,34 @@ def test_strict_successes_leave_out_those_slower_than_the_oracle_may_be():
     assert (row.successes, row.successes_strict) == (2, 1)
 
 
+def test_the_strict_limit_of_an_episode_goes_before_that_of_its_row():
+    row = Row("mine", "rotate", "L1", 1, (EpisodeOutcome(0, True, 3, oracle_max_steps=3),))
+    assert row.successes_strict == 1
+
+
+def test_rows_under_controls_stand_beside_the_plain_ones(results):
+    plain = results.rows[0]
+    under = Row("mine", "rotate", "L1", 1, plain.outcomes[5:], "no_prompt")
+    both = Results((*results.rows, under), results.config, results.versions, results.policies)
+    assert both.row("mine", "rotate", "L1") == plain
+    assert both.row("mine", "rotate", "L1", "no_prompt") == under
+    means = {(mean.policy, mean.level, mean.control): mean.mean for mean in both.level_means()}
+    assert means["mine", "L1", "no_prompt"] == pytest.approx(0.8)
+    assert means["mine", "L1", ""] == pytest.approx(0.75)
+    assert json.loads(both.to_json())["rows"][-1]["control"] == "no_prompt"
+
+
+def test_results_of_before_there_were_controls_are_read(results, tmp_path):
+    content = json.loads(results.to_json())
+    for row in content["rows"]:
+        del row["control"]
+        for outcome in row["outcomes"]:
+            del outcome["near_ties"], outcome["oracle_max_steps"]
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps(content))
+    assert Results.read(path).rows == results.rows
+
+
 def test_level_means_weigh_the_tasks_of_a_level_alike(results):
     means = {(mean.policy, mean.level): mean for mean in results.level_means()}
     assert means["mine", "L1"].mean == pytest.approx(0.75)

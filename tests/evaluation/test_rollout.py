@@ -6,7 +6,14 @@ import pytest
 
 from openvima.errors import ActionError, OracleError, PolicyError
 from openvima.evaluation.players import PolicyPlayer
-from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, NOTHING_PICKED, OUT_OF_STEPS, play
+from openvima.evaluation.rollout import (
+    BAD_ACTION,
+    NO_ORACLE_ACTION,
+    NOTHING_PICKED,
+    OUT_OF_STEPS,
+    WRONG_PICKED,
+    play,
+)
 from openvima.scene import RenderedPrompt
 
 
@@ -83,6 +90,23 @@ def test_the_player_is_asked_for_running_episodes_only():
 def test_an_episode_without_any_pick_is_counted_apart_with_the_suction_cup_only():
     cup, spatula = Env({}, {}), Env({}, {}, end_effector="spatula")
     assert [o.kind for o in play([cup, spatula], [0, 1], Player())] == [NOTHING_PICKED, OUT_OF_STEPS]
+
+
+def test_an_episode_in_which_only_other_objects_were_picked_is_counted_apart():
+    wrong, right = Env({"grasped": 9}, {}), Env({"grasped": 9}, {"grasped": 6})
+    outcomes = play([wrong, right], [0, 1], Player())
+    assert [o.kind for o in outcomes] == [WRONG_PICKED, OUT_OF_STEPS]
+    assert outcomes[1].reason == f"{OUT_OF_STEPS}: 1 of 2 goals were met"
+
+
+def test_outcomes_hold_the_strict_limit_and_the_decisions_that_rounding_may_have_made():
+    class Wavering(Player):
+        def near_ties(self):
+            return [True, len(self.asked) == 2]
+
+    outcomes = play([Env({}, {}, {"success": True}), Env({}, {}, {})], [0, 1], Wavering())
+    assert [o.near_ties for o in outcomes] == [3, 1]
+    assert {o.oracle_max_steps for o in outcomes} == {1}
 
 
 def test_an_impossible_action_fails_its_episode_alone():

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, UnknownPolicyError  # noqa: E402
-from openvima.evaluation.protocol import weights_hash  # noqa: E402
+from openvima.evaluation.sources import weights_hash  # noqa: E402
 from openvima.policies import Policy, RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.base import TOKENIZER_FOLDER  # noqa: E402

@@ -48,7 +48,7 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.evaluation.protocol import policy_sources
+    from openvima.evaluation.sources import policy_sources
     from openvima.evaluation.versions import versions
     from openvima.policies import load_policy
     from openvima.serving import ServerConfig, serve

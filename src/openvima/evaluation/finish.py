@@ -15,10 +15,10 @@ from openvima.evaluation.protocol import (
     DEFAULT_DEVICE,
     Batch,
     EvaluationConfig,
-    PolicySource,
     cells,
 )
 from openvima.evaluation.results import Results, Row
+from openvima.evaluation.sources import PolicySource
 from openvima.processes import in_processes
 
 REPORT_NAME = "report.html"

@@ -9,7 +9,8 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation.boxes import load_finder
 from openvima.evaluation.controls import Sight, sight
-from openvima.evaluation.protocol import ORACLE, Batch
+from openvima.evaluation.protocol import Batch
+from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.scene import Action
 from openvima.serving.client import RemotePolicy
 from openvima.serving.protocol import is_remote
@@ -108,7 +109,7 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
 @contextmanager
 def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    if batch.source in ("oracle", "random") or is_remote(batch.source):  # no network, or not here
+    if batch.source in (ORACLE, RANDOM) or is_remote(batch.source):  # no network, or not here
         yield
         return
     from openvima.policies.base import require_torch

@@ -6,36 +6,26 @@ take whole batches, so their number changes neither the batches nor the results.
 
 import hashlib
 import json
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
-from urllib.parse import urlsplit
+from typing import Literal
 
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.setup import DEFAULT_SETUP, Setup
-from openvima.errors import CheckpointError, ConfigError, LevelError, UnknownPolicyError, unknown_name
+from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES
-from openvima.policies.base import find_checkpoint
-from openvima.policies.hub import is_hub_id
-from openvima.policies.presets import PRESETS
-from openvima.serving.client import describe
-from openvima.serving.protocol import is_remote
+from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
-ORACLE = "oracle"
-RANDOM = "random"
-NAMED_POLICIES = (ORACLE, RANDOM, "untrained")
 POLICY_CONTROLS = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
 DEFAULT_EPISODES = 200  # as in the published tables
 PRECISIONS = ("float64", "float32", "bfloat16")
 Engine = Literal["processes", "ray"]
 DEFAULT_DEVICE = "cpu"
 DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
-_WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +128,7 @@ class EvaluationConfig:
             yield "film names episodes, but no report is asked for; films are part of it."
 
     @property
-    def sources(self) -> "tuple[PolicySource, ...]":
+    def sources(self) -> tuple[PolicySource, ...]:
         """The policies that are played, those that the controls add last.
 
         Raises:
@@ -150,7 +140,7 @@ class EvaluationConfig:
         added = [name for name in POLICY_CONTROLS if name in asked and name not in there]
         return policy_sources((*self.policies, *added)) if added else given
 
-    def controls_of(self, source: "PolicySource") -> tuple[str, ...]:
+    def controls_of(self, source: PolicySource) -> tuple[str, ...]:
         """Return the controls under which a policy is played, besides the plain score.
 
         Oracle and random policy read no prompts, and a policy server finds its objects by itself.
@@ -162,7 +152,7 @@ class EvaluationConfig:
         return tuple(name for name in CONTROLS if name in asked and (name != DETECTED_BOXES or usable))
 
     def record(self) -> dict[str, object]:
-        """Settings that the results depend on, as plain JSON values; no paths, workers or videos."""
+        """Settings that the results depend on, as plain JSON values; not who plays, nor where to."""
         return {
             "policies": [source.name for source in self.sources],
             "tasks": list(self.tasks),
@@ -177,87 +167,6 @@ class EvaluationConfig:
             **({"controls": list(self.controls)} if self.controls else {}),
             **({"boxes": self.boxes} if self.boxes else {}),
         }
-
-
-@dataclass(frozen=True, slots=True)
-class PolicySource:
-    """A policy under the name that it bears in the results.
-
-    Args:
-        name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset, what else `load_policy` takes, or the
-            address of a policy server.
-    """
-
-    name: str
-    source: str
-
-    @property
-    def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset), "remote" or "run" (all else)."""
-        if is_remote(self.source):
-            return "remote"
-        if self.source in PRESETS:
-            return "untrained"
-        return self.source if self.source in NAMED_POLICIES else "run"
-
-    def record(self) -> dict[str, Any]:  # Any: plain values
-        """What the policy is; for a trained one with a hash of its weights, for a remote one what it says.
-
-        Raises:
-            UnknownPolicyError: There is no such run folder.
-            CheckpointError: The run folder holds no weights.
-            ServerError: No policy server answers at the address.
-        """
-        if self.kind == "remote":
-            return {"kind": "remote", "metadata": describe(self.source)}
-        if self.kind == "run":
-            return {"kind": "run", "sha256": weights_hash(self.source)}
-        return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
-
-
-def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
-    """Read policies as given on the command line.
-
-    Raises:
-        ConfigError: Two policies bear the same name, or a name could not be part of a file's.
-    """
-    sources = []
-    for given in policies:
-        name, equals, source = ("", "", given) if is_remote(given) else given.partition("=")
-        sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
-    if unfinished := [source.name for source in sources if not source.source]:
-        raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
-    names = [source.name for source in sources]
-    if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
-        raise ConfigError(
-            f"policies need distinct names of letters, digits, dots and hyphens, got {', '.join(names)}; "
-            "name them as NAME=PATH."
-        )
-    return tuple(sources)
-
-
-def weights_hash(source: str | Path) -> str:
-    """SHA-256 over the weights that a folder, file or id on the Hub stands for, as hexadecimal text.
-
-    Raises:
-        UnknownPolicyError: There is no such folder or file, and it is not like an id on the Hub.
-        CheckpointError: It holds no weights, or the Hub does not give it.
-    """
-    if not (Path(source).exists() or is_hub_id(str(source))):
-        known = (*NAMED_POLICIES, *PRESETS)
-        hint = "Give the folder of a training run, a published .ckpt file or a name of `openvima policies`."
-        raise UnknownPolicyError(unknown_name("policy", str(source), known, hint))
-    found = find_checkpoint(source)
-    files = [found] if found.is_file() else sorted(found.iterdir())
-    files = [file for file in files if file.suffix in _WEIGHTS]
-    if not files:
-        raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
-    digest = hashlib.sha256()
-    for file in files:
-        with open(file, "rb") as stream:
-            digest.update(hashlib.file_digest(stream, "sha256").digest())
-    return digest.hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,9 +286,3 @@ def plan(config: EvaluationConfig) -> list[Batch]:
         for task, level in cells(config)
         for offset in range(0, config.episodes, config.batch)
     ]
-
-
-def _default_name(source: str) -> str:
-    if is_remote(source):
-        return re.sub(r"[^\w.-]+", "-", urlsplit(source).netloc).strip("-")
-    return source if source in NAMED_POLICIES else Path(source).name

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from openvima.evaluation.players import PolicyPlayer
+from openvima.evaluation.players import PolicyPlayer, load_player
 from openvima.evaluation.protocol import DEFAULT_EPISODES, EvaluationConfig, plan
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.rollout import play
@@ -18,6 +18,7 @@ def score(
     levels: tuple[str, ...] = ("L1", "L2", "L3", "L4"),
     episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
+    controls: tuple[str, ...] = (),
 ) -> Results:
     """Play the episodes of `openvima evaluate` with policies that exist as objects only.
 
@@ -27,6 +28,7 @@ def score(
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
+        controls: What to play besides; as in `EvaluationConfig`, except for "detected_boxes".
 
     Returns:
         Success rates and the outcome of every episode.
@@ -43,16 +45,27 @@ def score(
         2
     """
     config = EvaluationConfig(
-        tuple(policies), tasks=tasks, levels=levels, episodes=episodes, seed=seed, report=False
+        tuple(policies),
+        tasks=tasks,
+        levels=levels,
+        episodes=episodes,
+        seed=seed,
+        controls=controls,
+        report=False,
     )
-    outcomes: dict[tuple[str, str, str], list[EpisodeOutcome]] = {}
+    outcomes: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
     for batch in plan(config):
         envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        played = play(envs, batch.seeds, PolicyPlayer(policies[batch.policy]))
-        outcomes.setdefault((batch.policy, batch.task, batch.level), []).extend(played)
+        given = policies.get(batch.policy)
+        player = load_player(batch) if given is None else PolicyPlayer(given, batch.control)
+        cell = (batch.policy, batch.control, batch.task, batch.level)
+        outcomes.setdefault(cell, []).extend(play(envs, batch.seeds, player))
     rows = tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(cell))
-        for (policy, task, level), cell in outcomes.items()
+        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
+        for (policy, control, task, level), played in outcomes.items()
     )
-    kinds = {name: {"kind": "object"} for name in policies}
+    kinds = {
+        source.name: {"kind": "object"} if source.name in policies else source.record()
+        for source in config.sources
+    }
     return Results(rows, config.record(), versions(with_torch=True), kinds)

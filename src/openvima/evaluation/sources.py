@@ -1,0 +1,108 @@
+"""The policies of an evaluation: under which name, from where, and what stands for their weights."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, unknown_name
+from openvima.policies.base import find_checkpoint
+from openvima.policies.hub import is_hub_id
+from openvima.policies.presets import PRESETS
+from openvima.serving.client import describe
+from openvima.serving.protocol import is_remote
+
+ORACLE = "oracle"
+RANDOM = "random"
+NAMED_POLICIES = (ORACLE, RANDOM, "untrained")
+_WEIGHTS = (".safetensors", ".ckpt", ".pt")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicySource:
+    """A policy under the name that it bears in the results.
+
+    Args:
+        name: Name in the results.
+        source: "oracle", "random", "untrained", the name of a preset, what else `load_policy` takes, or the
+            address of a policy server.
+    """
+
+    name: str
+    source: str
+
+    @property
+    def kind(self) -> str:
+        """What it is: "oracle", "random", "untrained" (also for a preset), "remote" or "run" (all else)."""
+        if is_remote(self.source):
+            return "remote"
+        if self.source in PRESETS:
+            return "untrained"
+        return self.source if self.source in NAMED_POLICIES else "run"
+
+    def record(self) -> dict[str, Any]:  # Any: plain values
+        """What the policy is; for a trained one with a hash of its weights, for a remote one what it says.
+
+        Raises:
+            UnknownPolicyError: There is no such run folder.
+            CheckpointError: The run folder holds no weights.
+            ServerError: No policy server answers at the address.
+        """
+        if self.kind == "remote":
+            return {"kind": "remote", "metadata": describe(self.source)}
+        if self.kind == "run":
+            return {"kind": "run", "sha256": weights_hash(self.source)}
+        return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
+
+
+def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
+    """Read policies as given on the command line.
+
+    Raises:
+        ConfigError: Two policies bear the same name, or a name could not be part of a file's.
+    """
+    sources = []
+    for given in policies:
+        name, equals, source = ("", "", given) if is_remote(given) else given.partition("=")
+        sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
+    if unfinished := [source.name for source in sources if not source.source]:
+        raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
+    names = [source.name for source in sources]
+    if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
+        raise ConfigError(
+            f"policies need distinct names of letters, digits, dots and hyphens, got {', '.join(names)}; "
+            "name them as NAME=PATH."
+        )
+    return tuple(sources)
+
+
+def weights_hash(source: str | Path) -> str:
+    """SHA-256 over the weights that a folder, file or id on the Hub stands for, as hexadecimal text.
+
+    Raises:
+        UnknownPolicyError: There is no such folder or file, and it is not like an id on the Hub.
+        CheckpointError: It holds no weights, or the Hub does not give it.
+    """
+    if not (Path(source).exists() or is_hub_id(str(source))):
+        known = (*NAMED_POLICIES, *PRESETS)
+        hint = "Give the folder of a training run, a published .ckpt file or a name of `openvima policies`."
+        raise UnknownPolicyError(unknown_name("policy", str(source), known, hint))
+    found = find_checkpoint(source)
+    files = [found] if found.is_file() else sorted(found.iterdir())
+    files = [file for file in files if file.suffix in _WEIGHTS]
+    if not files:
+        raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
+    digest = hashlib.sha256()
+    for file in files:
+        with open(file, "rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _default_name(source: str) -> str:
+    if is_remote(source):
+        return re.sub(r"[^\w.-]+", "-", urlsplit(source).netloc).strip("-")
+    return source if source in NAMED_POLICIES else Path(source).name
