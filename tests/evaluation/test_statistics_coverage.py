@@ -1,7 +1,7 @@
 """Whether intervals hold the truth as often as they say, in simulated evaluations with known success rates.
 
-Coverage of a score interval is close to 95 %, not at least 95 %, since counts are whole numbers. The bounds leave
-room for that and for three standard errors of the simulation.
+Coverage of a score interval is close to 95 %, not at least 95 %, since counts are whole numbers. The bounds
+leave room for that and for three standard errors of the simulation.
 """
 
 import math

@@ -1,0 +1,245 @@
+"""Two policies on the same seeds: by how much one is better, and whether that may be chance."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Literal
+
+from openvima.errors import ConfigError, UnknownPolicyError, unknown_name
+from openvima.evaluation.results import Results, Row
+from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
+
+Verdict = Literal["a", "b", "unsure", "noise"]
+CONTROL_MARK = ":"  # "mine:no_prompt" is the policy `mine` under the control `no_prompt`
+_LEARNED = ("run", "remote")
+_FALSE_ALARMS = 0.05
+_MOST_PAIRS = 6  # that are compared unasked
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How much more often one policy solves the same episodes than another.
+
+    Args:
+        level: The level; empty for the mean over all levels.
+        task: The task; empty for a mean over tasks.
+        pairs: Outcomes of each task and level that it is made of.
+        rate_a: Success rate of the first policy, for a mean unweighted over tasks.
+        rate_b: That of the second one.
+        difference: The first minus the second, as a fraction.
+        interval: Its 95 % interval, see `statistics.mean_difference`.
+        p_value: Exact McNemar test, two-sided; over several tasks that of the added counts.
+        p_mid: The same test with the observed outcome counted half.
+        p_holm: `p_value`, adjusted by Holm's method for all differences of its kind that were looked at.
+    """
+
+    level: str
+    task: str
+    pairs: tuple[PairCounts, ...]
+    rate_a: float
+    rate_b: float
+    difference: float
+    interval: Interval
+    p_value: float
+    p_mid: float
+    p_holm: float
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes that both policies played."""
+        return sum(pair.episodes for pair in self.pairs)
+
+    @property
+    def only_a(self) -> int:
+        """Number of episodes that only the first policy solved."""
+        return sum(pair.only_a for pair in self.pairs)
+
+    @property
+    def only_b(self) -> int:
+        """Number of episodes that only the second policy solved."""
+        return sum(pair.only_b for pair in self.pairs)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Which policy is better.
+
+        Returns:
+            "noise" where the interval holds 0, so that chance alone explains the difference; "unsure" where
+            it does not, but the test does not hold out against the number of comparisons; else "a" or "b".
+        """
+        if self.interval[0] <= 0 <= self.interval[1]:
+            return "noise"
+        if self.p_holm >= _FALSE_ALARMS:
+            return "unsure"
+        return "a" if self.difference > 0 else "b"
+
+    def record(self) -> dict[str, object]:
+        """Everything as plain JSON values."""
+        return {
+            "level": self.level or "all",
+            "task": self.task or "mean",
+            "episodes": self.episodes,
+            "rates": [round(self.rate_a, 6), round(self.rate_b, 6)],
+            "difference": round(self.difference, 6),
+            "interval": [round(end, 6) for end in self.interval],
+            "only_a": self.only_a,
+            "only_b": self.only_b,
+            "p_mcnemar": self.p_value,
+            "p_mcnemar_mid": self.p_mid,
+            "p_holm": self.p_holm,
+            "verdict": self.verdict,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two policies on the episodes that both played.
+
+    Args:
+        a: Name of the first policy, with its control if any, as in "mine:no_prompt".
+        b: Name of the second one.
+        tasks: Differences on single tasks, in the order level, task.
+        levels: Mean over the tasks of each level.
+        overall: Mean over all tasks of all levels; the same as `levels[0]` where there is but one.
+        unpaired: Episodes that only one of the two played; they are left out.
+    """
+
+    a: str
+    b: str
+    tasks: tuple[Difference, ...]
+    levels: tuple[Difference, ...]
+    overall: Difference
+    unpaired: int
+
+    @property
+    def means(self) -> tuple[Difference, ...]:
+        """The means of the levels, and that of all where there are several."""
+        return (*self.levels, self.overall) if len(self.levels) > 1 else self.levels
+
+    def record(self) -> dict[str, object]:
+        """Everything as plain JSON values."""
+        return {
+            "a": self.a,
+            "b": self.b,
+            "unpaired": self.unpaired,
+            "overall": self.overall.record(),
+            "levels": [difference.record() for difference in self.levels],
+            "tasks": [difference.record() for difference in self.tasks],
+        }
+
+
+def compare(results: Results, a: str, b: str) -> Comparison:
+    """Compare two policies of an evaluation, seed by seed.
+
+    Args:
+        results: The evaluation; `merging.merge` joins several.
+        a: A policy, or "POLICY:CONTROL" for its rows under that control.
+        b: Another one.
+
+    Returns:
+        Differences a minus b by task, level and in all.
+
+    Raises:
+        UnknownPolicyError: The results hold no such policy or control.
+        ConfigError: The two have no episode in common.
+    """
+    return compare_pairs(results, [(a, b)])[0]
+
+
+def compare_pairs(results: Results, pairs: Sequence[tuple[str, str]]) -> list[Comparison]:
+    """Compare several pairs of policies, with p-values adjusted for the number of pairs too."""
+    return _adjusted([_compare(results, a, b) for a, b in pairs])
+
+
+def default_pairs(results: Results) -> list[tuple[str, str]]:
+    """What is worth comparing unasked: the first learned policy with all others but the oracle."""
+    kinds = {name: results.policies.get(name, {}).get("kind", "run") for name in results.policy_names()}
+    learned = [name for name, kind in kinds.items() if kind in _LEARNED]
+    others = [name for name, kind in kinds.items() if name not in learned[:1] and kind != "oracle"]
+    pairs = [(learned[0], other) for other in others] if learned else []
+    return [pair for pair in pairs if can_be_compared(results, *pair)][:_MOST_PAIRS]
+
+
+def can_be_compared(results: Results, a: str, b: str) -> bool:
+    """Whether two policies, or a policy under a control, played any episode in common."""
+    rows_a, rows_b = _rows(results, a), _rows(results, b)
+    return any(_pair(rows_a[cell], rows_b[cell]) for cell in rows_a.keys() & rows_b.keys())
+
+
+def _compare(results: Results, a: str, b: str) -> Comparison:
+    rows_a, rows_b = _rows(results, a), _rows(results, b)
+    cells: list[Difference] = []
+    num_paired = 0
+    for cell, row in rows_a.items():
+        pair = _pair(row, rows_b[cell]) if cell in rows_b else None
+        if pair is not None:
+            num_paired += pair.episodes
+            cells.append(_difference(*cell, (pair,)))
+    if not cells:
+        raise ConfigError(
+            f"{a} and {b} have no episode in common; evaluate both on the same tasks, levels and seeds."
+        )
+    levels = [
+        _difference(level, "", tuple(cell.pairs[0] for cell in of_level))
+        for level, of_level in groupby(cells, key=lambda cell: cell.level)
+    ]
+    overall = _difference("", "", tuple(cell.pairs[0] for cell in cells)) if len(levels) > 1 else levels[0]
+    played = sum(row.episodes for row in (*rows_a.values(), *rows_b.values()))
+    return Comparison(a, b, tuple(cells), tuple(levels), overall, played - 2 * num_paired)
+
+
+def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
+    """Rows of a policy, plain or under a control, by level and task, levels one after the other."""
+    policy, _, control = name.partition(CONTROL_MARK)
+    if policy not in results.policy_names():
+        raise UnknownPolicyError(unknown_name("policy", policy, results.policy_names()))
+    of_policy = [row for row in results.rows if row.policy == policy]
+    rows = [row for row in of_policy if row.control == control]
+    if control and not rows:
+        controls = dict.fromkeys(row.control for row in of_policy if row.control)
+        raise UnknownPolicyError(unknown_name(f"control of {policy}", control, controls))
+    order = results.levels()
+    return {(row.level, row.task): row for row in sorted(rows, key=lambda row: order.index(row.level))}
+
+
+def _pair(a: Row, b: Row) -> PairCounts | None:
+    """Count outcomes on the seeds that both rows hold; None if there are none."""
+    solved_b: Mapping[int, bool] = {outcome.seed: outcome.success for outcome in b.outcomes}
+    outcomes = [(o.success, solved_b[o.seed]) for o in a.outcomes if o.seed in solved_b]
+    if not outcomes:
+        return None
+    possible = ((True, True), (True, False), (False, True), (False, False))
+    return PairCounts(*(outcomes.count(pair) for pair in possible))
+
+
+def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Difference:
+    difference, interval = mean_difference(pairs)
+    p_value, p_mid = mcnemar(sum(pair.only_a for pair in pairs), sum(pair.only_b for pair in pairs))
+    return Difference(
+        level=level,
+        task=task,
+        pairs=pairs,
+        rate_a=sum((pair.both + pair.only_a) / pair.episodes for pair in pairs) / len(pairs),
+        rate_b=sum((pair.both + pair.only_b) / pair.episodes for pair in pairs) / len(pairs),
+        difference=difference,
+        interval=interval,
+        p_value=p_value,
+        p_mid=p_mid,
+        p_holm=p_value,
+    )
+
+
+def _adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
+    """Adjust p-values: those of tasks for the number of tasks and pairs, those of means for theirs."""
+    of_tasks = iter(holm([task.p_value for comparison in comparisons for task in comparison.tasks]))
+    of_levels = iter(holm([level.p_value for comparison in comparisons for level in comparison.levels]))
+    of_all = holm([comparison.overall.p_value for comparison in comparisons])
+    return [
+        replace(
+            comparison,
+            tasks=tuple(replace(task, p_holm=next(of_tasks)) for task in comparison.tasks),
+            levels=tuple(replace(level, p_holm=next(of_levels)) for level in comparison.levels),
+            overall=replace(comparison.overall, p_holm=p_all),
+        )
+        for comparison, p_all in zip(comparisons, of_all, strict=True)
+    ]
