@@ -2,15 +2,22 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
 
 from openvima.errors import DatasetError
 from openvima.evaluation.clips import load_clips, save_clips
+from openvima.evaluation.comparison import compare
 from openvima.evaluation.report import write_report
-from openvima.evaluation.report.curves import read_charts
-from openvima.evaluation.results import Results
+from openvima.evaluation.report.curves import read_charts, read_run_charts, run_labels
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
+
+
+def outcomes(num_solved: int) -> tuple[EpisodeOutcome, ...]:
+    return tuple(EpisodeOutcome(i, i < num_solved, 2, "" if i < num_solved else "lost") for i in range(10))
+
 
 VOID = {"meta", "link", "img", "br", "input"}
 
@@ -91,12 +98,33 @@ def test_the_page_is_well_formed_and_its_names_are_unique(text):
 
 def test_the_table_shows_rates_intervals_and_counts(text):
     table = Page(text).tables[0]
-    assert [cell.strip() for cell in table[0]] == ["task", "mine", "oracle", "random"]
+    heads = [cell.split() for cell in table[0]]
+    assert heads == [["task"], ["mine"], ["oracle"], ["random"], ["VIMA", "200M", "published", "elsewhere"]]
     rotate = next(row for row in table if row[0].strip() == "rotate")
     assert "90 %" in rotate[1] and "60–98 · 9/10" in rotate[1]
     assert "100 %" in rotate[2]
     mean = next(row for row in table if row[0].strip() == "mean of 2")
     assert "75.0 %" in mean[1]
+
+
+def test_published_numbers_stand_beside_those_of_the_same_task_only(text):
+    table = Page(text).tables[0]
+    assert [(row[0].strip(), row[-1].strip()) for row in table[2:5]] == [
+        ("rotate", "99.5 %"),
+        ("stack<b>", "–"),
+        ("mean of 2", "–"),
+    ]
+
+
+def test_success_within_the_oracles_steps_is_shown_where_it_differs(text, results, tmp_path):
+    strict = [row for row in Page(text).tables[0] if row[0].startswith("mean within the oracle")]
+    assert [row[1].split()[0] for row in strict] == [
+        "0.0",
+        "0.0",
+    ]  # all took two steps, the oracle may take one
+    quick = tuple(replace(row, oracle_max_steps=2) for row in results.rows)
+    path = write_report(replace(results, rows=quick), tmp_path / "quick.html")
+    assert "mean within the oracle" not in path.read_text(encoding="utf-8")
 
 
 def test_the_headline_is_that_of_the_trained_policy(text):
@@ -162,7 +190,79 @@ def test_seventeen_tasks_and_eight_policies_fit_in(tmp_path, results):
         for t in range(17)
     )
     page = Page(write_report(Results(rows), tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert len(page.tables[0]) == 1 + 4 * (1 + 17 + 1)
+    assert len(page.tables[0]) == 1 + 4 * (1 + 17 + 2)
+
+
+def section(text: str, name: str) -> str:
+    found = re.search(rf'<section id="{name}">.*?</section>', text, flags=re.DOTALL)
+    return found[0] if found else ""
+
+
+def test_trained_policies_are_compared_unasked_and_noise_is_marked(text):
+    comparison = section(text, "comparison")
+    assert "<h3>mine against random</h3>" in comparison
+    assert "On all levels together, mine is better than random: +56.7 points" in comparison
+    table = Page(comparison).tables[1]
+    stack = next(row for row in table if "stack<b>" in row[0])
+    assert stack[1].split()[0] == "+50.0" and stack[5].strip() == "5 : 0"
+
+
+def test_a_difference_inside_the_noise_is_said_to_be_so(results, tmp_path):
+    twin = tuple(replace(row, policy="twin") for row in results.rows if row.policy == "mine")
+    both = replace(results, rows=(*results.rows, *twin))
+    path = write_report(both, tmp_path / "a.html", comparisons=[compare(both, "mine", "twin")])
+    comparison = section(path.read_text(encoding="utf-8"), "comparison")
+    assert "inside the noise, it may well be chance" in comparison
+    assert comparison.count("≈ inside the noise") == 6  # three tasks, two levels, all
+
+
+def test_controls_stand_beside_the_score_with_what_they_change(results, tmp_path):
+    rows = [row for row in results.rows if row.policy == "mine"]
+    without = (replace(r, control="no_prompt", outcomes=outcomes(r.successes - 3)) for r in rows)
+    named = (replace(r, control="somebody_elses", outcomes=r.outcomes[:4]) for r in rows)
+    path = write_report(replace(results, rows=(*results.rows, *without, *named)), tmp_path / "a.html")
+    text = path.read_text(encoding="utf-8")
+    controls = section(text, "controls")
+    table = Page(controls).tables[0]
+    heads = [cell.strip() for cell in table[0]]
+    assert heads == ["level", "mine", "no prompt", "somebody elses", "oracle", "random"]
+    assert "75.0 %" in table[1][1] and "45.0 %" in table[1][2] and "−30 (" in table[1][2]
+    assert "100.0 %" in table[1][4]
+    # and nothing else on the page changes
+    plain = write_report(results, tmp_path / "b.html").read_text(encoding="utf-8")
+    for name in ("overview", "results", "failures", "comparison", "published"):
+        assert section(text, name) == section(plain, name)
+    assert not section(plain, "controls")
+
+
+def test_published_means_are_marked_and_said_to_rest_on_more_tasks(text):
+    published = section(text, "published")
+    assert "those of this evaluation on 1 of 13 tasks at L1, 1 of 12 tasks at L3" in published
+    assert "not measured here" in published and "read off figures" in published
+    rows = {row[0].split()[0]: row for row in Page(published).tables[0][1:]}
+    assert rows["MIDAS"][1].strip() == "91.6"  # the last of that name: without pretraining
+    assert "2 of 13 tasks" in rows["mine"][1]
+
+
+def test_levels_of_ones_own_have_no_published_section(results, tmp_path):
+    rows = tuple(replace(row, level="train") for row in results.rows if row.level == "L3")
+    path = write_report(replace(results, rows=rows), tmp_path / "a.html")
+    assert not section(path.read_text(encoding="utf-8"), "published")
+
+
+def test_notes_stand_at_the_top(results, tmp_path):
+    path = write_report(results, tmp_path / "a.html", notes=["Beware of <this>."])
+    assert "Beware of &lt;this&gt;." in path.read_text(encoding="utf-8").split("<main>")[0]
+
+
+def test_many_tasks_and_causes_of_failure_are_summed_up(results, tmp_path):
+    kinds = [f"cause {number}" for number in range(10)]
+    failed = tuple(EpisodeOutcome(i, False, 1, kind, kind) for i, kind in enumerate(kinds))
+    rows = tuple(Row("mine", f"task{number}", "L1", 1, failed) for number in range(7))
+    path = write_report(Results(rows), tmp_path / "a.html")
+    table = Page(section(path.read_text(encoding="utf-8"), "failures")).tables[0]
+    assert table[1][4].strip() == "task0 1, task1 1, task2 1, task3 1 and 3 other tasks"
+    assert [cell.strip() for cell in table[-1][1:4]] == ["2 rarer causes", "14", "20.0 %"]
 
 
 def test_films_are_kept_beside_the_results(clip, tmp_path):
@@ -198,6 +298,33 @@ def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
     matching, cloning = read_charts(path)
     assert (matching.title, matching.curves) == ("Matching: loss", {"training data": [(5.0, 2.0)]})
     assert list(cloning.curves) == ["held out", "pick, held out", "yaw, held out"]
+
+
+def test_curves_of_several_runs_are_laid_over_each_other(metrics, tmp_path):
+    runs = [tmp_path / "runs" / name for name in ("one", "two")]
+    for run in runs:
+        run.mkdir(parents=True)
+        (run / "metrics.jsonl").write_bytes(metrics.read_bytes())
+    charts = read_run_charts(runs)
+    assert [chart.title for chart in charts[:3]] == [
+        "All runs · Training: loss",
+        "All runs · Training: accuracy",
+        "one · Training: loss",
+    ]
+    assert list(charts[0].curves) == ["one", "two"]
+    assert charts[0].curves["one"][0] == (0.0, pytest.approx(3.3))  # held out, not training
+    assert read_run_charts([runs[0]]) == read_charts(metrics)
+
+
+def test_runs_in_equally_named_folders_are_told_apart(tmp_path):
+    assert run_labels([tmp_path / "a" / "run", tmp_path / "b" / "run"]) == ["a/run", "b/run"]
+    assert run_labels([tmp_path / "a", tmp_path / "b"]) == ["a", "b"]
+    assert run_labels([tmp_path, tmp_path]) == [f"{tmp_path.name} 1", f"{tmp_path.name} 2"]
+
+
+def test_a_run_without_a_record_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"no .*metrics.jsonl"):
+        read_run_charts([tmp_path])
 
 
 def test_a_damaged_training_record_names_the_line(tmp_path):

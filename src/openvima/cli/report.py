@@ -1,43 +1,171 @@
-"""`openvima report`: make the HTML report of evaluation results."""
+"""`openvima report`: one page, or tables for a paper, from the results of evaluations."""
 
+import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+if TYPE_CHECKING:
+    from openvima.evaluation.clips import Clip
+    from openvima.evaluation.comparison import Comparison
+    from openvima.evaluation.merging import Merged
+    from openvima.evaluation.results import Results
+
+_HTML, _MARKDOWN, _LATEX = (".html", ".htm"), (".md", ".markdown"), (".tex",)
+
 
 def main(
-    results: tyro.conf.Positional[Path],
+    results: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RESULTS")],
     *,
     out: Path | None = None,
+    compare: str | None = None,
+    runs: tuple[Path, ...] = (),
     metrics: Path | None = None,
+    markdown: bool = False,
+    latex: bool = False,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Write the report of an evaluation once more, as one HTML file that needs nothing else.
+    """Write the report of one or several evaluations, as one HTML file that needs nothing else.
 
-    Films are those that the evaluation made.
+    Films are those that the evaluations made. Policies of the same name that differ get that of their folder
+    too, as in mine@first.
 
-    Example: openvima report evaluation --metrics runs/first/metrics.jsonl
+    Example: openvima report first second --compare mine@first,mine@second --out report.html
 
     Args:
-        results: Folder of an evaluation, or a results.json.
-        out: HTML file to write; by default report.html beside the results.
-        metrics: Training record whose curves to show.
+        results: Folders of evaluations, or their results.json.
+        out: File to write: .html, .md or .tex; by default report.html beside the results, or in the current
+            folder if there are several.
+        compare: Policies with commas in between; each is compared with the first, seed by seed.
+            POLICY:CONTROL stands for its score under a control.
+        runs: Folders of training runs whose learning curves to show.
+        metrics: The same for a single metrics.jsonl.
+        markdown: Print tables in Markdown for a paper.
+        latex: Print tables in LaTeX for a paper; they need the package booktabs.
+        as_json: Print the comparisons as JSON.
 
     Returns:
         Exit status.
     """
-    from openvima.errors import ConfigError, DatasetError
-    from openvima.evaluation.clips import load_clips
-    from openvima.evaluation.finish import REPORT_NAME, require_extra
-    from openvima.evaluation.report import write_report
+    from openvima.evaluation.comparison import compare_pairs, default_pairs
+    from openvima.evaluation.report.differences import finding
+    from openvima.evaluation.report.paper import latex as as_latex
+    from openvima.evaluation.report.paper import markdown as as_markdown
+    from openvima.evaluation.report.paper import paper_tables
+    from openvima.files import write_whole
+
+    _check(results, out)
+    evaluations = _read(results)
+    merged = _merged(evaluations)
+    found = merged.results
+    pairs = _pairs(compare) if compare is not None else default_pairs(found)
+    comparisons = compare_pairs(found, pairs)
+    suffix = out.suffix.lower() if out else ""
+    tables = paper_tables(found, comparisons)
+    if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
+        write_whole(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
+        print(f"Tables: {out}")
+        return 0
+    if markdown:
+        print(as_markdown(tables), end="")
+    if latex:
+        print(as_latex(tables), end="")
+    if as_json:
+        print(json.dumps([comparison.record() for comparison in comparisons], indent=1))
+    prints = markdown or latex or as_json
+    said = sys.stderr if prints else sys.stdout  # what is printed for other programs has stdout to itself
+    if compare is not None:
+        for comparison in comparisons:
+            for difference in comparison.means:
+                print(finding(comparison, difference), file=said)
+    if out is not None or not prints:
+        records = [*runs, *([metrics] if metrics else [])]
+        path = _page(evaluations, merged, comparisons, out or _default_out(evaluations), records)
+        print(f"Report: {path}", file=said)
+    return 0
+
+
+def _check(results: Sequence[Path], out: Path | None) -> None:
+    from openvima.errors import ConfigError
+
+    if not results:
+        raise ConfigError("give at least one folder of an evaluation, or a results.json.")
+    if out is not None and out.suffix.lower() not in (*_HTML, *_MARKDOWN, *_LATEX):
+        raise ConfigError(
+            f"--out is {str(out)!r}; give the name of an HTML file, such as report.html, or one that ends in "
+            ".md or .tex for tables."
+        )
+
+
+def _read(paths: Sequence[Path]) -> dict[Path, "Results"]:
     from openvima.evaluation.results import Results
 
-    if out is not None and out.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"--out is {str(out)!r}; give the name of an HTML file, such as report.html.")
+    return {path: Results.read(path) for path in dict.fromkeys(paths)}
+
+
+def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
+    from openvima.evaluation.merging import merge
+    from openvima.evaluation.report.curves import run_labels
+
+    labels = run_labels([_folder(path) for path in evaluations])
+    return merge(dict(zip(labels, evaluations.values(), strict=True)))
+
+
+def _pairs(names: str) -> list[tuple[str, str]]:
+    """Pair the first name with each of the others."""
+    from openvima.errors import ConfigError
+
+    first, *others = [name.strip() for name in names.split(",") if name.strip()] or [""]
+    if not others:
+        raise ConfigError(f"--compare is {names!r}; give two or more policies with commas in between.")
+    return [(first, other) for other in others]
+
+
+def _page(
+    evaluations: dict[Path, "Results"],
+    merged: "Merged",
+    comparisons: "Sequence[Comparison]",
+    out: Path,
+    records: Sequence[Path],
+) -> Path:
+    from openvima.evaluation.finish import require_extra
+    from openvima.evaluation.report import write_report
+    from openvima.evaluation.report.page import default_command
+
     require_extra()
-    found = Results.read(results)
-    if metrics is not None and not metrics.is_file():
-        raise DatasetError(f"there is no {metrics}; give the metrics.jsonl of a training run.")
-    folder = results if results.is_dir() else results.parent
-    path = write_report(found, out or folder / REPORT_NAME, metrics=metrics, clips=load_clips(folder))
-    print(f"Report: {path}")
-    return 0
+    return write_report(
+        merged.results,
+        out,
+        command="\n".join(default_command(found) for found in evaluations.values()),
+        runs=records,
+        clips=_clips(evaluations, merged),
+        comparisons=comparisons,
+        notes=merged.notes,
+    )
+
+
+def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]:
+    """Films of all evaluations, under the names that policies have in the common report."""
+    from dataclasses import replace
+
+    from openvima.evaluation.clips import load_clips
+
+    return [
+        replace(clip, policy=names.get(clip.policy, clip.policy))
+        for path, names in zip(evaluations, merged.names.values(), strict=True)
+        for clip in load_clips(_folder(path))
+    ]
+
+
+def _default_out(evaluations: dict[Path, "Results"]) -> Path:
+    """Beside the results; several have no place in common, and each may have a report of its own."""
+    from openvima.evaluation.finish import REPORT_NAME
+
+    return _folder(next(iter(evaluations))) / REPORT_NAME if len(evaluations) == 1 else Path(REPORT_NAME)
+
+
+def _folder(path: Path) -> Path:
+    return path if path.is_dir() else path.parent

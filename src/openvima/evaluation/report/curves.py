@@ -1,4 +1,4 @@
-"""Training curves for the report, read from a run's `metrics.jsonl`."""
+"""Training curves for the report, read from the `metrics.jsonl` of training runs."""
 
 import json
 from collections.abc import Sequence
@@ -9,9 +9,16 @@ from openvima.errors import DatasetError
 
 Curve = Sequence[tuple[float, float]]
 
-_KINDS = (("loss", False), ("accuracy", True))  # part of a metric's name, and whether it is a fraction
+METRICS_FILE = "metrics.jsonl"
+_KINDS = (  # part of a metric's name, and whether it is a fraction
+    ("loss", False),
+    ("accuracy", True),
+    ("success", True),
+)
 _HELD_OUT = "validation_"
+_HELD_OUT_LABEL = "held out"
 _MOST_CURVES = 4  # more of them in one chart cannot be told apart
+_MOST_RUNS = 6  # as many as the page has colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +34,52 @@ class Chart:
     title: str
     curves: dict[str, Curve]
     percent: bool
+
+
+def find_metrics(run: Path) -> Path:
+    """The training record of a run folder; a file is one itself.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    file = run / METRICS_FILE if run.is_dir() else run
+    if not file.is_file():
+        raise DatasetError(f"there is no {file}; give the folder of a training run or its {METRICS_FILE}.")
+    return file
+
+
+def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
+    """Read what the report shows of several training runs.
+
+    Args:
+        runs: Run folders or their `metrics.jsonl`.
+
+    Returns:
+        First the charts that several runs share, with one curve each, then those of each run.
+
+    Raises:
+        DatasetError: A run has no record, or a damaged one.
+    """
+    if len(runs) == 1:
+        return read_charts(find_metrics(runs[0]))
+    labels = run_labels(runs)
+    charts = {label: read_charts(find_metrics(run)) for label, run in zip(labels, runs, strict=True)}
+    single = [
+        Chart(f"{label} · {chart.title}", chart.curves, chart.percent)
+        for label, of_run in charts.items()
+        for chart in of_run
+    ]
+    return _overlaid(charts) + single
+
+
+def run_labels(folders: Sequence[Path]) -> list[str]:
+    """Short distinct names for folders: the last part of the path, or as much of it as tells them apart."""
+    parts = [folder.resolve().parts for folder in folders]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(part[-length:]) for part in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{part[-1]} {number}" for number, part in enumerate(parts, start=1)]
 
 
 def read_charts(metrics: Path) -> list[Chart]:
@@ -62,6 +115,22 @@ def read_charts(metrics: Path) -> list[Chart]:
     return charts
 
 
+def _overlaid(charts: dict[str, list[Chart]]) -> list[Chart]:
+    """One chart for each title that several runs have, with one curve a run: held out, where it can be."""
+    titles = dict.fromkeys(chart.title for of_run in charts.values() for chart in of_run)
+    shared = []
+    for title in titles:
+        of_title = {run: chart for run, found in charts.items() for chart in found if chart.title == title}
+        curves = {run: _main_curve(chart) for run, chart in list(of_title.items())[:_MOST_RUNS]}
+        if len(curves) > 1:
+            shared.append(Chart(f"All runs · {title}", curves, next(iter(of_title.values())).percent))
+    return shared
+
+
+def _main_curve(chart: Chart) -> Curve:
+    return chart.curves.get(_HELD_OUT_LABEL, next(iter(chart.curves.values())))
+
+
 def _chosen(names: list[str]) -> list[str]:
     """All metrics of a kind, or the held-out ones alone where all would be too many."""
     held_out = [name for name in names if name.startswith(_HELD_OUT)]
@@ -76,5 +145,5 @@ def _stage_title(name: str) -> str:
 def _label(name: str, kind: str) -> str:
     """Name of a curve, such as "pick, held out" for "validation_pick_accuracy"."""
     what = name.removeprefix(_HELD_OUT).replace(kind, "").strip("_").replace("_", " ")
-    seen = "held out" if name.startswith(_HELD_OUT) else "training data"
+    seen = _HELD_OUT_LABEL if name.startswith(_HELD_OUT) else "training data"
     return f"{what}, {seen}" if what else seen

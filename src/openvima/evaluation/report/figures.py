@@ -67,13 +67,14 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
 
 
 def curve_chart(
-    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, percent: bool = False
+    curves: Mapping[str, Sequence[tuple[float, float]]], *, title: str, name: str, percent: bool = False
 ) -> str:
     """Draw curves over training steps.
 
     Args:
         curves: Name of each curve to its (step, value) points.
         title: What the chart shows; stands above it.
+        name: Put before the names of its elements; no other chart of the page may have it.
         percent: Whether values are fractions to be shown as per cent, on an axis from 0 to 100.
 
     Returns:
@@ -96,7 +97,7 @@ def curve_chart(
     axes.tick_params(length=0)
     if len(curves) > 1:
         axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
-    return _themed(figure, f"curve-{re.sub(r'[^a-z]+', '-', title.lower())}", title, variables)
+    return _themed(figure, name, title, variables)
 
 
 def _panel(height_in: float, margins_in: tuple[float, float, float, float]) -> tuple[Any, Any]:

@@ -5,8 +5,13 @@ from importlib import resources
 from pathlib import Path
 
 from openvima.evaluation.clips import Clip
+from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.report import sections
-from openvima.evaluation.report.curves import read_charts
+from openvima.evaluation.report.controls import control_section
+from openvima.evaluation.report.curves import read_run_charts
+from openvima.evaluation.report.differences import comparison_section
+from openvima.evaluation.report.elsewhere import published_section
+from openvima.evaluation.report.tables import failure_table, rate_table
 from openvima.evaluation.report.wording import headline, prose
 from openvima.evaluation.results import Results
 from openvima.files import write_whole
@@ -18,7 +23,10 @@ def write_report(
     *,
     command: str = "",
     metrics: Path | None = None,
+    runs: Sequence[Path] = (),
     clips: Sequence[Clip] = (),
+    comparisons: Sequence[Comparison] | None = None,
+    notes: Sequence[str] = (),
 ) -> Path:
     """Write the report of an evaluation.
 
@@ -27,26 +35,35 @@ def write_report(
         out: The HTML file to write.
         command: The command that repeats the evaluation; by default put together from `results.config`.
         metrics: `metrics.jsonl` of the training run, for its curves.
+        runs: Folders of training runs, for theirs.
         clips: Filmed episodes.
+        comparisons: Policies to compare; by default those of `comparison.default_pairs`.
+        notes: Warnings to put at the top.
 
     Returns:
         The file.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        DatasetError: `metrics` is damaged.
+        DatasetError: The record of a training run is missing or damaged.
     """
+    if comparisons is None:
+        comparisons = compare_pairs(results, default_pairs(results))
+    records = [*([metrics] if metrics else []), *runs]
     body = (
         sections.policy_cards(results),
-        sections.rate_table(results),
+        rate_table(results),
         sections.clip_cards(clips),
+        failure_table(results),
         sections.level_charts(results),
-        sections.training_charts(read_charts(metrics) if metrics else []),
-        sections.failure_table(results),
+        comparison_section(comparisons),
+        control_section(results),
+        published_section(results),
+        sections.training_charts(read_run_charts(records) if records else []),
         sections.level_meanings(results),
         sections.reproduction(results, command or default_command(results)),
     )
-    return write_whole(out, _page(results, "\n".join(part for part in body if part)))
+    return write_whole(out, _page(results, "\n".join(part for part in body if part), notes))
 
 
 def default_command(results: Results) -> str:
@@ -63,7 +80,7 @@ def default_command(results: Results) -> str:
     )
 
 
-def _page(results: Results, body: str) -> str:
+def _page(results: Results, body: str, notes: Sequence[str]) -> str:
     style = resources.files("openvima.evaluation.report").joinpath("style.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -71,7 +88,8 @@ def _page(results: Results, body: str) -> str:
         f'<meta name="description" content="{sections.summary_line(results)}">\n'
         f"<title>{prose(headline(results))} · openvima</title>\n"
         '<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n{sections.heading(results)}\n<main>\n{body}\n</main>\n"
+        f"<style>\n{style}</style>\n</head>\n<body>\n{sections.heading(results, notes)}\n"
+        f"<main>\n{body}\n</main>\n"
         f"<footer><div>openvima {prose(results.versions.get('openvima', ''))} · prompts, images and films "
         "on this page come from the evaluated episodes themselves.</div></footer>\n</body>\n</html>\n"
     )

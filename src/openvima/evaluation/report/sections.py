@@ -1,12 +1,12 @@
 """Sections of the report, each a function from results to HTML."""
 
 import base64
-from collections import Counter
 from collections.abc import Sequence
 
 from openvima.evaluation.clips import Clip
 from openvima.evaluation.report.curves import Chart
 from openvima.evaluation.report.figures import curve_chart, level_chart
+from openvima.evaluation.report.markup import DOT, section
 from openvima.evaluation.report.wording import (
     LEVEL_MEANINGS,
     LEVEL_NAMES,
@@ -20,13 +20,11 @@ from openvima.evaluation.report.wording import (
     series_colours,
     span,
 )
-from openvima.evaluation.results import LevelMean, Results, Row
-
-_DOT = '<span class="dot"></span>'  # in the colour of its policy
+from openvima.evaluation.results import LevelMean, Results
 
 
-def heading(results: Results) -> str:
-    """The page's head: the finding, and what was measured."""
+def heading(results: Results, notes: Sequence[str] = ()) -> str:
+    """The page's head: the finding, what was measured, and what to beware of."""
     levels, tasks = results.levels(), results.tasks()
     episodes = sorted({row.episodes for row in results.rows})
     each = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
@@ -41,23 +39,23 @@ def heading(results: Results) -> str:
         "<p>A robot arm is told what to do by a prompt that mixes words with images. It looks at the table "
         "from two cameras, acts, and an episode counts as solved when the goal is reached within the step "
         "limit.</p>"
-        f"<p>{prose(measured)}</p></div></header>"
+        f"<p>{prose(measured)}</p>{''.join(f'<p><b>{prose(note)}</b></p>' for note in notes)}</div></header>"
     )
 
 
 def policy_cards(results: Results) -> str:
     """Level means of each policy, as bars."""
     colours = series_colours(results)
-    means = results.level_means()
+    means = [mean for mean in results.level_means() if not mean.control]
     cards = []
     for policy in results.policy_names():
         meters = "".join(_meter(mean) for mean in means if mean.policy == policy)
         cards.append(
             f'<article class="card policy" style="--series:var({colours[policy]})">'
-            f"<h3>{_DOT}{prose(policy)}</h3><p>{prose(role(results, policy))}</p>"
+            f"<h3>{DOT}{prose(policy)}</h3><p>{prose(role(results, policy))}</p>"
             f"<div>{meters}</div></article>"
         )
-    return _section(
+    return section(
         "overview",
         "At a glance",
         "Share of solved episodes, averaged over the tasks of each level. The higher the level, the less of "
@@ -66,29 +64,11 @@ def policy_cards(results: Results) -> str:
     )
 
 
-def rate_table(results: Results) -> str:
-    """Success of every policy on every task, by level, with 95 % intervals."""
-    policies = results.policy_names()
-    colours = series_colours(results)
-    head = "".join(
-        f'<th scope="col" style="--series:var({colours[policy]})">{_DOT}{prose(policy)}</th>'
-        for policy in policies
-    )
-    bodies = "".join(_level_rows(results, level, policies) for level in results.levels())
-    return _section(
-        "results",
-        "Results by task",
-        "Solved episodes in per cent; below, the 95 % interval (Wilson) in per cent, and counts.",
-        '<div class="card scroll"><table class="rates"><thead><tr><th scope="col">task</th>'
-        f"{head}</tr></thead>{bodies}</table></div>",
-    )
-
-
 def level_charts(results: Results) -> str:
     """The same numbers as dots with interval bars."""
     colours = series_colours(results)
     legend = "".join(
-        f'<li style="--series:var({variable})">{_DOT}{prose(policy)}</li>'
+        f'<li style="--series:var({variable})">{DOT}{prose(policy)}</li>'
         for policy, variable in colours.items()
     )
     panels = "".join(
@@ -96,11 +76,11 @@ def level_charts(results: Results) -> str:
         f"{level_chart(results, level, colours)}</figure>"
         for level in results.levels()
     )
-    return _section(
+    return section(
         "chart",
         "How sure the numbers are",
         "Each dot is a success rate, each bar its 95 % interval. Bars that do not overlap mean that the "
-        "difference is hardly chance.",
+        "difference is hardly chance; where they do overlap, comparing episode by episode may still tell.",
         f'<ul class="legend">{legend}</ul><div class="grid wide">{panels}</div>',
     )
 
@@ -109,7 +89,7 @@ def clip_cards(clips: Sequence[Clip]) -> str:
     """Films of single episodes, each with its prompt."""
     if not clips:
         return ""
-    return _section(
+    return section(
         "films",
         "Watch it work",
         "Episodes of the evaluation, filmed from the front camera in real time. Below each film stands the "
@@ -122,35 +102,20 @@ def training_charts(charts: Sequence[Chart]) -> str:
     """Curves over training steps.
 
     Args:
-        charts: As read from the run's record.
+        charts: As read from the records of training runs.
     """
-    figures = "".join(
-        f'<figure class="card">{curve_chart(chart.curves, title=chart.title, percent=chart.percent)}</figure>'
-        for chart in charts
+    drawn = (
+        curve_chart(chart.curves, title=chart.title, name=f"curve-{number}", percent=chart.percent)
+        for number, chart in enumerate(charts)
     )
+    figures = "".join(f'<figure class="card">{svg}</figure>' for svg in drawn)
     if not figures:
         return ""
-    return _section(
+    return section(
         "training",
         "Training",
         "How the policy learned from the demonstrations.",
         f'<div class="grid wide">{figures}</div>',
-    )
-
-
-def failure_table(results: Results) -> str:
-    """Why episodes were not solved, by policy."""
-    lines = []
-    for policy in results.policy_names():
-        rows = [row for row in results.rows if row.policy == policy]
-        lines += _failure_lines(policy, series_colours(results)[policy], rows)
-    return _section(
-        "failures",
-        "What went wrong",
-        "Causes of unsolved episodes, over all levels.",
-        '<div class="card scroll"><table><thead><tr><th scope="col">policy</th><th scope="col">cause</th>'
-        '<th scope="col" class="num">episodes</th><th scope="col" class="num">share of all</th>'
-        f'<th scope="col">tasks</th></tr></thead><tbody>{"".join(lines)}</tbody></table></div>',
     )
 
 
@@ -161,7 +126,7 @@ def level_meanings(results: Results) -> str:
         for level, meaning in LEVEL_MEANINGS.items()
         if level != "train" or level in results.levels()
     )
-    return _section(
+    return section(
         "levels",
         "What the levels mean",
         "Each level takes away one more thing that the policy could have learned by heart.",
@@ -179,7 +144,7 @@ def reproduction(results: Results, command: str) -> str:
         for policy, what in results.policies.items()
         if "sha256" in what
     )
-    return _section(
+    return section(
         "repeat",
         "Repeat this",
         "The same command gives the same numbers, with any number of workers.",
@@ -194,10 +159,6 @@ def summary_line(results: Results) -> str:
     return prose(findings(results))
 
 
-def _section(name: str, title: str, lead: str, body: str) -> str:
-    return f'<section id="{name}"><h2>{prose(title)}</h2><p>{prose(lead)}</p>{body}</section>'
-
-
 def _meter(mean: LevelMean) -> str:
     text = f"{mean.level}: {per_cent(mean.mean)}, 95 % interval {span(mean.interval)}"
     return (
@@ -205,49 +166,6 @@ def _meter(mean: LevelMean) -> str:
         f'<span class="track"><i style="width:{100 * mean.mean:.1f}%"></i></span>'
         f"<b>{per_cent(mean.mean)}</b></div>"
     )
-
-
-def _level_rows(results: Results, level: str, policies: list[str]) -> str:
-    name = LEVEL_NAMES.get(level, level)
-    rows = [
-        f'<tr class="level"><th scope="rowgroup">{prose(level)}</th>'
-        f'<td colspan="{len(policies)}">{prose(name)}</td></tr>'
-    ]
-    for task in results.tasks(level):
-        cells = "".join(_rate_cell(results.row(policy, task, level)) for policy in policies)
-        rows.append(f'<tr><th scope="row">{prose(_breakable(task))}</th>{cells}</tr>')
-    means = {mean.policy: mean for mean in results.level_means() if mean.level == level}
-    cells = "".join(_mean_cell(means.get(policy)) for policy in policies)
-    rows.append(f'<tr class="mean"><th scope="row">mean of {len(results.tasks(level))}</th>{cells}</tr>')
-    return f"<tbody>{''.join(rows)}</tbody>"
-
-
-def _rate_cell(row: Row | None) -> str:
-    if row is None:
-        return "<td>–</td>"
-    return (
-        f'<td class="rate" style="--share:{row.rate:.3f}"><b>{_exact(row.rate)}</b>'
-        f"<small>{span(row.interval)} · {row.successes}/{row.episodes}</small></td>"
-    )
-
-
-def _exact(rate: float) -> str:
-    """Whole per cent where the rate is, as with 50 or 100 episodes, else one decimal."""
-    return per_cent(rate, 0 if round(1000 * rate) % 10 == 0 else 1)
-
-
-def _mean_cell(mean: LevelMean | None) -> str:
-    if mean is None:
-        return "<td>–</td>"
-    return (
-        f'<td class="rate" style="--share:{mean.mean:.3f}"><b>{per_cent(mean.mean, 1)}</b>'
-        f"<small>{span(mean.interval)}</small></td>"
-    )
-
-
-def _breakable(name: str) -> str:
-    """Let long names break after their underscores."""
-    return name.replace("_", "_\u200b")
 
 
 def _clip_card(clip: Clip) -> str:
@@ -275,25 +193,6 @@ def _prompt_part(part: str | bytes) -> str:
     return f'<img src="{_data_uri(part, "image/png")}" alt="[image]">'
 
 
-def _failure_lines(policy: str, colour: str, rows: list[Row]) -> list[str]:
-    causes: Counter[str] = Counter()
-    tasks: dict[str, Counter[str]] = {}
-    for row in rows:
-        for kind, count in row.failures.items():
-            causes[kind] += count
-            tasks.setdefault(kind, Counter())[row.task] += count
-    total = sum(row.episodes for row in rows)
-    name = f'<span class="dot" style="--series:var({colour})"></span>{prose(policy)}'
-    if not causes:
-        return [f'<tr><td class="name">{name}</td><td colspan="4">every episode was solved</td></tr>']
-    return [
-        f'<tr><td class="name">{name if index == 0 else ""}</td><td>{prose(kind)}</td>'
-        f'<td class="num">{count}</td><td class="num">{per_cent(count / total, 1)}</td>'
-        f'<td class="long">{prose(_by_task(tasks[kind]))}</td></tr>'
-        for index, (kind, count) in enumerate(sorted(causes.items(), key=lambda item: (-item[1], item[0])))
-    ]
-
-
 def _tasks_of(results: Results, level: str) -> str:
     tasks = results.tasks(level)
     if not tasks:
@@ -303,7 +202,3 @@ def _tasks_of(results: Results, level: str) -> str:
 
 def _data_uri(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def _by_task(counts: Counter[str]) -> str:
-    return ", ".join(f"{task} {count}" for task, count in sorted(counts.items()))

@@ -23,11 +23,28 @@ _ROLES = {
     "random": "Actions drawn at random. The least that a policy must beat.",
     "untrained": "The same network before any training.",
     "run": "Trained policy: sees only the prompt and two camera images.",
+    "remote": "Policy behind a server: sees only the prompt and two camera images.",
 }
-
+_CONTROL_MEANINGS = {
+    "no_prompt": "The prompt is a full stop in every episode. What is still solved, the table gives away.",
+    "other_prompt_images": "The prompt has its own words, with images of another episode of the task.",
+    "scrambled_words": "The prompt has its own images; each word is some word of the vocabulary.",
+    "shuffled_objects": "Objects have other numbers, so that the order in which they were made says nothing.",
+    "detected_boxes": "Objects are found by a detector in the pixels, not given by the simulator.",
+}
 
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
+
+
+def control_name(control: str) -> str:
+    """Name of a control as words."""
+    return control.replace("_", " ")
+
+
+def control_meaning(control: str) -> str:
+    """One sentence on what a control takes from the policy."""
+    return _CONTROL_MEANINGS.get(control, "See the documentation of the evaluation.")
 
 
 def role(results: Results, policy: str) -> str:
@@ -59,6 +76,43 @@ def per_cent(fraction: float, decimals: int = 0) -> str:
     return f"{100 * fraction:.{decimals}f} %"
 
 
+def exact(fraction: float) -> str:
+    """Whole per cent where the rate is, as with 50 or 100 episodes, else one decimal."""
+    return per_cent(fraction, 0 if round(1000 * fraction) % 10 == 0 else 1)
+
+
+def points(difference: float, decimals: int = 1) -> str:
+    """Write a difference of rates in percentage points, with its sign.
+
+    Example:
+        >>> points(0.043), points(-0.5)
+        ('+4.3', '−50.0')
+    """
+    return f"{100 * difference:+.{decimals}f}".replace("-", "−")
+
+
+def points_span(interval: tuple[float, float], decimals: int = 1) -> str:
+    """Write the interval of a difference.
+
+    Example:
+        >>> points_span((-0.02, 0.3))
+        '−2.0 … +30.0'
+    """
+    return " … ".join(points(end, decimals) for end in interval)
+
+
+def probability(p_value: float) -> str:
+    """Write a p-value with as many digits as matter.
+
+    Example:
+        >>> probability(0.0402), probability(0.3), probability(1e-7)
+        ('0.040', '0.30', '< 0.001')
+    """
+    if p_value < 0.001:
+        return "< 0.001"
+    return f"{p_value:.3f}" if p_value < 0.1 else f"{p_value:.2f}"
+
+
 def span(interval: tuple[float, float]) -> str:
     """Write an interval in whole per cent, without the sign."""
     return f"{round(100 * interval[0])}–{round(100 * interval[1])}"
@@ -81,8 +135,8 @@ def listed(names: list[str]) -> str:
 
 def headline(results: Results) -> str:
     """The finding in one line: what the trained policy, or else the first one, reaches on its first level."""
-    means = results.level_means()
-    trained = [mean for mean in means if results.policies.get(mean.policy, {}).get("kind") == "run"]
+    means = [mean for mean in results.level_means() if not mean.control] or results.level_means()
+    trained = [m for m in means if results.policies.get(m.policy, {}).get("kind") in ("run", "remote")]
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
     return f"{first.policy} solves {per_cent(first.mean)} of {first.level} episodes ({tasks})"
@@ -92,7 +146,8 @@ def findings(results: Results) -> str:
     """All level means as one sentence a policy."""
     sentences = []
     for policy in results.policy_names():
-        rates = [f"{per_cent(m.mean)} on {m.level}" for m in results.level_means() if m.policy == policy]
+        means = [m for m in results.level_means() if (m.policy, m.control) == (policy, "")]
+        rates = [f"{per_cent(mean.mean)} on {mean.level}" for mean in means]
         sentences.append(f"{policy}: {', '.join(rates)}")
     return "; ".join(sentences) + "."
 

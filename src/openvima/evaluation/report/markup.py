@@ -1,0 +1,25 @@
+"""Pieces of HTML that several sections of the report share."""
+
+from openvima.evaluation.report.wording import prose
+
+DOT = '<span class="dot"></span>'  # in the colour of its policy
+
+
+def section(name: str, title: str, lead: str, body: str) -> str:
+    """A part of the page under a heading, with a sentence on what it shows."""
+    return f'<section id="{name}"><h2>{prose(title)}</h2><p>{prose(lead)}</p>{body}</section>'
+
+
+def breakable(name: str) -> str:
+    """Let long names break after their underscores."""
+    return name.replace("_", "_\u200b")
+
+
+def policy_head(policy: str, colour: str) -> str:
+    """Head of a policy's column; the colour is a CSS variable."""
+    return f'<th scope="col" style="--series:var({colour})">{DOT}{prose(policy)}</th>'
+
+
+def folded(summary: str, body: str) -> str:
+    """Something to unfold on request."""
+    return f'<details class="card fold"><summary>{prose(summary)}</summary>{body}</details>'

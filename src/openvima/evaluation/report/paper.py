@@ -1,0 +1,264 @@
+"""Tables of an evaluation for papers: the same content as Markdown and as LaTeX."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from openvima.evaluation.comparison import CONTROL_MARK, Comparison, Difference
+from openvima.evaluation.report.published import leading_models, published_tasks
+from openvima.evaluation.report.wording import control_name
+from openvima.evaluation.results import LevelMean, Results
+
+_NOISE_MARK = "≈"
+_LATEX_TEXT = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "–": "--",
+    "−": "$-$",
+    "≈": r"$\approx$",
+    "×": r"$\times$",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A number with its interval, as fractions; shown in per cent.
+
+    Args:
+        value: The number.
+        interval: Its 95 % interval.
+        signed: Whether it is a difference.
+        mark: Put behind it.
+    """
+
+    value: float
+    interval: tuple[float, float]
+    signed: bool = False
+    mark: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A row of a table: its name, and as many cells as the table has columns besides."""
+
+    name: str
+    cells: tuple[Estimate | str, ...]
+    starts_group: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table before it is written in any language.
+
+    Args:
+        label: Short name for references, of letters and hyphens.
+        caption: What it shows.
+        columns: Heads, the first that of the names.
+        lines: Rows.
+    """
+
+    label: str
+    caption: str
+    columns: tuple[str, ...]
+    lines: tuple[Line, ...]
+
+
+def paper_tables(results: Results, comparisons: Sequence[Comparison] = ()) -> list[Table]:
+    """Choose what a paper would print: level means, tasks by level of each policy, controls, differences."""
+    by_policy = [_task_table(results, policy) for policy in results.policy_names()]
+    with_controls = [
+        _control_table(results, policy)
+        for policy in results.policy_names()
+        if any(row.policy == policy and row.control for row in results.rows)
+    ]
+    return [_mean_table(results), *by_policy, *with_controls, *map(_difference_table, comparisons)]
+
+
+def markdown(tables: Sequence[Table]) -> str:
+    """Write tables in Markdown, each with its caption above."""
+    return "\n".join(_markdown_table(table) for table in tables)
+
+
+def latex(tables: Sequence[Table]) -> str:
+    r"""Write tables in LaTeX; they need `\usepackage{booktabs}`."""
+    head = "% Needs \\usepackage{booktabs} and UTF-8 input; made with `openvima report --latex`.\n"
+    return head + "\n".join(_latex_table(table) for table in tables)
+
+
+def latex_text(text: str) -> str:
+    r"""Escape text for LaTeX.
+
+    Example:
+        >>> print(latex_text("follow_order: 50 %"))
+        follow\_order: 50 \%
+    """
+    return "".join(_LATEX_TEXT.get(letter, letter) for letter in text)
+
+
+def _mean_table(results: Results) -> Table:
+    levels = results.levels()
+    means = _means(results)
+    lines = [
+        Line(policy, tuple(_mean_cell(means.get((policy, "", level))) for level in levels))
+        for policy in results.policy_names()
+    ]
+    sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
+    caption = (
+        f"Success rates in per cent, means over the tasks of each level ({sizes}), with 95 % intervals. "
+        f"{_made_of(results)}"
+    )
+    if any(published_tasks(level) for level in levels):
+        for number, model in enumerate(leading_models()):
+            cells = tuple(model.written(level).replace("*", "") for level in levels)
+            lines.append(Line(f"{model.name} (published)", cells, starts_group=number == 0))
+        caption += (
+            " Rows marked “published” were not measured here: they are those of the VIMA and MIDAS papers, "
+            "over all tasks of a level, in another simulator, and mostly read off figures."
+        )
+    return Table("levels", caption, ("policy", *levels), tuple(lines))
+
+
+def _task_table(results: Results, policy: str) -> Table:
+    levels = [level for level in results.levels() if any(r.level == level for r in _plain(results, policy))]
+    tasks = list(dict.fromkeys(row.task for row in _plain(results, policy)))
+    means = _means(results)
+    lines = []
+    for task in tasks:
+        rows = [results.row(policy, task, level) for level in levels]
+        lines.append(Line(task, tuple(Estimate(row.rate, row.interval) if row else "–" for row in rows)))
+    cells = tuple(_mean_cell(means.get((policy, "", level))) for level in levels)
+    lines.append(Line("mean", cells, starts_group=True))
+    caption = f"Success rates of {policy} in per cent, with 95 % intervals. {_made_of(results, policy)}"
+    return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
+
+
+def _control_table(results: Results, policy: str) -> Table:
+    levels, means = results.levels(), _means(results)
+    controls = dict.fromkeys(row.control for row in results.rows if row.policy == policy)
+    lines = [
+        Line(
+            control_name(control) if control else "none",
+            tuple(_mean_cell(means.get((policy, control, level))) for level in levels),
+        )
+        for control in controls
+    ]
+    caption = (
+        f"Success rates of {policy} in per cent under controls, means over the tasks of each level, with 95 "
+        f"% "
+        "intervals."
+    )
+    return Table(f"controls-{policy}", caption, ("control", *levels), tuple(lines))
+
+
+def _difference_table(comparison: Comparison) -> Table:
+    first = comparison.levels[0]
+    lines = [
+        _difference_line(difference, starts_group=difference is first)
+        for difference in (*comparison.tasks, *comparison.means)
+    ]
+    a, b = (name.replace(CONTROL_MARK, ", ") for name in (comparison.a, comparison.b))
+    caption = (
+        f"Success rate of {a} minus that of {b} on the same episodes, in percentage points, with 95 % "
+        f"intervals; "
+        "episodes solved by one of them only; exact McNemar test, p as it is and after Holm for the number "
+        "of rows "
+        f"of its kind. {_NOISE_MARK}: inside the noise, the interval holds 0."
+    )
+    columns = ("task", "level", "difference", "one only", "p", "p (Holm)")
+    return Table(f"difference-{a}-{b}".replace(", ", "-"), caption, columns, tuple(lines))
+
+
+def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
+    mark = _NOISE_MARK if difference.verdict == "noise" else ""
+    cells = (
+        difference.level or "all",
+        Estimate(difference.difference, difference.interval, signed=True, mark=mark),
+        f"{difference.only_a} : {difference.only_b}",
+        f"{difference.p_value:.2g}",
+        f"{difference.p_holm:.2g}",
+    )
+    return Line(difference.task or f"mean of {len(difference.pairs)}", cells, starts_group)
+
+
+def _plain(results: Results, policy: str) -> list:
+    return [row for row in results.rows if (row.policy, row.control) == (policy, "")]
+
+
+def _means(results: Results) -> dict[tuple[str, str, str], LevelMean]:
+    return {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
+
+
+def _mean_cell(mean: LevelMean | None) -> Estimate | str:
+    return "–" if mean is None else Estimate(mean.mean, mean.interval)
+
+
+def _made_of(results: Results, policy: str | None = None) -> str:
+    """Say how many episodes a number is made of."""
+    rows = [row for row in results.rows if not row.control and policy in (None, row.policy)]
+    episodes = sorted({row.episodes for row in rows})
+    return f"{episodes[0]}{'' if len(episodes) == 1 else f' to {episodes[-1]}'} episodes a task."
+
+
+def _markdown_table(table: Table) -> str:
+    rows = [[line.name, *(_markdown_cell(cell) for cell in line.cells)] for line in table.lines]
+    lines = [
+        [_markdown_text(head) for head in table.columns],
+        ["---", *["---:"] * (len(table.columns) - 1)],
+        *[[_markdown_text(row[0]), *row[1:]] for row in rows],
+    ]
+    return f"{_markdown_text(table.caption)}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _markdown_cell(cell: Estimate | str) -> str:
+    if isinstance(cell, str):
+        return _markdown_text(cell)
+    low, high = (_number(end, cell.signed) for end in cell.interval)
+    return f"{_number(cell.value, cell.signed)} ({low} to {high}){f' {cell.mark}' if cell.mark else ''}"
+
+
+def _markdown_text(text: str) -> str:
+    for letter in "\\|_*<`[]":
+        text = text.replace(letter, f"\\{letter}")
+    return text
+
+
+def _latex_table(table: Table) -> str:
+    rows = []
+    for line in table.lines:
+        rule = "\\midrule\n" if line.starts_group else ""
+        cells = [latex_text(line.name), *(_latex_cell(cell) for cell in line.cells)]
+        rows.append(f"{rule}{' & '.join(cells)} \\\\\n")
+    head = " & ".join(latex_text(column) for column in table.columns)
+    return (
+        "\\begin{table}\n\\centering\n"
+        f"\\caption{{{latex_text(table.caption)}}}\n\\label{{tab:{_label(table.label)}}}\n"
+        f"\\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}\n\\toprule\n{head} \\\\\n\\midrule\n"
+        f"{''.join(rows)}\\bottomrule\n\\end{{tabular}}\n\\end{{table}}\n"
+    )
+
+
+def _latex_cell(cell: Estimate | str) -> str:
+    if isinstance(cell, str):
+        return latex_text(cell)
+    value, low, high = (latex_text(_number(x, cell.signed)) for x in (cell.value, *cell.interval))
+    mark = f" {latex_text(cell.mark)}" if cell.mark else ""
+    return f"{value} {{\\footnotesize({low} to {high})}}{mark}"
+
+
+def _label(text: str) -> str:
+    """A name that LaTeX takes as a label: other letters become hyphens."""
+    return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text)
+
+
+def _number(fraction: float, signed: bool) -> str:
+    return f"{100 * fraction:{'+' if signed else ''}.1f}".replace("-", "−")

@@ -1,0 +1,99 @@
+"""Tables for papers: right numbers, and text that Markdown and LaTeX can read."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from openvima.evaluation.comparison import compare_pairs
+from openvima.evaluation.report.paper import latex, latex_text, markdown, paper_tables
+from openvima.evaluation.results import Results
+
+
+@pytest.fixture
+def tables(results):
+    controlled = tuple(
+        replace(row, control="no_prompt", outcomes=row.outcomes[5:])
+        for row in results.rows
+        if row.policy == "mine"
+    )
+    more = replace(results, rows=(*results.rows, *controlled))
+    return paper_tables(more, compare_pairs(more, [("mine", "random"), ("mine:no_prompt", "mine")]))
+
+
+def cells_of(text: str, name: str) -> list[list[str]]:
+    """Cells of all rows of that name in Markdown."""
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith(f"| {name} ")]
+    return [line[1:] for line in lines]
+
+
+def test_tables_are_those_a_paper_prints(tables):
+    assert [table.label for table in tables] == [
+        "levels",
+        "tasks-mine",
+        "tasks-oracle",
+        "tasks-random",
+        "controls-mine",
+        "difference-mine-random",
+        "difference-mine-no_prompt-mine",
+    ]
+    assert all(len(line.cells) == len(table.columns) - 1 for table in tables for line in table.lines)
+
+
+def test_markdown_holds_means_with_intervals_and_published_numbers(tables, results):
+    text = markdown(tables)
+    mean = next(m for m in results.level_means() if (m.policy, m.level) == ("mine", "L1"))
+    expected = f"75.0 ({100 * mean.interval[0]:.1f} to {100 * mean.interval[1]:.1f})"
+    assert cells_of(text, "mine")[0][0] == expected
+    assert cells_of(text, "rotate")[0][0] == "90.0 (59.6 to 98.2)"
+    assert cells_of(text, "VIMA 200M (published)") == [["81.5", "78.7"]]
+    assert "were not measured here" in text
+
+
+def test_markdown_has_equally_many_cells_in_all_rows_of_a_table(tables):
+    for block in markdown(tables).split("\n\n"):
+        rows = [re.sub(r"\\.", "", line) for line in block.splitlines() if line.startswith("|")]
+        assert len({row.count("|") for row in rows}) <= 1
+
+
+def test_differences_show_counts_and_mark_noise(tables):
+    text = markdown(tables)
+    rotate = cells_of(text, "rotate")
+    assert [rotate[3][0], rotate[3][2]] == ["L1", "9 : 0"]
+    assert any("≈" in cell for cells in cells_of(text, "stack\\<b>") for cell in cells)
+
+
+def test_latex_is_balanced_and_escaped(tables):
+    text = latex(tables)
+    begun, ended = re.findall(r"\\begin{(\w+)}", text), re.findall(r"\\end{(\w+)}", text)
+    assert sorted(begun) == sorted(ended) and len(begun) == 2 * len(tables)
+    body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+    plain = re.sub(r"\\[\\%&_#${}]", "", re.sub(r"\\(label|begin|end){[^}]*}", "", body))
+    assert plain.count("{") == plain.count("}")
+    assert not re.search(r"[_#~^<>%]", plain)
+    assert plain.count("$") % 2 == 0
+    assert "stack\\textless{}b\\textgreater{}" in text
+    assert "−" not in text and "–" not in text and "≈" not in text
+
+
+def test_latex_rows_have_as_many_cells_as_columns(tables):
+    for part in latex(tables).split("\\begin{tabular}")[1:]:
+        columns = len(re.match(r"{(\w+)}", part)[1])
+        rows = [line for line in part.splitlines() if line.endswith("\\\\")]
+        assert rows and all(len(re.findall(r"(?<!\\)&", row)) == columns - 1 for row in rows)
+        assert all(f"\\{rule}rule" in part for rule in ("top", "mid", "bottom"))
+
+
+def test_labels_are_fit_for_references(tables):
+    labels = re.findall(r"\\label{tab:([^}]*)}", latex(tables))
+    assert len(set(labels)) == len(labels)
+    assert all(re.fullmatch(r"[A-Za-z0-9-]+", label) for label in labels)
+
+
+def test_all_special_letters_of_latex_are_escaped():
+    assert latex_text(r"\&%$#_{}~^") == (r"\textbackslash{}\&\%\$\#\_\{\}\textasciitilde{}\textasciicircum{}")
+
+
+def test_own_tasks_only_make_tables_without_published_rows(results):
+    own = Results(tuple(r for r in results.rows if r.task != "rotate"), policies=results.policies)
+    assert "rotate" not in markdown(paper_tables(own))
