@@ -27,9 +27,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(replace(NETWORK, out=tmp_path_factory.mktemp("whole")))
 
 
-@pytest.mark.parametrize("workers", [2, 4])
-def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Path, workers: int) -> None:
-    assert evaluate(replace(NETWORK, out=tmp_path, workers=workers)).read_bytes() == whole.read_bytes()
+def test_four_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
+    """Two are compared with one in `test_runner.py`; starting processes with torch takes seconds each."""
+    assert evaluate(replace(NETWORK, out=tmp_path, workers=4)).read_bytes() == whole.read_bytes()
 
 
 def test_ray_gives_the_same_bytes_and_is_stopped(

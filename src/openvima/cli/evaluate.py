@@ -10,6 +10,8 @@ import tyro
 from openvima.cli.progress import progress_bar
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from openvima.evaluation import Results
 
 
@@ -120,24 +122,51 @@ def main(
 
 
 def print_results(results: "Results") -> None:
-    """Print success rates as a table, a row a task and level, a column a policy."""
+    """Print success rates as a table, a row a task and level, a column a policy; then the controls."""
     from rich.console import Console
     from rich.table import Table
 
-    columns = list(dict.fromkeys((row.policy, row.control) for row in results.rows))
-    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
+    policies = results.policy_names()
+    means = {(mean.policy, mean.level): mean for mean in results.level_means() if not mean.control}
     table = Table("level", title="solved episodes in per cent (95 % interval)")
     table.add_column("task", overflow="fold", min_width=12)
-    for policy, control in columns:
-        table.add_column(f"{policy}\n{control.replace('_', ' ')}".strip(), justify="right", no_wrap=True)
+    for policy in policies:
+        table.add_column(policy, justify="right", no_wrap=True)
     for level in results.levels():
         for task in results.tasks(level):
-            rows = (results.row(policy, task, level, control) for policy, control in columns)
+            rows = (results.row(policy, task, level) for policy in policies)
             table.add_row(level, task, *(_cell(row.rate, row.interval) if row else "–" for row in rows))
-        level_means = (means.get((*column, level)) for column in columns)
+        level_means = (means.get((policy, level)) for policy in policies)
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
-        table.add_row(level, "mean", *cells, style="bold", end_section=True)
+        table.add_row(level, "mean", *cells, style="bold")
+        strict = (_strict_mean(results, policy, level) for policy in policies)
+        table.add_row(level, "mean, strict limit", *strict, end_section=True)
     Console().print(table)
+    if any(row.control for row in results.rows):
+        Console().print(_control_table(results))
+
+
+def _control_table(results: "Results") -> "Table":
+    """Level means of each policy, plain and under each control."""
+    from rich.table import Table
+
+    table = Table("policy", "control", title="what the scores are made of: means in per cent (95 % interval)")
+    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
+    for level in results.levels():
+        table.add_column(level, justify="right", no_wrap=True)
+    for policy, control in dict.fromkeys((row.policy, row.control) for row in results.rows):
+        found = (means.get((policy, control, level)) for level in results.levels())
+        cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in found)
+        table.add_row(policy, control.replace("_", " ") or "–", *cells)
+    return table
+
+
+def _strict_mean(results: "Results", policy: str, level: str) -> str:
+    """The mean with the time limit of the oracle, which is two steps shorter."""
+    rows = [row for task in results.tasks(level) if (row := results.row(policy, task, level)) is not None]
+    return (
+        f"{100 * sum(row.successes_strict / row.episodes for row in rows) / len(rows):.1f}" if rows else "–"
+    )
 
 
 def _cell(rate: float, interval: tuple[float, float]) -> str:
