@@ -4,6 +4,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from openvima.evaluation.comparison import Comparison, compare
+    from openvima.evaluation.merging import merge
     from openvima.evaluation.picture import save_episode_picture
     from openvima.evaluation.protocol import EvaluationConfig
     from openvima.evaluation.report import write_report
@@ -13,11 +15,14 @@ if TYPE_CHECKING:
     from openvima.evaluation.statistics import wilson_interval
 
 _HOMES = {
+    "Comparison": "comparison",
     "EpisodeOutcome": "results",
     "EvaluationConfig": "protocol",
     "Results": "results",
     "Row": "results",
+    "compare": "comparison",
     "evaluate": "runner",
+    "merge": "merging",
     "save_episode_picture": "picture",
     "score": "scoring",
     "wilson_interval": "statistics",
@@ -25,11 +30,14 @@ _HOMES = {
 }
 
 __all__ = [
+    "Comparison",
     "EpisodeOutcome",
     "EvaluationConfig",
     "Results",
     "Row",
+    "compare",
     "evaluate",
+    "merge",
     "save_episode_picture",
     "score",
     "wilson_interval",

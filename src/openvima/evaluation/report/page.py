@@ -16,6 +16,15 @@ from openvima.evaluation.report.wording import headline, prose
 from openvima.evaluation.results import Results
 from openvima.files import write_whole
 
+_OPTIONS = {  # settings that a command names where they are not these
+    "assets": "procedural",
+    "difficulty": "easy",
+    "batch": 16,
+    "boxes": "",
+    "device": "cpu",
+    "precision": "",
+}
+
 
 def write_report(
     results: Results,
@@ -73,11 +82,16 @@ def default_command(results: Results) -> str:
         f"{name}=RUN" if results.policies.get(name, {}).get("kind") == "run" else name
         for name in results.policy_names()
     ]
-    return (
-        f"openvima evaluate --policy {','.join(policies)} --tasks {','.join(config.get('tasks', ['all']))} "
-        f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)} "
-        f"--seed {config.get('seed', 0)} --out DIR"
-    )
+    words = [
+        f"openvima evaluate --policy {','.join(policies)} --tasks {','.join(config.get('tasks', ['all']))}",
+        f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)}",
+        f"--seed {config.get('seed', 0)}",
+        *[f"--{name} {config[name]}" for name, usual in _OPTIONS.items() if config.get(name, usual) != usual],
+        *(["--compat"] if config.get("compat") else []),
+        *([f"--controls {','.join(config['controls'])}"] if config.get("controls") else []),
+        "--out DIR",
+    ]
+    return " ".join(words)
 
 
 def _page(results: Results, body: str, notes: Sequence[str]) -> str:

@@ -149,7 +149,9 @@ def reproduction(results: Results, command: str) -> str:
         "Repeat this",
         "The same command gives the same numbers, with any number of workers.",
         f'<div class="card"><pre><code>{prose(command)}</code></pre>'
-        '<p class="note">The outcome of every single episode is in results.json, next to this page.</p>'
+        '<p class="note">The outcome of every single episode is in the results.json of the evaluation. '
+        "Objects are cut out along the simulator’s own outlines, as in most published scores; a detector "
+        "finds them only where the control “detected boxes” says so.</p>"
         f'<ul class="versions">{versions}{weights}</ul></div>',
     )
 

@@ -85,9 +85,10 @@ def points(difference: float, decimals: int = 1) -> str:
     """Write a difference of rates in percentage points, with its sign.
 
     Example:
-        >>> points(0.043), points(-0.5)
-        ('+4.3', '−50.0')
+        >>> points(0.043), points(-0.5), points(-0.004, 0)
+        ('+4.3', '−50.0', '−0.4')
     """
+    decimals = max(decimals, int(abs(difference) < 0.0095))  # no rounding to "−0"
     return f"{100 * difference:+.{decimals}f}".replace("-", "−")
 
 
