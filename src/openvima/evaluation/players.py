@@ -132,6 +132,7 @@ def _load_policy(
     from openvima.policies import load_policy
 
     if is_remote(source):
+        _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
         return RemotePolicy(source)
     options: dict[str, Any] = {"device": device}  # Any: of several kinds
     if precision:

@@ -123,7 +123,10 @@ def _pack_array(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     if not isinstance(value, np.ndarray):
-        raise MessageError(f"a {type(value).__name__} cannot be sent; allowed are plain values and arrays.")
+        raise MessageError(
+            f"a value of type {type(value).__name__} cannot be sent; allowed are plain values, with whole "
+            "numbers of up to 64 bits, and arrays."
+        )
     dtype = value.dtype.newbyteorder("<")
     _checked_dtype(dtype.str)
     data = np.ascontiguousarray(value, dtype).tobytes()

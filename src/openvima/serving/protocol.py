@@ -109,7 +109,9 @@ def decode_action(message: object, where: str = "action") -> dict[str, np.ndarra
     return message  # type: ignore[return-value]  # checked
 
 
-def read_request(message: object, kind: str, field: str, max_length: int) -> list:
+def read_list(
+    message: object, kind: str, field: str, max_length: int, *, optional: tuple[str, ...] = ()
+) -> list:
     """Take the list out of a request or reply.
 
     Args:
@@ -117,11 +119,12 @@ def read_request(message: object, kind: str, field: str, max_length: int) -> lis
         kind: The type that it has, which was looked at before.
         field: Name of the list.
         max_length: Entries that it may have at most.
+        optional: What else the message may hold.
 
     Raises:
         MessageError: The list is missing or too long, or there is something else.
     """
-    fields = _map(message, kind, required=("type", field), optional=("protocol",))
+    fields = _map(message, kind, required=("type", field), optional=optional)
     values = _typed(fields[field], list, f"{kind}: {field}")
     if len(values) > max_length:
         raise MessageError(f"{kind} has {len(values)} {field}; at most {max_length} are allowed.")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 HEALTH_PATH = "/healthz"
-CLOSE_S = 5.0  # for the other side to say goodbye
+CLOSE_S = 2.0  # for the other side to say goodbye
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
 _TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `serve_client` says what matters

@@ -14,7 +14,7 @@ from openvima.serving.protocol import (
     decode_observation,
     decode_prompt,
     encode_action,
-    read_request,
+    read_list,
     type_of,
 )
 
@@ -57,13 +57,15 @@ class Session:
             assert isinstance(message, dict)  # it has a type
             protocol = message.get("protocol", PROTOCOL)
             check_protocol(protocol, theirs="the client", ours="this server")
-            prompts = read_request(message, "reset", "prompts", self._max_episodes)
+            prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
             self._reset([decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(prompts)])
             return pack({"type": "reset", "episodes": self._num_episodes})
         if kind == "act":
-            seen = read_request(message, "act", "observations", self._max_episodes)
+            seen = read_list(message, "act", "observations", self._max_episodes)
             actions = self._act([decode_observation(one, f"observation {n}") for n, one in enumerate(seen)])
-            return pack({"type": "act", "actions": actions})
+            near_ties = getattr(self._policy, "near_ties", None)
+            told = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
+            return pack({"type": "act", "actions": actions, **told})
         if isinstance(message, dict) and "type" not in message:
             return pack(self._infer(message))
         raise MessageError(

@@ -1,0 +1,194 @@
+"""Servers that are not there, speak otherwise, fall silent or break off: the client says which, and what."""
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+from websockets.server import ServerProtocol
+
+from openvima.errors import ConfigError, PolicyError, ServerError
+from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread
+from openvima.serving.packing import pack
+from openvima.serving.protocol import TOKEN_VARIABLE
+from served_policies import (
+    ForMany,
+    Telltale,
+    made_up_observation,
+    made_up_prompt,
+    scripted_server,
+    told,
+)
+
+RESET = {"type": "reset", "episodes": 1}
+
+
+def port_of(url: str) -> int:
+    return int(url.rpartition(":")[2])
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://127.0.0.1:8000", "ws://", "ws://:8000", "ws://host:port", "ws://host:99999", "ws://h:1/#x"],
+)
+def test_what_is_no_address_is_named(url: str) -> None:
+    with pytest.raises(ConfigError, match="ws://HOST:PORT"):
+        RemotePolicy(url)
+
+
+def test_a_server_that_is_not_there_is_named_with_what_starts_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(ServerError, match=f"127.0.0.1:{port}.*openvima serve"):
+        RemotePolicy(f"ws://127.0.0.1:{port}")
+
+
+def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    with serve_in_thread(ForMany(), ServerConfig(port=0, token="secret")) as url:
+        for token in (None, "wrong"):
+            with pytest.raises(ServerError, match=f"HTTP 401.*{TOKEN_VARIABLE}"):
+                RemotePolicy(url, token=token)
+        RemotePolicy(url, token="secret").close()
+        monkeypatch.setenv(TOKEN_VARIABLE, "secret")
+        RemotePolicy(url).close()
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"protocol": "openvima-policy/2"}, f"speaks 'openvima-policy/2', this client '{PROTOCOL}'"),
+        ({"hello": "other server"}, "speaks None, this client"),
+        ([1], "a list came where a map must be"),
+        ("not now", "refuses: not now"),
+        ({"protocol": PROTOCOL, "mean": np.zeros(3)}, "other than plain values"),
+    ],
+)
+def test_a_server_of_another_protocol_is_told_apart(metadata: object, message: str) -> None:
+    with scripted_server(metadata=metadata) as url, pytest.raises(ServerError, match=message):
+        RemotePolicy(url)
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ("no, thanks", "refuses: no, thanks"),
+        (b"\xc1", f"does not keep to {PROTOCOL}"),
+        ([], "a list came where a map must be"),
+        ({"type": "reset"}, "has type 'reset'"),
+        ({"type": "act"}, "lacks 'actions'"),
+        ({"type": "act", "actions": []}, "must be 1"),
+        ({"type": "act", "actions": [3]}, "action 0 is 3; it must be a map"),
+        ({"type": "act", "actions": [{"pose0_position": [0.5, 0.5]}]}, "'pose0_position' is a list"),
+        ({"type": "act", "actions": [None], "near_ties": 3}, "near_ties"),
+        ({"type": "act", "actions": [None], "extra": 3}, "'extra', which nobody knows"),
+        (b"\0" * (17 * 2**20), "has ended the connection"),
+    ],
+)
+def test_an_answer_that_must_not_be_is_an_error_that_names_the_server(frame: object, message: str) -> None:
+    with scripted_server(RESET, frame) as url, RemotePolicy(url) as policy:
+        policy.reset([made_up_prompt(1)])
+        with pytest.raises(ServerError, match=message) as error:
+            policy.act([made_up_observation(1)])
+        assert url in str(error.value)
+
+
+def test_a_connection_lost_within_an_episode_is_an_error_and_the_next_reset_makes_a_new_one() -> None:
+    with serve_in_thread(ForMany()) as url:
+        policy = RemotePolicy(url)
+        policy.reset([made_up_prompt(1)])
+    with pytest.raises(ServerError, match=f"{url} has ended the connection"):
+        policy.act([made_up_observation(1)])
+    with pytest.raises(ServerError, match="no policy server answers"):
+        policy.reset([made_up_prompt(2)])
+    with pytest.raises(PolicyError, match="call reset"):
+        policy.act([made_up_observation(1)])
+    with serve_in_thread(ForMany(), ServerConfig(port=port_of(url))):
+        policy.reset([made_up_prompt(3)])
+        assert told(policy.act([made_up_observation(4)])[0]) == (3, 4, 1)
+        policy.close()
+
+
+def test_another_policy_at_the_same_address_is_refused() -> None:
+    with serve_in_thread(ForMany(), about={"policy": {"sha256": "one"}}) as url:
+        policy = RemotePolicy(url)
+    config = ServerConfig(port=port_of(url))
+    with serve_in_thread(ForMany(), config, about={"policy": {"sha256": "two"}}):
+        with pytest.raises(ServerError, match="another policy than before"):
+            policy.reset([made_up_prompt(1)])
+        policy.close()
+
+
+def test_a_server_that_falls_silent_is_given_up() -> None:
+    with (
+        scripted_server(RESET, lambda connection: connection.recv()) as url,
+        RemotePolicy(url, timeout_s=0.1) as policy,
+    ):
+        policy.reset([made_up_prompt(1)])
+        with pytest.raises(ServerError, match=r"has not answered within 0\.1 s"):
+            policy.act([made_up_observation(1)])
+
+
+def test_a_server_that_does_not_read_is_given_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def greet() -> None:
+            peer, _ = listening.accept()
+            protocol = ServerProtocol()
+            protocol.receive_data(peer.recv(2**16))
+            (request,) = protocol.events_received()
+            protocol.send_response(protocol.accept(request))
+            protocol.send_binary(pack({"protocol": PROTOCOL}))
+            peer.sendall(b"".join(protocol.data_to_send()))
+            done.wait(10)
+            peer.close()
+
+        done = threading.Event()
+        thread = threading.Thread(target=greet)
+        thread.start()
+        policy = RemotePolicy(f"ws://127.0.0.1:{listening.getsockname()[1]}", timeout_s=0.2)
+        big = made_up_prompt(1)
+        big.images["thing"].rgb["top"] = np.zeros((3, 4000, 4000), np.uint8)
+        with pytest.raises(ServerError, match=r"has ended the connection|has not answered"):
+            policy.reset([big])
+        done.set()
+        thread.join()
+
+
+def test_batches_above_the_limits_are_refused_before_they_are_sent() -> None:
+    config = ServerConfig(port=0, max_episodes=2, max_message_bytes=1024)
+    with serve_in_thread(Telltale(), config) as url, RemotePolicy(url) as policy:
+        with pytest.raises(PolicyError, match=r"at most 2 episodes at once, got 3.*--max-episodes"):
+            policy.reset([made_up_prompt(1)] * 3)
+        with pytest.raises(PolicyError, match=r"prompts take [\d,]+ bytes.*--max-message-mb"):
+            policy.reset([made_up_prompt(1)] * 2)
+        policy.reset([made_up_prompt(1)])
+
+
+def test_acting_out_of_order_is_refused_here() -> None:
+    with serve_in_thread(Telltale()) as url, RemotePolicy(url) as policy:
+        with pytest.raises(PolicyError, match="call reset"):
+            policy.act([made_up_observation(1)])
+        policy.reset([made_up_prompt(1)])
+        with pytest.raises(PolicyError, match="got 2 observations for 1 prompts"):
+            policy.act([made_up_observation(1)] * 2)
+
+
+def test_near_ties_are_passed_on_where_the_server_tells_them() -> None:
+    class Unsure(Telltale):
+        near_ties = (np.True_,)
+
+    with serve_in_thread(Unsure()) as url, RemotePolicy(url) as policy:
+        policy.reset([made_up_prompt(1)])
+        assert policy.near_ties == []
+        policy.act([made_up_observation(1)])
+        assert policy.near_ties == [True]
+
+
+def test_a_policy_that_nobody_closes_frees_its_place() -> None:
+    with serve_in_thread(Telltale()) as url:
+        policy = RemotePolicy(url)
+        policy.reset([made_up_prompt(1)])
+        del policy
+        with RemotePolicy(url) as other:
+            other.reset([made_up_prompt(2)])

@@ -1,0 +1,154 @@
+"""Policies are scored through a server as they are without one."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from served_policies import Telltale
+
+torch = pytest.importorskip("torch")
+
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.errors import ConfigError, ServerError  # noqa: E402
+from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E402
+from openvima.evaluation.players import PolicyPlayer, load_player  # noqa: E402
+from openvima.evaluation.protocol import Batch, policy_sources  # noqa: E402
+from openvima.policies import RandomPolicy, load_policy  # noqa: E402
+from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.presets import preset  # noqa: E402
+from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
+
+TASKS = ("rotate", "sweep_without_exceeding")
+TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2, report=False)
+ABOUT = {"policy": {"name": "tiny", "sha256": "ab12"}}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """As servers compute by default."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def network_policy() -> NetworkPolicy:
+    """A network whose outputs depend visibly on everything; fresh heads start near zero."""
+    network = build_network(preset("nano"), seed=3)
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return NetworkPolicy(network)
+
+
+def test_a_network_acts_through_a_server_as_here_bit_for_bit(network_policy: NetworkPolicy) -> None:
+    envs = [TabletopEnv(task, domain="user") for task in ("visual_manipulation", "rotate", "novel_noun")]
+    views = [[env.reset(seed=step)[0] for env in envs] for step in range(3)]
+    prompts = [env.prompt for env in envs]
+    local = network_policy.new_session()
+    with (
+        serve_in_thread(network_policy) as url,
+        RemotePolicy(url) as remote,
+        RemotePolicy(url) as other,
+    ):
+        for policy in (local, remote):
+            policy.reset(prompts)
+        other.reset(prompts[::-1])  # another client, in between
+        for seen in (*views[:2], [views[2][0], None, views[2][2]]):
+            expected, got = local.act(seen), remote.act(seen)
+            other.act(views[0][::-1])
+            assert remote.near_ties == local.near_ties
+            for one, two in zip(expected, got, strict=True):
+                if one is None:
+                    assert two is None
+                    continue
+                assert two is not None and two.keys() == one.keys()
+                for key, array in one.items():
+                    np.testing.assert_array_equal(two[key], array, strict=True)
+
+
+def test_sessions_share_the_weights_and_nothing_else(network_policy: NetworkPolicy) -> None:
+    env = TabletopEnv("rotate", domain="user")
+    env.reset(seed=1)
+    network_policy.reset([env.prompt])
+    session = network_policy.new_session()
+    assert session.network is network_policy.network
+    with pytest.raises(ValueError, match="call reset"):
+        session.act([None])
+    session.reset([env.prompt] * 2)
+    assert len(network_policy.act([None])) == 1
+
+
+def test_an_evaluation_through_a_server_has_the_outcomes_of_one_without(
+    network_policy: NetworkPolicy, tmp_path: Path
+) -> None:
+    network_policy.save_pretrained(tmp_path / "net")
+    served = load_policy(str(tmp_path / "net"))
+    here = evaluate(replace(TINY, policies=(f"tiny={tmp_path / 'net'}",), out=tmp_path / "here"))
+    with serve_in_thread(served, about=ABOUT) as url:
+        config = replace(TINY, policies=(f"tiny={url}",), out=tmp_path / "there")
+        there = evaluate(config)
+    local, remote = Results.read(here), Results.read(there)
+    assert remote.rows == local.rows
+    assert remote.policies["tiny"]["kind"] == "remote"
+    assert remote.policies["tiny"]["metadata"]["policy"] == ABOUT["policy"]
+    assert "limits" not in remote.policies["tiny"]["metadata"]
+    assert url not in there.read_text()
+
+
+def test_two_workers_play_through_one_server(tmp_path: Path) -> None:
+    short = replace(TINY, tasks=("rotate",), episodes=2, batch=1)
+    config = replace(short, policies=("random",), out=tmp_path / "one")
+    alone = Results.read(evaluate(config))
+    with serve_in_thread(RandomPolicy()) as url:
+        config = replace(short, policies=(f"random={url}",), out=tmp_path / "two", workers=2)
+        assert Results.read(evaluate(config)).rows == alone.rows
+
+
+def test_outcomes_are_kept_for_the_same_server_and_played_again_for_another(tmp_path: Path) -> None:
+    config = replace(TINY, tasks=("rotate",), out=tmp_path)
+    with serve_in_thread(RandomPolicy(), about=ABOUT) as url:
+        config = replace(config, policies=(f"tiny={url}",))
+        path = evaluate(config)
+        first = path.read_bytes()
+        assert evaluate(config).read_bytes() == first
+    same_port = ServerConfig(port=int(url.rpartition(":")[2]))
+    with serve_in_thread(RandomPolicy(1), same_port, about={"policy": {"sha256": "other"}}):
+        with pytest.raises(ConfigError, match="another evaluation"):
+            evaluate(config)
+        evaluate(replace(config, force=True))
+        assert json.loads(path.read_text())["policies"]["tiny"]["metadata"]["policy"] == {"sha256": "other"}
+
+
+def test_a_policy_that_fails_on_its_server_is_an_error_that_names_the_server(tmp_path: Path) -> None:
+    class Bad(Telltale):
+        def reset(self, prompts):
+            raise RuntimeError("out of memory")
+
+    with serve_in_thread(Bad()) as url:
+        config = replace(TINY, policies=(f"bad={url}",), out=tmp_path)
+        with pytest.raises(ServerError, match=rf"{url} refuses: the policy failed: RuntimeError: out of"):
+            evaluate(config)
+    with pytest.raises(ServerError, match="no policy server answers"):
+        evaluate(config)
+
+
+def test_one_connection_serves_all_that_a_process_plays() -> None:
+    with serve_in_thread(Telltale()) as url:  # which lets in one client at a time
+        batch = Batch("p", url, "rotate", "L1", first_seed=0, episodes=1)
+        for fingerprint in ("for the scores", "for the films"):
+            assert isinstance(load_player(batch, fingerprint), PolicyPlayer)
+
+
+def test_servers_are_named_after_their_address_or_as_asked() -> None:
+    sources = policy_sources(("ws://127.0.0.1:8000", "mine=wss://a.example/x?b=c", "ws://[::1]:8000/p?q=r"))
+    assert [source.name for source in sources] == ["127.0.0.1-8000", "mine", "1-8000"]
+    assert [source.source for source in sources][1:] == ["wss://a.example/x?b=c", "ws://[::1]:8000/p?q=r"]
+    assert {source.kind for source in sources} == {"remote"}

@@ -1,0 +1,233 @@
+"""What a server says to its clients, and to whom it says nothing."""
+
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from http.client import HTTPConnection
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from openvima import __version__
+from openvima.errors import ConfigError
+from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread
+from openvima.serving.packing import pack, unpack
+from openvima.serving.protocol import encode_observation, encode_prompt
+from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
+
+CONFIG = ServerConfig(port=0, max_episodes=3, max_connections=2, max_message_bytes=2**16)
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    with serve_in_thread(ForMany(), CONFIG, about={"policy": {"name": "telltale"}}) as url:
+        yield url
+
+
+@pytest.fixture
+def connection(url: str) -> Iterator[ClientConnection]:
+    """A connection after its first frame."""
+    with connect(url, compression=None, proxy=None) as connection:
+        connection.recv()
+        yield connection
+
+
+def ask(connection: ClientConnection, message: object) -> Any:  # Any: an answer, or the text of an error
+    connection.send(message if isinstance(message, str | bytes) else pack(message))
+    answer = connection.recv()
+    return answer if isinstance(answer, str) else unpack(answer)
+
+
+def reset_with(*numbers: int, **more: object) -> dict:
+    prompts = [encode_prompt(made_up_prompt(number)) for number in numbers]
+    return {"type": "reset", "prompts": prompts, **more}
+
+
+def act_with(*numbers: int | None) -> dict:
+    seen = [None if n is None else encode_observation(made_up_observation(n)) for n in numbers]
+    return {"type": "act", "observations": seen}
+
+
+def fetch(url: str, path: str) -> tuple[int, bytes]:
+    client = HTTPConnection(urlsplit(url).netloc, timeout=10)
+    try:
+        client.request("GET", path)
+        response = client.getresponse()
+        return response.status, response.read()
+    finally:
+        client.close()
+
+
+def test_the_first_frame_says_what_is_served(url: str) -> None:
+    with connect(url, proxy=None) as connection:
+        first = unpack(connection.recv())  # type: ignore[arg-type]
+    assert first == {
+        "protocol": PROTOCOL,
+        "versions": {"openvima": __version__},
+        "policy": {"name": "telltale"},
+        "limits": {"message_bytes": 2**16, "episodes": 3, "idle_s": 600.0},
+    }
+
+
+def test_a_batch_is_reset_and_acts(connection: ClientConnection) -> None:
+    assert ask(connection, reset_with(5, 6)) == {"type": "reset", "episodes": 2}
+    answer = ask(connection, act_with(7, 8))
+    assert [told(action) for action in answer["actions"]] == [(5, 7, 1), (6, 8, 1)]
+    answer = ask(connection, act_with(None, 9))
+    assert answer["actions"][0] is None and told(answer["actions"][1]) == (6, 9, 2)
+    assert answer.keys() == {"type", "actions"} and answer["type"] == "act"
+
+
+def test_single_observations_are_answered_with_the_bare_action(connection: ClientConnection) -> None:
+    first = {**encode_observation(made_up_observation(3)), "prompt": encode_prompt(made_up_prompt(2))}
+    assert told(ask(connection, first)) == (2, 3, 1)
+    assert told(ask(connection, made_up_observation(4) | {"ee": np.int64(1)})) == (2, 4, 2)
+    assert told(ask(connection, first)) == (2, 3, 1)
+
+
+def test_two_clients_at_once_do_not_mix(url: str) -> None:
+    with RemotePolicy(url) as one, RemotePolicy(url) as two:
+        one.reset([made_up_prompt(1), made_up_prompt(2)])
+        two.reset([made_up_prompt(9)])
+        for step in (1, 2, 3):
+            assert [told(a) for a in two.act([made_up_observation(8)])] == [(9, 8, step)]
+            seen = [made_up_observation(3), made_up_observation(4)]
+            assert [told(a) for a in one.act(seen)] == [(1, 3, step), (2, 4, step)]
+        two.reset([made_up_prompt(7)])
+        assert [told(a) for a in one.act(seen)] == [(1, 3, 4), (2, 4, 4)]
+
+
+@pytest.mark.parametrize(
+    ("request_", "refusal"),
+    [
+        (act_with(1), "no episodes yet"),
+        (made_up_observation(1), "no episodes yet"),
+        (reset_with(), "no prompts"),
+        (reset_with(1, 2, 3, 4), "4 prompts; at most 3 are allowed"),
+        (reset_with(1, protocol="openvima-policy/2"), "the client speaks 'openvima-policy/2', this server"),
+        (reset_with(1, hint="easy"), "'hint', which nobody knows"),
+        ({"type": "reset", "prompts": [3]}, "prompt 0 is 3; it must be a map"),
+        ({"type": "reset"}, "lacks 'prompts'"),
+        ({"type": "dance"}, "type 'reset' or 'act'"),
+        ({"prompt": 3}, "lacks 'rgb', 'ee'"),
+        ([1, 2], "must be a map"),
+        ("a text frame", "binary frames"),
+        (b"\xc1", "no whole MessagePack"),
+    ],
+)
+def test_a_bad_request_is_refused_with_a_reason_and_the_next_is_answered(
+    connection: ClientConnection, request_: object, refusal: str
+) -> None:
+    answer = ask(connection, request_)
+    assert isinstance(answer, str) and refusal in answer and "Traceback" not in answer
+    assert ask(connection, reset_with(1))["episodes"] == 1
+
+
+def test_acting_with_another_number_of_observations_is_refused(connection: ClientConnection) -> None:
+    ask(connection, reset_with(1, 2))
+    assert "1 observations for 2 prompts" in ask(connection, act_with(1))
+    assert len(ask(connection, act_with(1, 2))["actions"]) == 2
+
+
+def test_a_reset_that_was_refused_ends_no_episode(connection: ClientConnection) -> None:
+    ask(connection, reset_with(1))
+    assert isinstance(ask(connection, reset_with(1, 2, 3, 4)), str)
+    assert told(ask(connection, act_with(5))["actions"][0]) == (1, 5, 1)
+
+
+def test_a_message_above_the_limit_ends_the_connection_with_a_reason(connection: ClientConnection) -> None:
+    connection.send(b"\0" * (2**16 + 1))
+    with pytest.raises(ConnectionClosed) as closed:
+        connection.recv()
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
+def test_more_clients_than_allowed_are_told_so_and_let_in_later(url: str) -> None:
+    with connect(url, proxy=None) as one, connect(url, proxy=None) as two:
+        assert one.recv() == two.recv()
+        with connect(url, proxy=None) as three:
+            assert "has its 2 clients" in str(three.recv())
+    with RemotePolicy(url) as policy:
+        policy.reset([made_up_prompt(1)])
+
+
+def test_a_policy_without_sessions_serves_one_client_at_a_time() -> None:
+    with serve_in_thread(Telltale()) as url:
+        with RemotePolicy(url) as one, connect(url, proxy=None) as two:
+            assert "has its one client" in str(two.recv())
+            one.reset([made_up_prompt(1)])
+            assert told(one.act([made_up_observation(2)])[0]) == (1, 2, 1)
+        with RemotePolicy(url) as later:
+            later.reset([made_up_prompt(3)])
+
+
+def test_health_is_answered_over_http_with_and_without_a_token(url: str) -> None:
+    assert fetch(url, "/healthz") == (200, b"OK\n")
+    assert fetch(url, "/")[0] == 426  # Upgrade Required
+    with serve_in_thread(Telltale(), replace(CONFIG, token="secret")) as guarded:
+        assert fetch(guarded, "/healthz") == (200, b"OK\n")
+
+
+@pytest.mark.parametrize("header", [None, "Bearer", "Bearer ", "Bearer wrong", "secret", "Bearer secret2"])
+def test_who_does_not_know_the_token_is_turned_away(header: str | None) -> None:
+    with serve_in_thread(Telltale(), replace(CONFIG, token="secret")) as url:
+        headers = {"Authorization": header} if header else None
+        with pytest.raises(InvalidStatus, match="401"), connect(url, additional_headers=headers, proxy=None):
+            pass
+        for scheme in ("Bearer", "Api-Key"):
+            headers = {"Authorization": f"{scheme} secret"}
+            with connect(url, additional_headers=headers, proxy=None) as connection:
+                assert unpack(connection.recv())["protocol"] == PROTOCOL  # type: ignore[arg-type]
+
+
+def test_web_pages_are_turned_away(url: str) -> None:
+    with pytest.raises(InvalidStatus, match="403"), connect(url, origin="http://evil.example", proxy=None):  # type: ignore[arg-type]
+        pass
+
+
+def test_a_policy_that_fails_costs_an_answer_but_no_traceback_or_client() -> None:
+    class Failing(Telltale):
+        def act(self, observations):
+            if observations[0]["ee"] == 0:
+                raise KeyError("inner\nworkings")
+            if observations[0]["ee"] == 2:
+                return super().act(observations) * 2
+            if observations[0]["ee"] == 3:
+                return [{"pose0_position": np.array([None])}]
+            return super().act(observations)
+
+    with serve_in_thread(Failing()) as url, connect(url, proxy=None) as connection:
+        connection.recv()
+        ask(connection, reset_with(1))
+        failed = ask(connection, made_up_observation(1) | {"ee": 0})
+        assert "the policy failed: KeyError" in failed and "Traceback" not in failed
+        assert "2 actions for 1 observations" in ask(connection, made_up_observation(1) | {"ee": 2})
+        assert "dtype" in ask(connection, made_up_observation(1) | {"ee": 3})
+        assert told(ask(connection, made_up_observation(1)))[:2] == (1, 1)
+
+
+def test_a_port_that_is_taken_is_named() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(ConfigError, match=f"port {port}"),
+            serve_in_thread(Telltale(), ServerConfig(port=port)),
+        ):
+            pass
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "", "192.168.0.7", "example.org", "localhost.example.org"])
+def test_a_host_that_others_reach_needs_a_token(host: str) -> None:
+    with pytest.raises(ConfigError, match="give a token"):
+        ServerConfig(host=host)
+    assert ServerConfig(host=host, token="secret").host == host
+
+
+def test_settings_out_of_range_are_named_together_and_tokens_are_not_shown() -> None:
+    with pytest.raises(ConfigError, match=r"port is 70000.*max_episodes is 0"):
+        ServerConfig(port=70000, max_episodes=0)
+    assert "secret" not in repr(ServerConfig(token="secret"))
