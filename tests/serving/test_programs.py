@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ from urllib.request import urlopen
 import pytest
 
 from openvima.cli.main import main
-from openvima.serving import RemotePolicy
+from openvima.serving import PROTOCOL, RemotePolicy
 from openvima.serving.protocol import TOKEN_VARIABLE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "policy_server.py"
@@ -110,6 +111,13 @@ def test_the_example_is_short_and_is_scored_without_openvima(
     assert all(outcome["kind"] != "invalid action" for outcome in row["outcomes"])
     policies = json.loads((tmp_path / "results.json").read_text())["policies"]
     assert policies["mine"]["metadata"]["policy"] == {"name": "into-the-largest"}
+
+
+def test_the_code_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = EXAMPLE.parents[1] / "docs" / "serving.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    exec(compile(code, str(page), "exec"), {})
+    assert capsys.readouterr().out == f"{PROTOCOL}\n"
 
 
 def wait_for_port(port: int, server: subprocess.Popen[str]) -> None:
