@@ -19,9 +19,9 @@ DTYPES = {
     for dtype in map(np.dtype, ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f2", "f4", "f8"))
 }
 MAX_AXES = 8
-# MessagePack packs a list of a million empty maps into a megabyte, which Python needs 70 times. These bound
-# what a message can take beyond its own size: the values in all its lists and maps, and those of one list,
-# for which memory is set aside before they are read.
+# A million empty maps are a megabyte of MessagePack and 72 MB of Python. These bound what a message can take
+# beyond its own size: the values in all its lists and maps; and those of one, as older versions of msgpack
+# set memory aside for what a list claims to hold. A batch of 256 episodes has some 170,000 values.
 MAX_VALUES = 1_000_000
 MAX_LENGTH = 4096
 
