@@ -25,14 +25,17 @@ class Columns:
 
     Args:
         records: Column name to what `to_pylist` gives of the column's row, for all that is no array.
-        numbers: Column name to lists of lists of numbers: poses, the four arrays of the actions, joint paths.
+        numbers: Column name to numbers, shape (rows, width): poses, the four arrays of the actions, and the
+            waypoints of all joint paths, one path after the other.
+        path_lengths: Waypoints of each joint path.
         images: Column name to images, uint8: `prompt_rgb_…` and `rgb_…` (N, 128, 256, 3), `prompt_segm_…`
             and `segm_…` (N, 128, 256).
         content_hash: 32 hexadecimal digits that are equal for equal content; docs/format.md derives them.
     """
 
     records: dict[str, Any]  # Any: texts, numbers, and lists and dictionaries of them
-    numbers: dict[str, list]
+    numbers: dict[str, np.ndarray]
+    path_lengths: list[int]
     images: dict[str, np.ndarray]
     content_hash: str
 
@@ -76,9 +79,8 @@ def columns_of(demo: "Demonstration", scratch: Scratch | None = None) -> Columns
         digest.update(array.reshape(-1).view(np.uint8).data)  # while it is in the processor's cache
         if name not in arrays:
             images[name] = array
-    numbers = {name: array.reshape(-1, array.shape[-1]).tolist() for name, array in arrays.items()}
-    numbers["joint_paths"] = [path.tolist() for path in demo.joint_paths]
-    return Columns(records, numbers, images, digest.hexdigest())
+    numbers = {name: array.reshape(-1, array.shape[-1]) for name, array in arrays.items()}
+    return Columns(records, numbers, path_lengths, images, digest.hexdigest())
 
 
 def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.ndarray:

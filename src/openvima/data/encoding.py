@@ -1,5 +1,6 @@
 """Demonstrations to record batches."""
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,14 +11,14 @@ import pyarrow as pa
 
 from openvima.data.columns import Scratch, columns_of
 from openvima.data.records import Demonstration
-from openvima.data.schema import CODECS, COLUMNS, IMAGES, SCHEMA_VERSION
+from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
 
 _METADATA_KEY = b"openvima"
 _NAMES = COLUMNS.names
-_IMAGE_LISTS: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in IMAGES}
-# All other columns are made at once: each call into Arrow costs some microseconds.
-_OTHER_NAMES = [name for name in _NAMES if name not in IMAGES]
+_TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
+# Texts, records and single numbers are made at once: each call into Arrow costs some microseconds.
+_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS)]
 _OTHERS = pa.struct([COLUMNS.field(name) for name in _OTHER_NAMES])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
@@ -124,19 +125,41 @@ def encode(
     columns = columns_of(demo, scratch)
     others = {
         **columns.records,
-        **columns.numbers,
         "content_hash": columns.content_hash,
         "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
     }
     cells = dict(zip(_OTHER_NAMES, pa.array([others], type=_OTHERS).flatten(), strict=True))
+    for name, rows in columns.numbers.items():
+        if name == "joint_paths":
+            cells[name] = _paths_cell(rows, columns.path_lengths)
+        else:
+            cells[name] = _cell(_rows(rows, _TYPES[name].value_type), _TYPES[name])
     for name, images in columns.images.items():
-        cells[name] = _image_cell(images if with_images else images[:0], _IMAGE_LISTS[name])
+        seen = images if with_images else images[:0]
+        cells[name] = _cell(_rows(seen, _TYPES[name].value_type), _TYPES[name])
     return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=COLUMNS)
 
 
-def _image_cell(images: np.ndarray, dtype: pa.ListType) -> pa.ListArray:
-    """A column of one row that lists images, without a copy."""
-    flat = pa.Array.from_buffers(pa.uint8(), images.size, [None, pa.py_buffer(images)], null_count=0)
-    items = pa.Array.from_buffers(dtype.value_type, len(images), [None], null_count=0, children=[flat])
-    ends = pa.py_buffer(np.array([0, len(images)], np.int32))
-    return pa.Array.from_buffers(dtype, 1, [None, ends], null_count=0, children=[items])
+def _rows(rows: np.ndarray, dtype: pa.FixedSizeListType) -> pa.Array:
+    """An array as rows of equal size, without a copy."""
+    flat = pa.Array.from_buffers(dtype.value_type, rows.size, [None, pa.py_buffer(rows)], null_count=0)
+    return pa.Array.from_buffers(dtype, len(rows), [None], null_count=0, children=[flat])
+
+
+def _cell(items: pa.Array, dtype: pa.ListType) -> pa.ListArray:
+    """A column of one row that lists items."""
+    return _lists(items, [0, len(items)], dtype)
+
+
+def _paths_cell(waypoints: np.ndarray, lengths: Sequence[int]) -> pa.ListArray:
+    """A column of one row that lists, for each step, the waypoints of the arm."""
+    dtype = _TYPES["joint_paths"]
+    steps = _lists(
+        _rows(waypoints, dtype.value_type.value_type), [0, *itertools.accumulate(lengths)], dtype.value_type
+    )
+    return _cell(steps, dtype)
+
+
+def _lists(items: pa.Array, ends: Sequence[int], dtype: pa.ListType) -> pa.ListArray:
+    offsets = pa.py_buffer(np.array(ends, np.int32))
+    return pa.Array.from_buffers(dtype, len(ends) - 1, [None, offsets], null_count=0, children=[items])

@@ -98,3 +98,4 @@ ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     **{f"{kind}segm_{view}": ("u1", IMAGE_SHAPE) for kind in ("prompt_", "") for view in VIEWS},
 }
 IMAGES = frozenset(name for name, (_, shape) in ARRAYS.items() if shape[:2] == IMAGE_SHAPE)
+NUMBERS = frozenset({*ARRAYS, "joint_paths"}) - IMAGES
