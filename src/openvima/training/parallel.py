@@ -17,6 +17,7 @@ from torch import nn
 from openvima.errors import ConfigError
 
 Sharding = Literal["ddp", "fsdp"]
+ENTRANCES = ("keys_values",)  # methods besides `forward` by which layers are called
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,8 @@ class Parallel:
         if self.is_sharded:
             return _sharded(module, self.device)
         ids = [self.device.index] if self.device.type == "cuda" else None
-        return nn.parallel.DistributedDataParallel(module, device_ids=ids)
+        # Without broadcasts processes may call it different numbers of times; no buffer changes in training.
+        return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
     @contextlib.contextmanager
     def shares(self, module: nn.Module, *, last: bool) -> Iterator[None]:
@@ -74,13 +76,13 @@ class Parallel:
                 yield
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Average named numbers over all processes."""
+        """Average named numbers over all processes; one that lacks a name counts as 0."""
         if self.num_ranks == 1:
             return dict(values)
-        names = sorted(values)
-        numbers = torch.tensor([values[name] for name in names], dtype=torch.float64, device=self.device)
-        dist.all_reduce(numbers)
-        return dict(zip(names, (numbers / self.num_ranks).tolist(), strict=True))
+        everywhere: list[dict[str, float]] = [{}] * self.num_ranks
+        dist.all_gather_object(everywhere, dict(values))
+        names = {name: None for part in everywhere for name in part}
+        return {name: sum(part.get(name, 0.0) for part in everywhere) / self.num_ranks for name in names}
 
     def wait(self) -> None:
         """Wait until all processes have come here."""
@@ -160,7 +162,7 @@ def set_whole_state(
 def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
     """Shard the layers of the largest stacks one by one, and the rest together."""
     from torch.distributed.device_mesh import init_device_mesh
-    from torch.distributed.fsdp import fully_shard
+    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
     mesh = init_device_mesh(device.type, (dist.get_world_size(),))
     for part in module.modules():
@@ -168,4 +170,7 @@ def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module
             for layer in part:
                 if any(True for _ in layer.parameters()):
                     fully_shard(layer, mesh=mesh)
+                    for method in ENTRANCES:
+                        if hasattr(layer, method):
+                            register_fsdp_forward_method(layer, method)
     return fully_shard(module, mesh=mesh)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,21 +52,33 @@ class Parts:
         collate: Makes a batch of each part.
         seed: Of the run; every example has a generator of its own for every batch.
         largest: Demonstrations of a part.
+        count: Make exactly so many parts, whatever the lengths; None makes as many as are useful.
     """
 
     collate: Collate
     seed: int
     largest: int
+    count: int | None = None
 
     def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
         """Return the batches of one step, each with its number of steps in demonstrations."""
         parts = []
-        for group in by_length(examples):
-            for start in range(0, len(group), self.largest):
-                part = group[start : start + self.largest]
-                rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
-                parts.append((self.collate(part, rngs), sum(e.tokens.num_steps for e in part)))
+        for part in self._divided(examples):
+            rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
+            parts.append((self.collate(part, rngs), sum(e.tokens.num_steps for e in part)))
         return parts
+
+    def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
+        if self.count is not None:
+            ordered = sorted(examples, key=lambda example: example.tokens.num_steps)
+            ends = [len(ordered) * part // self.count for part in range(self.count + 1)]
+            return [ordered[start:end] for start, end in pairwise(ends)]
+        size = self.largest
+        return [
+            group[start : start + size]
+            for group in by_length(examples)
+            for start in range(0, len(group), size)
+        ]
 
 
 def split_examples(

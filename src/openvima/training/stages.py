@@ -108,6 +108,7 @@ class Cloning:
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
         self._training, self._validation = training, validation
+        self._validated = module if parallel.is_sharded else learner
         self._order = order_of(
             training,
             batch=config.batch,
@@ -131,7 +132,7 @@ class Cloning:
             # Processes average their gradients: each counts by its share of the steps of all.
             share = num_steps * self._parallel.num_ranks / total
             with self._parallel.shares(self._module, last=number == len(parts) - 1):
-                loss, metrics = self._call(batch)
+                loss, metrics = self._call(batch, self._module)
                 (loss * share).backward()
             _add(sums, {"loss": loss, **metrics}, share)
         return sums
@@ -153,7 +154,7 @@ class Cloning:
             if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes at once
                 continue
             for group in by_length(examples):
-                loss, metrics = self._call(collate(group, None))
+                loss, metrics = self._call(collate(group, None), self._validated)
                 share = sum(e.tokens.num_steps for e in group) / total
                 _add(sums, {"loss": loss, **metrics}, share * mine * self._parallel.num_ranks)
         sums = self._parallel.mean(sums)
@@ -163,7 +164,9 @@ class Cloning:
     def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
         config = self._config
         largest = -(-self._order.batch // self._parallel.num_ranks // config.accumulate)
-        parts = Parts(self._learner.collator(), config.seed, max(1, largest))
+        # Sharded weights are gathered at every pass, so all processes must make equally many.
+        count = config.accumulate if self._parallel.is_sharded else None
+        parts = Parts(self._learner.collator(), config.seed, max(1, largest), count)
         stream = BatchStream(self._training, self._order, first=step, transform=parts)
         loader = DataLoader(
             stream,
@@ -174,11 +177,13 @@ class Cloning:
         )
         return iter(loader)
 
-    def _call(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: a learner's own
+    def _call(
+        self, batch: Any, module: nn.Module
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: a learner's own
         device = self._parallel.device
         kind = torch.bfloat16 if self._config.precision == "bfloat16" else None
         with torch.autocast(device.type, kind, enabled=kind is not None):
-            return self._module(batch if device.type == "cpu" else batch.to(device))
+            return module(batch if device.type == "cpu" else batch.to(device))
 
 
 def freeze_crops(learner: PolicyLearner, cache: TokenCache) -> None:

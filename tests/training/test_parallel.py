@@ -1,0 +1,139 @@
+"""Several processes train as one would, and read ahead without changing anything."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.parallel import joined  # noqa: E402
+
+TRAIN = """
+import json, os, sys
+from pathlib import Path
+from openvima.policies import presets
+from openvima.policies.config import PolicyConfig
+from openvima.training import TrainingConfig, train
+
+sizes, settings = json.loads(sys.argv[1])
+presets.PRESETS["tiny-bins"] = lambda: PolicyConfig.from_dict(sizes)
+folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
+kill_at = settings.pop("kill_at", None)
+train(TrainingConfig(**folders, **settings), lambda done, total, note: done == kill_at and os._exit(9))
+"""
+
+
+@pytest.fixture
+def bins(settings, monkeypatch) -> dict:
+    """A network whose loss is a mean over steps, without dropout, which each process draws for itself."""
+
+    def tiny():
+        sizes = presets.preset("vima-nano")
+        trunk = replace(sizes.trunk, width=32, num_layers=1, dropout=0.0)
+        images = replace(sizes.images, width=32)
+        text = replace(sizes.prompt.text, num_layers=1)
+        return replace(sizes, trunk=trunk, images=images, prompt=replace(sizes.prompt, text=text))
+
+    monkeypatch.setitem(presets.PRESETS, "tiny-bins", tiny)
+    changes = {"preset": "tiny-bins", "pretraining_steps": 0, "steps": 6, "batch": 8, "checkpoint_every": 1}
+    return {**settings, **changes, "spurious_probability": 0.3}
+
+
+def run_in_processes(count: int, settings: dict) -> Path:
+    """Train in so many processes, as `torchrun` starts them; with "kill_at" the first one dies then."""
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+    argument = json.dumps([presets.PRESETS["tiny-bins"]().to_dict(), plain])
+    port = str(29_000 + os.getpid() % 5000)
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", TRAIN, argument],
+            env={
+                **os.environ,
+                "RANK": str(rank),
+                "LOCAL_RANK": str(rank),
+                "WORLD_SIZE": str(count),
+                "MASTER_ADDR": "127.0.0.1",
+                "MASTER_PORT": port,
+                "OMP_NUM_THREADS": "1",
+            },
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(count)
+    ]
+    try:
+        errors = [process.communicate(timeout=60)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    codes = [process.returncode for process in processes]
+    assert all(codes) if "kill_at" in settings else not any(codes), errors
+    return Path(settings["out"])
+
+
+def losses(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_alike(ours: Path, theirs: Path) -> None:
+    """The loss curves of training and validation are equal but for the last bits.
+
+    Weights differ more: Adam divides by the size of a gradient, and where that is next to nothing, the last
+    bits of it decide the step.
+    """
+    for a, b in zip(losses(ours), losses(theirs), strict=True):
+        assert a.keys() == b.keys()
+        for name in ("step", "name", "accuracy", "validation_accuracy"):
+            assert a.get(name) == (pytest.approx(b[name]) if name in b else None)
+        for name in ("loss", "validation_loss"):
+            assert a.get(name) == (pytest.approx(b[name], rel=1e-5) if name in b else None)
+
+
+@pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
+def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
+    one = train(TrainingConfig(**{**bins, "out": tmp_path / "one"}))
+    two = run_in_processes(2, {**bins, "out": tmp_path / "two", "sharding": sharding})
+    assert_alike(one, two)
+    load_policy(str(two))
+
+
+@pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
+def test_a_run_of_two_processes_goes_on_with_one(bins, tmp_path, sharding) -> None:
+    whole = train(TrainingConfig(**{**bins, "out": tmp_path / "whole"}))
+    torn = {**bins, "out": tmp_path / "torn", "sharding": sharding}
+    run_in_processes(2, {**torn, "kill_at": 4})
+    assert sorted(path.name for path in (tmp_path / "torn/checkpoints").glob("2-*"))[-1].endswith("000003")
+    assert_alike(whole, train(TrainingConfig(**torn)))
+
+
+def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, tmp_path) -> None:
+    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
+    ahead = train(TrainingConfig(**{**bins, "out": tmp_path / "ahead", "loader_workers": 2}))
+    assert (plain / "metrics.jsonl").read_bytes() == (ahead / "metrics.jsonl").read_bytes()
+    parts = train(TrainingConfig(**{**bins, "out": tmp_path / "parts", "accumulate": 4}))
+    assert_alike(plain, parts)
+
+
+def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:
+    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
+    half = train(TrainingConfig(**{**bins, "out": tmp_path / "half", "precision": "bfloat16"}))
+    for a, b in zip(losses(plain), losses(half), strict=True):
+        if "loss" in a:
+            assert a["loss"] != b["loss"]
+            assert a["loss"] == pytest.approx(b["loss"], rel=0.02)
+
+
+def test_a_device_that_is_not_there_is_named() -> None:
+    with pytest.raises(ConfigError, match="device is 'gpu0'; it must be auto, cpu"), joined("gpu0", "ddp"):
+        pass
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="no GPU can be used"), joined("cuda", "ddp"):
+            pass
