@@ -1,8 +1,10 @@
 """From nothing to a report on the command line, in small."""
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,3 +93,31 @@ def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], 
     assert shown.returncode == 2
     assert words[0] in shown.stdout + shown.stderr
     assert not (tmp_path / "quick").exists()
+
+
+def test_a_killed_training_goes_on_and_is_scored_with_controls(tmp_path: Path, capsys) -> None:
+    demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
+    run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
+    train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--batch", 2]
+    train += ["--steps", 12, "--checkpoint-every", 1, "--threads", 1]
+    words = [sys.executable, "-m", "openvima", *(str(word) for word in train)]
+    process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not any(trained.glob("checkpoints/2-cloning-00000[2-9]")) and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    run(*train)
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "loss" in line] == list(range(1, 13))
+
+    evaluate = ["evaluate", "--policy", f"mine={trained}", "--controls", "no_prompt,shuffled_objects"]
+    run(*evaluate, "--tasks", "rotate", "--levels", "L1", "--episodes", 2, "--videos", 0, "--out", results)
+    rows = json.loads((results / "results.json").read_text(encoding="utf-8"))["rows"]
+    assert {row.get("control", "") for row in rows} == {"", "no_prompt", "shuffled_objects"}
+    run("report", results, "--runs", trained, "--out", tmp_path / "page.html")
+    assert "mine" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    run("report", results, "--latex")
+    assert "rotate" in capsys.readouterr().out

@@ -15,11 +15,12 @@ from openvima.policies import RandomPolicy
 from openvima.tasks import list_tasks, registry
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-SERVER = "policy_server"  # runs until it is stopped; tests/serving/test_example.py scores it
+# Run in tests of their own: one goes on until it is stopped, the other wants to be trained.
+APART = ("policy_server", "custom_learner")
 
 
 @pytest.mark.parametrize(
-    "example", [path for path in EXAMPLES if path.stem != SERVER], ids=lambda path: path.stem
+    "example", [path for path in EXAMPLES if path.stem not in APART], ids=lambda path: path.stem
 )
 def test_the_example_runs_and_is_short(
     example: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -66,7 +66,8 @@ def run(words: Sequence[str]) -> int:
     )
     with progress_bar("training") as report:
         folder = train(config, report, _rollout(config) if config.rollout_every else None)
-    print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
+    if ":" not in config.preset:
+        print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
     print(folder)
     return 0
 

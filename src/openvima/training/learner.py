@@ -65,10 +65,11 @@ class Learner(nn.Module):
         Raises:
             CheckpointError: It is damaged or does not fit.
         """
+        file = folder / WEIGHTS_FILE
         try:
-            self.load_state_dict(load_file(folder / WEIGHTS_FILE))
-        except (OSError, RuntimeError, ValueError) as error:
-            raise CheckpointError(f"{folder / WEIGHTS_FILE} cannot be loaded: {error}") from None
+            self.load_state_dict(read_tensors(file))
+        except RuntimeError as error:
+            raise CheckpointError(f"{file} does not fit: {error}") from None
 
     def description(self) -> dict[str, Any]:  # Any: plain YAML values
         """Return what decides the network, for the run's `config.yaml`."""

@@ -164,13 +164,14 @@ class _Trainer:
         self.parallel, self.report, self.rollout = parallel, report, rollout
         self.board = Board(run.path, wanted=config.tensorboard and parallel.is_first)
         self.started = time.monotonic()
+        self._last = (0, self.started)  # step and time of the last line of metrics
         self.progress = run.resume(learner)
         learner.to(parallel.device)
         self.module: nn.Module = learner
-        self.cloning_steps = config.steps
-        if config.epochs is not None:
-            self.cloning_steps = self._steps_of_epochs(config.epochs)
-        self.stages: list[tuple[int, Callable[[], Stage]]] = [(self.cloning_steps, self._cloning)]
+        self.stages: list[tuple[int, Callable[[], Stage]]] = []
+        self.num_steps = 0  # until both are known, for what is reported on the way
+        steps = config.steps if config.epochs is None else self._steps_of_epochs(config.epochs)
+        self.stages.append((steps, self._cloning))
         if config.pretraining_steps:
             self.stages.insert(0, (config.pretraining_steps, self._matching))
         self.num_steps = sum(steps for steps, _ in self.stages)
@@ -244,8 +245,11 @@ class _Trainer:
             seconds = round(time.monotonic() - self.started, 2)
             self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
             self.board.add(stage.name, metrics, self.progress.step)
+        now, step = time.monotonic(), self.progress.step
+        rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
+        self._last = (step, now)
         note = "  ".join(f"{name} {value:.3f}" for name, value in list(metrics.items())[:3])
-        self._report(f"{stage.name}: {note}")
+        self._report(f"{stage.name}: {note}  {rate:.1f} steps/s")
 
     def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
         """Validate, note whether it is the best, and write a checkpoint.

@@ -1,0 +1,140 @@
+"""Networks of one's own in the training loop, and what surrounds it: trials, TensorBoard, compiling."""
+
+import json
+import runpy
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.errors import CheckpointError, ConfigError  # noqa: E402
+from openvima.evaluation import score  # noqa: E402
+from openvima.evaluation.trial import Trial  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.learner import Learner, make_learner  # noqa: E402
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "custom_learner.py"
+
+
+@pytest.fixture
+def example(monkeypatch) -> str:
+    """The preset that the example is."""
+    monkeypatch.syspath_prepend(str(EXAMPLE.parent))
+    yield "custom_learner:make"
+    sys.modules.pop("custom_learner", None)
+
+
+def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, tmp_path, capsys) -> None:
+    out = tmp_path / "run"
+    words = ["train", "--data", data, "--out", out, "--preset", example, "--batch", 8, "--steps", 6]
+    words += ["--checkpoint-every", 3, "--validation-share", 0.2]
+    assert main([str(word) for word in words]) == 0
+    whole = {path.name: path.read_bytes() for path in out.rglob("model.safetensors")}
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert {"pick_accuracy", "validation_pick_accuracy"} <= {name for line in lines for name in line}
+    shutil.rmtree(out / "checkpoints" / "2-cloning-000006")
+    (out / "checkpoints" / "best.txt").unlink()
+    if not (out / "checkpoints" / "2-cloning-000003").is_dir():  # only the best and the latest are kept
+        shutil.rmtree(out)
+    assert main([str(word) for word in words]) == 0
+    assert {path.name: path.read_bytes() for path in out.rglob("model.safetensors")} == whole
+    policy = runpy.run_path(str(EXAMPLE))["MatcherPolicy"](out)
+    row = score({"mine": policy}, tasks=("visual_manipulation",), levels=("L1",), episodes=2).rows[0]
+    assert row.episodes == 2
+    assert len(EXAMPLE.read_text().splitlines()) <= 120
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere:make", "No module named 'nowhere'"),
+        ("json:make", "no attribute 'make'"),
+        ("builtins:dict", "builtins:dict returned a dict; it must return a Learner"),
+    ],
+)
+def test_a_learner_that_cannot_be_made_is_named(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_learner(name)
+
+
+def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
+    with pytest.raises(ConfigError, match="neither pretraining_steps nor t5"):
+        train(TrainingConfig(**{**settings, "preset": example}))
+
+
+def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
+    learner = make_learner(example)
+    (tmp_path / "model.safetensors").write_bytes(b"half")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        learner.read(tmp_path)
+    Learner.write(learner, tmp_path, {"other": torch.zeros(1)})
+    with pytest.raises(CheckpointError, match=r"Missing key.*embed"):
+        learner.read(tmp_path)
+
+
+def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
+    seen = []
+
+    def rollout(checkpoint: Path) -> dict[str, float]:
+        seen.append(checkpoint.name)
+        return Trial(("rotate",), episodes=2)(checkpoint)
+
+    config = TrainingConfig(**settings, rollout_every=4)
+    train(config, rollout=rollout)
+    assert seen == ["2-cloning-000004"]
+    lines = [json.loads(line) for line in (config.out / "metrics.jsonl").read_text().splitlines()]
+    (trial,) = [line for line in lines if "rollout_success" in line]
+    assert (trial["step"], trial["rollout_rotate"]) == (4, trial["rollout_success"])
+
+
+def test_checkpoints_that_are_to_be_kept_are_kept(settings) -> None:
+    run = train(TrainingConfig(**settings, keep_every=2))
+    kept = {folder.name for folder in (run / "checkpoints").glob("2-*")}
+    assert kept == {"2-cloning-000002", "2-cloning-000004", "2-cloning-000006"}
+
+
+def test_a_run_of_epochs_takes_as_many_steps_as_they_have(settings) -> None:
+    config = {**settings, "pretraining_steps": 0, "epochs": 1.5, "batch": 4, "validation_share": 0.0}
+    run = train(TrainingConfig(**config))
+    assert [folder.name for folder in (run / "checkpoints").glob("2-*-000009")] == ["2-cloning-000009"]
+
+
+@pytest.mark.skipif(find_spec("tensorboard") is None, reason="tensorboard is not installed")
+@pytest.mark.filterwarnings("ignore")  # of the reader, whose package is not ours
+def test_tensorboard_shows_the_metrics(settings) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = train(TrainingConfig(**settings))
+    events = EventAccumulator(str(run / "tensorboard_log"))
+    events.Reload()
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    told = {line["step"]: line["loss"] for line in lines if line["stage"] == 1 and "loss" in line}
+    shown = {event.step: event.value for event in events.Scalars("2-cloning/loss")}
+    assert shown == pytest.approx(told)
+    assert not (
+        train(TrainingConfig(**{**settings, "out": run.with_name("b"), "tensorboard": False}))
+        / "tensorboard_log"
+    ).exists()
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_last_checkpoint(settings, monkeypatch) -> None:
+    from openvima.training.stages import Cloning
+
+    backward = Cloning.backward
+
+    def exploding(self, step: int) -> dict[str, float]:
+        metrics = backward(self, step)
+        if step == 3:
+            self.parameters[0].grad.fill_(float("nan"))
+        return metrics
+
+    monkeypatch.setattr(Cloning, "backward", exploding)
+    with pytest.raises(ConfigError, match=r"the gradient is nan at step 3 of 2-cloning.*lower learning_rate"):
+        train(TrainingConfig(**settings))
+    assert (settings["out"] / "checkpoints" / "2-cloning-000002").is_dir()
