@@ -29,7 +29,7 @@ _CONTROL_MEANINGS = {
     "no_prompt": "The prompt is a full stop in every episode. What is still solved, the table gives away.",
     "other_prompt_images": "The prompt has its own words, with images of another episode of the task.",
     "scrambled_words": "The prompt has its own images; each word is some word of the vocabulary.",
-    "shuffled_objects": "Objects have other numbers; by default those say nothing, under compat they are in order of making.",
+    "shuffled_objects": "Objects have other numbers, which only under compat say how the table was laid.",
     "detected_boxes": "Objects are found by a detector in the pixels, not given by the simulator.",
 }
 
