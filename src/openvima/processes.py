@@ -12,9 +12,11 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from typing import Any, Protocol
 
-from openvima.errors import WorkerError
+from openvima.errors import ConfigError, WorkerError
 
 POLL_S = 0.2
+PARENT_END_S = 5.0  # from the end of its pipes to the end of a process
+MAX_WORKERS = 1024
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
 _counters: Any = None
@@ -45,6 +47,7 @@ def in_processes(
         An item and its result, as they finish.
 
     Raises:
+        ConfigError: There cannot be so many processes.
         WorkerError: A worker was killed from outside.
         Exception: Whatever a job raised; the other jobs are stopped.
     """
@@ -73,9 +76,11 @@ def in_watched_processes(
         An item and its result, as they finish.
 
     Raises:
+        ConfigError: There cannot be so many processes.
         WorkerError: A worker was killed from outside.
         Exception: Whatever a job raised; the other jobs are stopped.
     """
+    check_workers(num_workers)
     watch = watch or (lambda counts: None)
     if num_workers == 1 or len(items) <= 1:
         yield from _one_after_the_other(job, items, num_counts, watch)
@@ -108,6 +113,16 @@ def in_watched_processes(
             raise
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def check_workers(num_workers: int) -> None:
+    """Refuse a number of processes that cannot be.
+
+    Raises:
+        ConfigError: It is out of range.
+    """
+    if not 1 <= num_workers <= MAX_WORKERS:
+        raise ConfigError(f"workers is {num_workers}; it must lie within 1 … {MAX_WORKERS}.")
 
 
 def _one_after_the_other(
@@ -168,20 +183,25 @@ def interrupts_held() -> Iterator[None]:
 def become_worker() -> None:
     """Make this process a worker: it leaves Ctrl-C to its parent, and ends when the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, args=(None,), daemon=True).start()
+
+
+def end_with_parent(patience_s: float | None = PARENT_END_S) -> None:
+    """End this worker at once when its parent has ended.
+
+    Args:
+        patience_s: How long to wait for that; None waits for ever.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this only runs in workers
+    if wait_for([parent.sentinel], patience_s):
+        os._exit(1)
 
 
 def _start_worker(counters: Any) -> None:  # Any: see `_counters`
     global _counters
     _counters = counters
     become_worker()
-
-
-def _die_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this only runs in workers
-    wait_for([parent.sentinel])
-    os._exit(1)
 
 
 def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: see `Job`

@@ -39,7 +39,7 @@ def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, ca
     demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
     run("generate", "--tasks", TASKS, "--episodes", 3, "--out", demos)
     train = ["train", "--data", demos, "--preset", tiny, "--out", trained, "--batch", 4, "--steps", 3]
-    train += ["--pretraining-steps", 0, "--checkpoint-every", 2, "--threads", 1]
+    train += ["--recipe", "nano", "--pretraining-steps", 0, "--checkpoint-every", 2, "--threads", 1]
     run(*train)
     policies = f"mine={trained},oracle,random"
     evaluate = ["evaluate", "--policy", policies, "--tasks", TASKS, "--levels", "L1", "--episodes", 2]

@@ -1,5 +1,6 @@
 """The verb `serve`, and a server that knows nothing of openvima, as programs of their own."""
 
+import functools
 import json
 import os
 import re
@@ -31,6 +32,8 @@ def program(*words: str, **variables: str) -> Iterator[subprocess.Popen[str]]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # What a shell starts in the background ignores Ctrl-C, and so do its children.
+        preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
     with started:
         try:

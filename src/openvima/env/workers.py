@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import functools
 import os
+import sys
 import queue
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,7 +25,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 
 from openvima.env.gate import Gate
 from openvima.errors import WorkerError
-from openvima.processes import become_worker, interrupts_held, one_thread_each
+from openvima.processes import become_worker, end_with_parent, interrupts_held, one_thread_each
 
 _PATIENCE_S = 5.0  # for an idle worker to end by itself, and for an error to arrive
 
@@ -185,6 +186,13 @@ class _Failed:
 
 class _Answering(gymnasium.Wrapper):
     """Answers calls with an error instead of raising it, which would end the worker."""
+
+    def close(self) -> None:
+        # Gymnasium's worker closes its environment as its last act. If that is because nobody takes its
+        # answers any more, the parent has died, and the worker goes without a traceback.
+        if isinstance(sys.exc_info()[1], OSError):
+            end_with_parent()
+        super().close()
 
     def get_wrapper_attr(self, name: str) -> Any:
         try:
