@@ -1,6 +1,7 @@
 """The two stages of a run: matching prompt and scene crops, then behaviour cloning."""
 
 import math
+import os
 from collections.abc import Iterator
 from typing import Any, Protocol
 
@@ -11,6 +12,7 @@ from torch.utils.data import DataLoader
 
 from openvima.data.tokens.cache import TokenCache
 from openvima.data.torch_dataset import BatchStream
+from openvima.errors import ConfigError
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
 from openvima.training.config import TrainingConfig
@@ -163,15 +165,16 @@ class Cloning:
 
     def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
         config = self._config
-        largest = -(-self._order.batch // self._parallel.num_ranks // config.accumulate)
+        ours = self._order.batch // self._parallel.num_ranks
+        largest = -(-ours // config.accumulate)
         # Sharded weights are gathered at every pass, so all processes must make equally many.
-        count = config.accumulate if self._parallel.is_sharded else None
-        parts = Parts(self._learner.collator(), config.seed, max(1, largest), count)
+        count = min(config.accumulate, ours) if self._parallel.is_sharded else None
+        parts = Parts(self._learner.collator(), config.seed, largest, count)
         stream = BatchStream(self._training, self._order, first=step, transform=parts)
         loader = DataLoader(
             stream,
             batch_size=None,
-            num_workers=config.loader_workers,
+            num_workers=min(config.loader_workers, _num_processors()),
             collate_fn=_unchanged,
             generator=torch.Generator(),  # else it draws from the one that dropout draws from
         )
@@ -183,7 +186,13 @@ class Cloning:
         device = self._parallel.device
         kind = torch.bfloat16 if self._config.precision == "bfloat16" else None
         with torch.autocast(device.type, kind, enabled=kind is not None):
-            return module(batch if device.type == "cpu" else batch.to(device))
+            loss, metrics = module(batch if device.type == "cpu" else batch.to(device))
+        if self._learner.score not in metrics:  # said at the first step, not at the first checkpoint
+            raise ConfigError(
+                f"the learner's score is {self._learner.score!r}, but its forward returns "
+                f"{', '.join(sorted(metrics)) or 'no metrics'}; name one of them as its score."
+            )
+        return loss, metrics
 
 
 def freeze_crops(learner: PolicyLearner, cache: TokenCache) -> None:
@@ -213,6 +222,11 @@ def crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
         return list(images.frame_encoder.parameters())
     appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
     return [*images.crop_encoder.parameters(), *appearance]
+
+
+def _num_processors() -> int:
+    """How many this process may use; more readers than these would be in each other's way."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _add(sums: Metrics, values: dict[str, torch.Tensor], share: float) -> None:
