@@ -10,8 +10,8 @@ import atexit
 import contextlib
 import functools
 import os
-import sys
 import queue
+import sys
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
