@@ -20,7 +20,7 @@ from openvima.policies.layers.trunk import MAX_PLACES  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
-NAMES = ("nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano")
+NAMES = ("nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
 LENGTHS = (8, 3, 5, 8)  # steps of the episodes that are played together
 
 

@@ -12,6 +12,7 @@ from openvima.policies.families.common import Size  # noqa: E402
 from openvima.policies.families.flamingo import flamingo  # noqa: E402
 from openvima.policies.families.gato import gato  # noqa: E402
 from openvima.policies.families.gpt import gpt  # noqa: E402
+from openvima.policies.families.midas import midas  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
@@ -22,7 +23,7 @@ from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
 from training_examples import examples_of  # noqa: E402
 
-FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
 NUM_LAYERS = 3  # of the text encoder
 IN_A_BLOCK = (
     "norm_attention",

@@ -20,7 +20,10 @@ def decisive(name: str) -> PolicyNetwork:
     return network
 
 
-@pytest.mark.parametrize(("name", "last_layer"), [("nano", "yaw"), ("nano-bins", "classifiers.5.4")])
+@pytest.mark.parametrize(
+    ("name", "last_layer"),
+    [("nano", "yaw"), ("nano-bins", "classifiers.5.4"), ("midas-nano", "classifiers.11.4")],
+)
 def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
     envs, observations = zip(*starts, strict=True)
     network = decisive(name)
@@ -37,7 +40,7 @@ def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
     assert policy.near_ties == [True, False, True]
 
 
-@pytest.mark.parametrize("name", ["nano", "nano-bins"])
+@pytest.mark.parametrize("name", ["nano", "nano-bins", "midas-nano"])
 def test_in_single_precision_only_near_ties_turn_with_the_batch(name, starts):
     envs, observations = zip(*starts, strict=True)
     policy = NetworkPolicy(decisive(name), dtype=torch.float32)

@@ -45,7 +45,9 @@ def test_images_and_trunk_of_different_widths_are_refused():
         replace(sizes, trunk=replace(sizes.trunk, width=64))
 
 
-@pytest.mark.parametrize("name", ["nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano"])
+@pytest.mark.parametrize(
+    "name", ["nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano"]
+)
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
     reader = Reader.of(network.config.images)

@@ -62,6 +62,7 @@ def test_of_t5_words_and_all_but_two_layers_are_frozen() -> None:
         ("gato-200m", ("gato", 768, 22, 24)),
         ("flamingo-2m", ("flamingo", 256, 1, 8)),
         ("gpt-9m", ("gpt", 320, 6, 10)),
+        ("midas-92m", ("midas", 640, 14, 20)),
     ],
 )
 def test_family_width_layers_and_heads_are_told(name: str, expected: tuple) -> None:

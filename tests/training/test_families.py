@@ -26,7 +26,7 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
     return main([str(word) for word in (*words, "--checkpoint-every", 1, *options)])
 
 
-@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt"])
+@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt", "midas"])
 def test_a_run_can_be_interrupted_and_gives_a_policy_that_acts(family, data, tmp_path, monkeypatch) -> None:
     preset, whole, torn = f"{family}-nano", tmp_path / "whole", tmp_path / "torn"
     assert run_train(data, whole, preset) == 0

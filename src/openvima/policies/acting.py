@@ -250,7 +250,7 @@ class NetworkPolicy(Policy):
         choose = drawing(episodes.generators, self._temperature) if self._temperature else likeliest
         margins: list[torch.Tensor] = []
         # The history holds actions as they are sent.
-        actions_BC = self.network.head.decide(inputs, _noting(choose, margins))[:, 0].to(torch.float32)
+        actions_BC = self.network.decide(inputs, state, _noting(choose, margins))[:, 0].to(torch.float32)
         return replace(
             episodes,
             readers=readers,

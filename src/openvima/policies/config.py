@@ -6,6 +6,7 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_type_hints
 
 from openvima.errors import ConfigError
+from openvima.policies.heads.autoregressive import AutoregressiveConfig
 from openvima.policies.heads.bins import BinsConfig
 from openvima.policies.heads.pointing import PointingConfig
 from openvima.policies.layers.frame_encoder import FrameEncoderConfig
@@ -22,8 +23,9 @@ class PolicyConfig:
         images: How images become tokens: object by object, or as whole frames.
         prompt: Prompt encoder.
         trunk: How the history is read in the light of the prompt.
-        head: How actions are given: as table bins, or by pointing.
-        action_width: Width of the features of each part of a past action.
+        head: How actions are given: as table bins, as bins one after the other, or by pointing.
+        action_width: Width of the features of each part of a past action; not used where each component is a
+            token of its own.
         query_token: Append a learned token to each step's images and act from there; without it the policy
             acts from its last image token, as the published ones do.
     """
@@ -31,7 +33,7 @@ class PolicyConfig:
     images: ObjectEncoderConfig | FrameEncoderConfig
     prompt: PromptEncoderConfig
     trunk: DecoderConfig | PrefixConfig
-    head: BinsConfig | PointingConfig
+    head: BinsConfig | AutoregressiveConfig | PointingConfig
     action_width: int
     query_token: bool = False
 

@@ -16,7 +16,12 @@ from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.config import PolicyConfig
-from openvima.policies.heads.base import ActionHead, HeadInputs, to_unit_range
+from openvima.policies.heads.autoregressive import (
+    AutoregressiveConfig,
+    AutoregressiveHead,
+    ComponentTokens,
+)
+from openvima.policies.heads.base import ActionHead, Choose, HeadInputs, likeliest, to_unit_range
 from openvima.policies.heads.bins import BinsConfig, BinsHead
 from openvima.policies.heads.pointing import PointingHead
 from openvima.policies.inputs import HistoryBatch, PromptBatch
@@ -62,6 +67,21 @@ class Memory:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Places of every step that follow each other in the history.
+
+    Args:
+        tokens_BTQD: What stands there.
+        mask_BTQ: Which of them exist.
+        kept_BTQ: Which of them are read: those that exist, and perhaps padding that the action is read from.
+    """
+
+    tokens_BTQD: torch.Tensor
+    mask_BTQ: torch.Tensor
+    kept_BTQ: torch.Tensor
+
+
 class PolicyNetwork(nn.Module):
     """Multimodal prompt -> trunk over the history -> action head.
 
@@ -73,6 +93,7 @@ class PolicyNetwork(nn.Module):
                          1st action               2nd action
 
     The query is a learned token, or, as in the published policies, simply the last image token of the step.
+    With an autoregressive head an action is twelve tokens, see `AutoregressiveHead`.
     """
 
     def __init__(self, config: PolicyConfig) -> None:
@@ -85,7 +106,11 @@ class PolicyNetwork(nn.Module):
         self.prompt = PromptEncoder(config.prompt, image_token_width=images.token_width, width=width)
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(images.token_width + NUM_END_EFFECTORS, width)
-        self.actions = ActionEncoder(config.action_width, width)
+        self.actions: ActionEncoder | ComponentTokens = (
+            ComponentTokens(width, config.head.token_std)
+            if isinstance(config.head, AutoregressiveConfig)
+            else ActionEncoder(config.action_width, width)
+        )
         self.trunk = build_trunk(config.trunk)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head: ActionHead = _head(config)
@@ -128,11 +153,15 @@ class PolicyNetwork(nn.Module):
             memory: Encoded prompts.
             history: Observations.
             features_KF: Encoded images, by number.
-            actions_BTC: Actions taken, metres and quaternions; the last step's is never looked at.
+            actions_BTC: Actions taken, metres and quaternions. What is told about one depends on earlier ones
+                alone; with a token for each component also on the components before it.
 
         Returns:
             What the action head needs at every step.
         """
+        if isinstance(self.actions, ComponentTokens):
+            own = self._action_places(actions_BTC, history.steps_BT, features_KF.dtype)
+            return self._read_steps(memory, self.begin(memory), history, features_KF, after=own)[0]
         previous_BTC = torch.cat([torch.zeros_like(actions_BTC[:, :1]), actions_BTC[:, :-1]], dim=1)
         has_previous_BT = F.pad(history.steps_BT[:, 1:], (1, 0), value=False)
         return self.extend(memory, self.begin(memory), history, features_KF, previous_BTC, has_previous_BT)[0]
@@ -162,17 +191,57 @@ class PolicyNetwork(nn.Module):
         Raises:
             PolicyError: Prompt or history is longer than the trunk takes.
         """
+        previous = self._action_places(previous_BTC, has_previous_BT, features_KF.dtype)
+        return self._read_steps(memory, state, history, features_KF, before=previous)
+
+    def decide(self, inputs: HeadInputs, state: TrunkState, choose: Choose = likeliest) -> torch.Tensor:
+        """Decide on the action of the step that was read last.
+
+        Args:
+            inputs: What `extend` returned for one step.
+            state: The state after it, which stays as it is: the action that is then taken is read with the
+                next observation.
+            choose: How to choose between classes.
+
+        Returns:
+            Actions, shape (B, 1, 12), metres and quaternions, within bounds.
+        """
+        actions = self.actions
+        if not isinstance(actions, ComponentTokens):
+            return self.head.decide(inputs, choose)
+
+        def read_on(component: int, bins_B1: torch.Tensor) -> torch.Tensor:
+            nonlocal state
+            exists_B1 = torch.ones_like(bins_B1, dtype=torch.bool)
+            output_B1D, state = self.trunk.extend(state, actions.of(component, bins_B1), exists_B1)
+            return output_B1D
+
+        return self.head.decide(inputs, choose, read_on)
+
+    def _read_steps(
+        self,
+        memory: Memory,
+        state: TrunkState,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        *,
+        before: _Places | None = None,
+        after: _Places | None = None,
+    ) -> tuple[HeadInputs, TrunkState]:
+        """Read the slots of steps, and the places of actions before or after those of each step."""
         features = features_KF[history.crops_BTVN]
         slots_BTQD, mask_BTQ, read_BT = self.observe(history, features)
-        dtype = slots_BTQD.dtype
-        metric = torch.promote_types(dtype, torch.float32)  # half precision is too coarse for metres
-        unit_BTC = self.head.as_history(to_unit_range(previous_BTC.to(torch.float64))).to(dtype)
-        outputs_BTQD, state = self._read_on(
-            state, self.actions(unit_BTC), has_previous_BT, slots_BTQD, mask_BTQ, read_BT, history.steps_BT
-        )
+        metric = torch.promote_types(slots_BTQD.dtype, torch.float32)  # half precision: too coarse for metres
+        # Masked places are left out, except the slot that is read: it is read even if it is padding.
+        is_read_BTQ = F.one_hot(read_BT, mask_BTQ.shape[-1]).bool() & history.steps_BT[..., None]
+        slots = _Places(slots_BTQD, mask_BTQ, mask_BTQ | is_read_BTQ)
+        places = [part for part in (before, slots, after) if part is not None]
+        outputs, state = self._read_on(state, places)
+        outputs_BTQD = outputs[places.index(slots)]
         place_BT1D = read_BT[..., None, None].expand(-1, -1, 1, outputs_BTQD.shape[-1])
+        query_BT1D = outputs_BTQD.gather(2, place_BT1D)
         inputs = HeadInputs(
-            query_BTD=outputs_BTQD.gather(2, place_BT1D).squeeze(2),
+            query_BTD=query_BT1D.squeeze(2),
             objects_BTND=outputs_BTQD[:, :, :-1] if self.query is not None else outputs_BTQD,
             masks_BTN=history.masks_BTVN.any(dim=2),
             appearance_BTNA=self._appearance(features, history.masks_BTVN),
@@ -182,6 +251,8 @@ class PolicyNetwork(nn.Module):
             prompt_BMD=memory.roles_BLD,
             prompt_masks_BM=memory.object_mask_BL,
             prompt_appearance_BMA=memory.appearance_BLA,
+            # The first component is told at the query, each other one at the one before it.
+            components_BTCD=torch.cat([query_BT1D, outputs[-1][:, :, :-1]], dim=2) if after else None,
         )
         return inputs, state
 
@@ -219,25 +290,32 @@ class PolicyNetwork(nn.Module):
         tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
         return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE)
 
-    def _read_on(
-        self,
-        state: TrunkState,
-        previous_BTD: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        slots_BTQD: torch.Tensor,
-        mask_BTQ: torch.Tensor,
-        read_BT: torch.Tensor,
-        steps_BT: torch.Tensor,
-    ) -> tuple[torch.Tensor, TrunkState]:
-        """Interleave actions and slots in time, read them, and return the outputs at the slots.
+    def _action_places(
+        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
+    ) -> _Places:
+        """Make the token of each action, or the tokens of its components."""
+        # Bins need all digits, whatever the network computes in.
+        unit_BTC = self.head.as_history(to_unit_range(actions_BTC.to(torch.float64)))
+        if isinstance(self.actions, ComponentTokens):
+            tokens_BTQD = self.actions(unit_BTC)
+        else:
+            tokens_BTQD = self.actions(unit_BTC.to(dtype))[:, :, None]
+        mask_BTQ = exists_BT[..., None].expand(tokens_BTQD.shape[:3])
+        return _Places(tokens_BTQD, mask_BTQ, mask_BTQ)
 
-        Masked places are left out, except the slot that is read: it is read even if it is padding.
+    def _read_on(
+        self, state: TrunkState, places: Sequence[_Places]
+    ) -> tuple[tuple[torch.Tensor, ...], TrunkState]:
+        """Put all places of each step in a row, and the steps one after the other, and read them.
+
+        Returns:
+            For each of the places the outputs, (B, T, Q, D), zero at those that are not read; and the state.
         """
-        batch, steps, slots = mask_BTQ.shape
-        sequence_BLD = torch.cat([previous_BTD[:, :, None], slots_BTQD], dim=2).flatten(1, 2)
-        mask_BL = torch.cat([has_previous_BT[..., None], mask_BTQ], dim=2).flatten(1)
-        is_read_BTQ = F.one_hot(read_BT, slots).bool() & steps_BT[..., None]
-        kept_BL = mask_BL | F.pad(is_read_BTQ, (1, 0), value=False).flatten(1)
+        sizes = [part.tokens_BTQD.shape[2] for part in places]
+        sequence_BLD = torch.cat([part.tokens_BTQD for part in places], dim=2).flatten(1, 2)
+        mask_BL = torch.cat([part.mask_BTQ for part in places], dim=2).flatten(1)
+        kept_BTQ = torch.cat([part.kept_BTQ for part in places], dim=2)
+        kept_BL = kept_BTQ.flatten(1)
         order_BP = kept_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
         order_BP = order_BP[:, : int(kept_BL.sum(dim=1).max())]
         places_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
@@ -248,7 +326,7 @@ class PolicyNetwork(nn.Module):
             kept_BL.gather(1, order_BP),
         )
         outputs_BLD = read_BPD.new_zeros(sequence_BLD.shape).scatter(1, places_BPD, read_BPD)
-        return outputs_BLD.view(batch, steps, slots + 1, -1)[:, :, 1:], state
+        return outputs_BLD.unflatten(1, kept_BTQ.shape[1:]).split(sizes, dim=2), state
 
     def _appearance(self, features_BTVNF: torch.Tensor, masks_BTVN: torch.Tensor) -> torch.Tensor:
         if _appearance_width(self.config):
@@ -279,9 +357,7 @@ def _appearance_width(config: PolicyConfig) -> int:
 
 
 def _head(config: PolicyConfig) -> ActionHead:
-    width = config.trunk.width
-    return (
-        BinsHead(config.head, width)
-        if isinstance(config.head, BinsConfig)
-        else PointingHead(config.head, width)
-    )
+    width, head = config.trunk.width, config.head
+    if isinstance(head, AutoregressiveConfig):
+        return AutoregressiveHead(head, width)
+    return BinsHead(head, width) if isinstance(head, BinsConfig) else PointingHead(head, width)

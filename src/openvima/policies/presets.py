@@ -9,7 +9,7 @@ from openvima.errors import UnknownPolicyError, unknown_name
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
 
-FAMILIES = ("vima", "gato", "flamingo", "gpt")
+FAMILIES = ("vima", "gato", "flamingo", "gpt", "midas")
 # Written out, so that listing the names needs no torch; a test compares them with `families.common.SIZES`.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
@@ -50,9 +50,10 @@ def _member(family: str, size_name: str) -> "PolicyConfig":
     from openvima.policies.families.flamingo import flamingo
     from openvima.policies.families.gato import gato
     from openvima.policies.families.gpt import gpt
+    from openvima.policies.families.midas import midas
     from openvima.policies.families.vima import vima
 
-    members = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+    members = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
     return members[family](size(size_name))
 
 

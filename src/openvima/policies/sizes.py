@@ -44,7 +44,7 @@ class PolicySize:
     """How large a policy is.
 
     Args:
-        family: vima, gato, flamingo or gpt.
+        family: vima, gato, flamingo, gpt or midas.
         width: Width of the trunk.
         num_layers: Layers of the trunk: pairs of a cross block and a self block, or self blocks alone.
         num_heads: Heads of self-attention.
@@ -66,14 +66,20 @@ class PolicySize:
 
 def policy_size(config: PolicyConfig) -> PolicySize:
     """Count the parameters that a network of these sizes has; none is made for it."""
-    images, trunk = config.images, config.trunk
+    trunk = config.trunk
     return PolicySize(
-        family=_FAMILIES[images.readout] if isinstance(images, FrameEncoderConfig) else "vima",
+        family=_family(config),
         width=trunk.width,
         num_layers=trunk.num_layers,
         num_heads=trunk.num_self_heads if isinstance(trunk, DecoderConfig) else trunk.num_heads,
         parts=count_parameters(outline_network(config)),
     )
+
+
+def _family(config: PolicyConfig) -> str:
+    if isinstance(config.images, FrameEncoderConfig):
+        return _FAMILIES[config.images.readout]
+    return "vima" if isinstance(config.trunk, DecoderConfig) else "midas"
 
 
 def count_parameters(network: PolicyNetwork) -> dict[str, Count]:

@@ -19,6 +19,7 @@ __all__ = [
     "ActionTargets",
     "Choose",
     "HeadInputs",
+    "ReadOn",
     "from_unit_range",
     "likeliest",
     "masked_mean",
@@ -27,6 +28,8 @@ __all__ = [
 
 # Scores (B, ..., classes) to indices (B, ...): how a head chooses between its classes.
 Choose = Callable[[torch.Tensor], torch.Tensor]
+# Number of a component and its bins (B, T) to what the trunk gives after reading them, (B, T, D).
+ReadOn = Callable[[int, torch.Tensor], torch.Tensor]
 
 _LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
 _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
@@ -47,6 +50,8 @@ class HeadInputs:
         prompt_BMD: Encoded prompt, one row for each place.
         prompt_masks_BM: Which of these places are objects.
         prompt_appearance_BMA: Appearance of the prompt's objects.
+        components_BTCD: Output of the decoder from which each component of the step's action is told, given
+            those before it. Only with a token for each component, and where whole histories are read.
     """
 
     query_BTD: torch.Tensor
@@ -59,6 +64,7 @@ class HeadInputs:
     prompt_BMD: torch.Tensor
     prompt_masks_BM: torch.Tensor
     prompt_appearance_BMA: torch.Tensor
+    components_BTCD: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,8 +109,17 @@ class ActionHead(nn.Module):
         """Return the mean loss over existing steps, and metrics by name."""
         raise NotImplementedError
 
-    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
-        """Return an action for every step, shape (B, T, 12), metres and quaternions, within bounds."""
+    def decide(
+        self, inputs: HeadInputs, choose: Choose = likeliest, read_on: ReadOn | None = None
+    ) -> torch.Tensor:
+        """Return an action for every step, shape (B, T, 12), metres and quaternions, within bounds.
+
+        Args:
+            inputs: What is known.
+            choose: How to choose between classes.
+            read_on: Has the trunk read a component that was chosen; for heads that choose one after the
+                other.
+        """
         raise NotImplementedError
 
     def as_history(self, unit_actions: torch.Tensor) -> torch.Tensor:

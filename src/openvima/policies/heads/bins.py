@@ -18,6 +18,7 @@ from openvima.policies.heads.base import (
     ActionTargets,
     Choose,
     HeadInputs,
+    ReadOn,
     from_unit_range,
     likeliest,
     masked_mean,
@@ -55,6 +56,10 @@ class BinsHead(ActionHead):
         """Return one tensor (B, T, bins) for each of the twelve components."""
         return [classifier(query_BTD) for classifier in self.classifiers]
 
+    def scores(self, inputs: HeadInputs) -> list[torch.Tensor]:
+        """Return the scores that the loss compares with what was done."""
+        return self.logits(inputs.query_BTD)
+
     def loss(
         self, inputs: HeadInputs, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -69,7 +74,7 @@ class BinsHead(ActionHead):
         Source: the published policies were trained with this loss (VIMA, Jiang et al. 2023).
         """
         bins_BTC = encode_bins(to_unit_range(targets.actions_BTC))
-        logits = self.logits(inputs.query_BTD)
+        logits = self.scores(inputs)
         losses_BTC = torch.stack([_surprise(scores, bins_BTC[..., c]) for c, scores in enumerate(logits)], -1)
         loss_BT = torch.stack([losses_BTC[..., part].mean(-1) for part in ACTION_PARTS.values()]).sum(0)
         right_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1) == bins_BTC
@@ -82,7 +87,9 @@ class BinsHead(ActionHead):
         metrics = {name: masked_mean(share.to(loss_BT.dtype), steps_BT) for name, share in shares_BT.items()}
         return masked_mean(loss_BT, steps_BT), metrics
 
-    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
+    def decide(
+        self, inputs: HeadInputs, choose: Choose = likeliest, read_on: ReadOn | None = None
+    ) -> torch.Tensor:
         """Choose a bin for each component, independently of the others."""
         bins = torch.stack([choose(scores) for scores in self.logits(inputs.query_BTD)], dim=-1)
         return from_unit_range(decode_bins(bins, inputs.positions_BTN2.dtype))

@@ -16,6 +16,7 @@ from openvima.policies.heads.base import (
     ActionTargets,
     Choose,
     HeadInputs,
+    ReadOn,
     from_unit_range,
     likeliest,
     masked_mean,
@@ -105,7 +106,9 @@ class PointingHead(ActionHead):
             }
         return torch.stack(list(losses.values())).sum(), metrics
 
-    def decide(self, inputs: HeadInputs, choose: Choose = likeliest) -> torch.Tensor:
+    def decide(
+        self, inputs: HeadInputs, choose: Choose = likeliest, read_on: ReadOn | None = None
+    ) -> torch.Tensor:
         """Point, then place: at the grasp point of the picked object, and by the offset from the other."""
         pick = choose(self.pick(inputs))
         place = choose(self.place_scores(inputs, pick))

@@ -27,6 +27,8 @@ class PromptEncoderConfig:
         train_words: Whether the word embedding is trained.
         trained_layers: How many of the last layers of the text encoder are trained, with its last norm; 0 for
             a frozen one. None trains all of it, position biases included.
+        visual_residual: Add what goes into the text encoder for an image to what comes out at that place, so
+            that what an object looks like reaches the trunk even through a text encoder that knows words.
     """
 
     text: TextEncoderConfig
@@ -35,6 +37,7 @@ class PromptEncoderConfig:
     tokenizer: Literal["closed", "t5"] = "closed"
     train_words: bool = True
     trained_layers: int | None = None
+    visual_residual: bool = False
 
     def __post_init__(self) -> None:
         if self.tokenizer not in ("closed", "t5"):
@@ -60,6 +63,7 @@ class PromptEncoder(nn.Module):
         self.words = nn.Embedding(config.vocabulary_size, words)
         self.images = mlp((image_token_width, config.image_width, config.image_width, words))
         self.text = TextEncoder(config.text)
+        self.visual_residual = config.visual_residual
         # The published 768-wide policies have no layer here, since both widths are equal.
         self.out = nn.Identity() if words == width else nn.Linear(words, width, bias=False)
         self._freeze(config)
@@ -83,10 +87,14 @@ class PromptEncoder(nn.Module):
             Shape (B, L, D); masked places are finite and mean nothing.
         """
         tokens_BLW = self.words(words_BL)
-        if len(image_tokens_IE):
-            chosen_BLW = self.images(image_tokens_IE)[images_BL.clamp(min=0)]
-            tokens_BLW = torch.where((images_BL >= 0)[..., None], chosen_BLW, tokens_BLW)
-        return self.out(self.text(tokens_BLW, mask_BL))
+        if not len(image_tokens_IE):
+            return self.out(self.text(tokens_BLW, mask_BL))
+        is_image_BL1 = (images_BL >= 0)[..., None]
+        chosen_BLW = self.images(image_tokens_IE)[images_BL.clamp(min=0)]
+        encoded_BLW = self.text(torch.where(is_image_BL1, chosen_BLW, tokens_BLW), mask_BL)
+        if self.visual_residual:
+            encoded_BLW = encoded_BLW + chosen_BLW * is_image_BL1
+        return self.out(encoded_BLW)
 
     def _freeze(self, config: PromptEncoderConfig) -> None:
         self.words.requires_grad_(config.train_words)

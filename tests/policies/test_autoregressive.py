@@ -1,0 +1,255 @@
+"""Actions told component by component: the chain rule, caches, causality, and the visual residual."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError, PolicyError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.families.midas import with_autoregression, with_visual_residual  # noqa: E402
+from openvima.policies.heads.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
+from openvima.policies.heads.base import (  # noqa: E402
+    ACTION_PARTS,
+    ACTION_WIDTH,
+    from_unit_range,
+    to_unit_range,
+)
+from openvima.policies.heads.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import Batch  # noqa: E402
+from training_examples import examples_of  # noqa: E402
+
+# One decoder, and cross-attention with the last slot, or with a query of its own, as the place to read from.
+CONFIGS = {
+    "midas": preset("midas-nano"),
+    "vima": with_autoregression(with_visual_residual(preset("vima-nano"))),
+    "query": with_autoregression(preset("nano-bins")),
+}
+
+
+def network_of(config: PolicyConfig) -> PolicyNetwork:
+    """In double precision, with outputs that depend visibly on everything; fresh heads start near zero."""
+    network = build_network(config, seed=3).double().eval()
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+@pytest.fixture(scope="module", params=CONFIGS)
+def network(request) -> PolicyNetwork:
+    return network_of(CONFIGS[request.param])
+
+
+def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]:
+    """A batch, and the features of its images."""
+    reader = Reader.of(network.config.images)
+    examples, images = examples_of(demonstrations, reader)
+    return Collator(reader)(examples), network.encode_images(images)
+
+
+@torch.no_grad()
+def told(network: PolicyNetwork, demonstrations, actions: "torch.Tensor | None" = None):
+    """Scores of all components of all actions, each (B, T, bins), and the batch."""
+    batch, features = read(network, demonstrations)
+    actions = batch.targets.actions_BTC if actions is None else actions
+    inputs = network(network.encode_prompts(batch.prompts, features), batch.history, features, actions)
+    return network.head.scores(inputs), batch
+
+
+def step_of(record, step: int):
+    """One step of a history."""
+    fields = {name: getattr(record, name) for name in type(record).__slots__}
+    return type(record)(**{name: tensor[:, step : step + 1] for name, tensor in fields.items()})
+
+
+@torch.no_grad()
+def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(network, demonstrations) -> None:
+    scores, batch = told(network, demonstrations)
+    bins_BTC = encode_bins(to_unit_range(batch.targets.actions_BTC))
+    steps_BT = batch.targets.steps_BT
+    assert steps_BT.sum() > len(steps_BT)  # padded, with more than one step somewhere
+    forced = sum(
+        score.log_softmax(-1).gather(-1, bins_BTC[..., c, None]).squeeze(-1) for c, score in enumerate(scores)
+    )
+
+    _, features = read(network, demonstrations)
+    memory = network.encode_prompts(batch.prompts, features)
+    state, previous = network.begin(memory), torch.zeros_like(batch.targets.actions_BTC[:, :1])
+    for step in range(steps_BT.shape[1]):
+        has_previous = torch.full_like(steps_BT[:, :1], step > 0)
+        history = step_of(batch.history, step)
+        inputs, state = network.extend(memory, state, history, features, previous, has_previous)
+        total, unread = torch.zeros(len(steps_BT), dtype=torch.float64), iter(range(ACTION_WIDTH))
+
+        def as_demonstrated(scores_B1K, bins_B1C=bins_BTC[:, step : step + 1], unread=unread, total=total):
+            chosen_B1 = bins_B1C[..., next(unread)]
+            total += scores_B1K.log_softmax(-1).gather(-1, chosen_B1[..., None])[:, 0, 0]
+            return chosen_B1
+
+        network.decide(inputs, state, as_demonstrated)
+        exists = steps_BT[:, step]
+        torch.testing.assert_close(total[exists], forced[exists, step], rtol=0, atol=1e-5)
+        previous = batch.targets.actions_BTC[:, step : step + 1]
+
+
+def test_a_component_is_told_by_those_before_it_alone(network, demonstrations) -> None:
+    scores, batch = told(network, demonstrations)
+    for component in range(ACTION_WIDTH):
+        changed = batch.targets.actions_BTC.clone()
+        last = batch.targets.steps_BT.sum(1) - 1  # whatever follows has no say in what comes before
+        rows = torch.arange(len(last))
+        moved = to_unit_range(changed[rows, last].double())
+        moved[:, component] = (moved[:, component] + 0.5) % 1
+        changed[rows, last] = from_unit_range(moved).to(changed.dtype)
+        others, _ = told(network, demonstrations, changed)
+        differs = [
+            not torch.equal(old[rows, last], new[rows, last]) for old, new in zip(scores, others, strict=True)
+        ]
+        assert differs == [later > component for later in range(ACTION_WIDTH)], component
+
+
+def test_the_loss_is_that_of_the_published_head_on_these_scores(network, demonstrations) -> None:
+    batch, features = read(network, demonstrations)
+    actions = batch.targets.actions_BTC
+    inputs = network(network.encode_prompts(batch.prompts, features), batch.history, features, actions)
+    loss, metrics = network.head.loss(inputs, batch.targets)
+    bins_BTC, exists = encode_bins(to_unit_range(actions)), batch.targets.steps_BT
+    parts = torch.zeros((), dtype=torch.float64)
+    for part in ACTION_PARTS.values():
+        for c in range(part.start, part.stop):
+            chances = network.head.scores(inputs)[c].softmax(-1).gather(-1, bins_BTC[..., c, None])
+            parts = parts - chances[exists].log().mean() / (part.stop - part.start)
+    torch.testing.assert_close(loss, parts)
+    assert isinstance(network.head, BinsHead) and metrics.keys() >= {"accuracy", "component_accuracy"}
+
+
+def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[dict]]) -> list[np.ndarray]:
+    """The actions of one episode after the other, reading all anew for every component."""
+    from openvima.perception.image_stack import ImageStack
+    from openvima.policies.inputs import batch_histories, batch_prompts
+
+    network, actions = policy.network, []
+    for prompt, observations in zip(prompts, seen, strict=True):
+        stack, reader = ImageStack(policy.reader.image_size), policy.reader.begin_episode()
+        asked, taken = policy.reader.read_prompt(prompt), np.zeros((1, len(observations), ACTION_WIDTH))
+        numbers = stack.add(asked.objects.crops)
+        steps = [reader.read_step(observation) for observation in observations]
+        crops = [stack.add(step.objects.crops) for step in steps]
+        features = network.encode_images(torch.from_numpy(stack.stacked()))
+        memory = network.encode_prompts(batch_prompts([asked], [numbers]), features)
+        for t in range(len(steps)):
+            history = batch_histories([steps[: t + 1]], [crops[: t + 1]])
+            bins = torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.int64)
+            for component in range(ACTION_WIDTH):
+                taken[:, t] = from_unit_range(decode_bins(bins, torch.float64))[0].numpy()
+                inputs = network(memory, history, features, torch.from_numpy(taken[:, : t + 1]))
+                bins[0, 0, component] = network.head.scores(inputs)[component][0, t].argmax()
+            chosen = from_unit_range(decode_bins(bins, torch.float64)).float()
+            taken[:, t] = chosen[0].numpy()
+        actions.append(taken[0].astype(np.float32))
+    return actions
+
+
+@torch.no_grad()
+def test_greedy_actions_with_caches_are_those_without_exactly(network, demonstrations) -> None:
+    """In a batch of episodes that end at different steps, against one episode at a time."""
+    runs = demonstrations[-3:]
+    pool = [run.observation(t) for run in demonstrations for t in range(run.num_steps + 1)]
+    lengths = (4, 1, 3)
+    seen = [
+        [pool[(5 * row + 3 * t) % len(pool)] for t in range(length)] for row, length in enumerate(lengths)
+    ]
+    policy = NetworkPolicy(network)
+    expected = uncached(policy, [run.prompt for run in runs], seen)
+    assert len(np.unique(np.concatenate(expected), axis=0)) > 2  # it does not always do the same
+    policy.reset([run.prompt for run in runs])
+    for t in range(max(lengths)):
+        acts = policy.act([steps[t] if t < len(steps) else None for steps in seen])
+        for row, action in enumerate(acts):
+            if action is not None:
+                vector = np.concatenate([action[key] for key in ACTION_PARTS])
+                np.testing.assert_array_equal(vector, expected[row][t], err_msg=f"{row} at {t}")
+
+
+def test_drawn_actions_follow_from_seed_and_prompt_alone(network, starts) -> None:
+    envs, observations = zip(*starts, strict=True)
+
+    def drawn(rows: Sequence[int], seed: int) -> list[list[float]]:
+        generator = torch.Generator().manual_seed(seed)
+        policy = NetworkPolicy(network, temperature=1.0, generator=generator)
+        policy.reset([envs[row].prompt for row in rows])
+        actions = policy.act([observations[row] for row in rows])
+        return [np.concatenate(list(action.values())).tolist() for action in actions]
+
+    together = drawn((0, 1, 2), 5)
+    assert drawn((2, 0), 5) == [together[2], together[0]]
+    assert drawn((0, 1, 2), 6) != together
+
+
+@pytest.mark.parametrize("component", range(ACTION_WIDTH))
+def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -> None:
+    bins = torch.zeros(NUM_BINS[component], ACTION_WIDTH, dtype=torch.int64)
+    bins[:, component] = torch.arange(NUM_BINS[component])
+    sent = from_unit_range(decode_bins(bins)).to(torch.float32)
+    tokens = ComponentTokens(4, std=1.0)
+    back = tokens(to_unit_range(sent.double()))
+    assert torch.equal(back[:, component], tokens.of(component, torch.arange(NUM_BINS[component])))
+    assert len(back[:, component].unique(dim=0)) == NUM_BINS[component]
+
+
+def test_the_head_alone_cannot_decide(network, demonstrations) -> None:
+    batch, features = read(network, demonstrations)
+    memory = network.encode_prompts(batch.prompts, features)
+    inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
+    with pytest.raises(PolicyError, match=r"call PolicyNetwork\.decide"):
+        network.head.decide(inputs)
+
+
+def test_half_precision_gives_actions_on_bins(demonstrations) -> None:
+    policy = NetworkPolicy(network_of(CONFIGS["midas"]), dtype=torch.bfloat16)
+    policy.reset([demonstrations[0].prompt])
+    for _ in range(2):
+        (action,) = policy.act([demonstrations[0].observation(0)])
+    vector = torch.from_numpy(np.concatenate(list(action.values())))[None]
+    unit = to_unit_range(vector.double())
+    torch.testing.assert_close(decode_bins(encode_bins(unit), torch.float64), unit, rtol=0, atol=1e-6)
+
+
+@torch.no_grad()
+def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonstrations) -> None:
+    on = network_of(with_visual_residual(preset("vima-nano")))
+    off = PolicyNetwork(preset("vima-nano")).double().eval()
+    off.load_state_dict(on.state_dict())
+    batch, features = read(on, demonstrations)
+    prompts = batch.prompts
+    memory, plain = (network.encode_prompts(prompts, features) for network in (on, off))
+    added_BLD = memory.tokens_BLD - plain.tokens_BLD
+    is_image_BL = prompts.images_BL >= 0
+    assert not added_BLD[~is_image_BL].any()
+    tokens_IE = on.images(features[prompts.crops_VS], prompts.boxes_VS4, prompts.masks_VS)
+    expected = on.prompt.images(tokens_IE)[prompts.images_BL[is_image_BL]]
+    torch.testing.assert_close(added_BLD[is_image_BL], expected)  # widths are equal: no layer behind
+    assert expected.abs().max() > 1e-3
+
+
+def test_switches_change_nothing_else_and_can_be_undone() -> None:
+    plain = preset("vima-nano")
+    both = with_visual_residual(with_autoregression(plain))
+    assert replace(both, head=plain.head, prompt=plain.prompt) == plain
+    assert with_visual_residual(with_autoregression(both, False), False) == plain
+    assert replace(both, trunk=preset("midas-nano").trunk) == preset("midas-nano")
+
+
+def test_vectors_without_spread_are_refused() -> None:
+    with pytest.raises(ConfigError, match="token_std is 0; it must be above 0"):
+        AutoregressiveConfig(token_std=0)
