@@ -20,6 +20,7 @@ ORDER = (
     "env",
     "data",
     "policies",
+    "detection",
     "serving",
     "training",
     "evaluation",
@@ -34,6 +35,7 @@ FORBIDDEN = {
     "tasks": {"mujoco", "torch", "openvima.sim"},
     "env": {"torch"},
     "policies": {"mujoco", "openvima.sim", "openvima.env"},
+    "detection": {"mujoco", "openvima.sim", "openvima.env"},
     "serving": {"mujoco", "torch", "openvima.sim", "openvima.env"},
     "training": {"mujoco", "openvima.sim", "openvima.env"},
 }

@@ -1,0 +1,57 @@
+"""Objects from pixels: a Mask R-CNN in plain torch, and what it is trained on and scored with."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from openvima.detection.config import DETECTORS, BackboneConfig, DetectorConfig, detector_config
+
+if TYPE_CHECKING:
+    from openvima.detection.detector import FrameDetector
+    from openvima.policies.detection import DetectedObjects
+
+PACKAGED = Path(__file__).parent / "trained"  # the small detector for the default assets
+
+
+def load_detector(
+    folder: str | Path | None = None, **options: Any
+) -> "FrameDetector":  # Any: of several kinds
+    """Load a trained detector.
+
+    Args:
+        folder: A run folder that `openvima detector train` wrote, of which the best checkpoint is taken, or a
+            checkpoint folder; None takes the small detector that comes with the package.
+        **options: Of `FrameDetector`, such as `device`.
+
+    Raises:
+        CheckpointError: There is no checkpoint, or it is damaged.
+        MissingExtraError: torch is not installed.
+    """
+    from openvima.policies.base import require_torch
+
+    require_torch("a detector")
+    from openvima.detection.checkpoint import load_network
+    from openvima.detection.detector import FrameDetector
+
+    return FrameDetector(load_network(PACKAGED if folder is None else folder), **options)
+
+
+def load_finder(folder: str | Path | None = None, **options: Any) -> "DetectedObjects":  # Any: as above
+    """Load a trained detector as what policies take for a finder; see `load_detector`.
+
+    Example:
+        >>> load_policy("run", finder=load_finder())
+    """
+    from openvima.policies.detection import DetectedObjects
+
+    return DetectedObjects(load_detector(folder, **options))
+
+
+__all__ = [
+    "DETECTORS",
+    "PACKAGED",
+    "BackboneConfig",
+    "DetectorConfig",
+    "detector_config",
+    "load_detector",
+    "load_finder",
+]

@@ -1,0 +1,25 @@
+"""Training a detector on the segmentation of demonstrations."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from openvima.training.detector.config import DetectorTrainingConfig
+
+
+def train_detector(
+    config: DetectorTrainingConfig, report: Callable[[int, int, str], None] | None = None
+) -> Path:
+    """Train a detector, or go on with a run; see `openvima.training.detector.loop.train_detector`.
+
+    Raises:
+        MissingExtraError: torch is not installed.
+    """
+    from openvima.policies.base import require_torch
+
+    require_torch("training a detector")
+    from openvima.training.detector import loop
+
+    return loop.train_detector(config, report)
+
+
+__all__ = ["DetectorTrainingConfig", "train_detector"]
