@@ -64,7 +64,7 @@ def test_a_learner_that_cannot_be_made_is_named(name: str, message: str) -> None
 
 
 def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
-    with pytest.raises(ConfigError, match="neither pretraining_steps nor t5"):
+    with pytest.raises(ConfigError, match="does not know pretraining_steps"):
         train(TrainingConfig(**{**settings, "preset": example}))
 
 

@@ -24,6 +24,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "weight_decay": (0, None),
     "clip_norm": (0, None),
     "spurious_probability": (0, 1),
+    "motion_share": (0, 1),
     "pretraining_steps": (0, None),
     "pretraining_scenes": (1, None),
     "pretraining_batch": (2, None),
@@ -51,6 +52,11 @@ class TrainingConfig:
         out: Run folder: checkpoints, settings, metrics.
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
+        autoregressive: Whether each component of an action is a token of its own; None is as the preset has
+            it.
+        visual_residual: Whether object tokens are added to the encoded prompt; None is as the preset has it.
+        init: Weights to begin with: those of another run, or whatever else `load_policy` takes; None begins
+            anew.
         steps: Steps of behaviour cloning.
         epochs: Passes over the demonstrations, instead of `steps`.
         batch: Demonstrations a step, of all processes together; at most as many as there are.
@@ -63,9 +69,12 @@ class TrainingConfig:
         weight_decay: Decay of weight matrices, as in AdamW.
         clip_norm: Largest norm of the gradient.
         spurious_probability: How often each view of each step shows an object that is none.
+        motion_share: Share of demonstrations that are read as "Follow this motion: frame … frame" instead of
+            with the prompt of their task: 1 for inverse dynamics pretraining, part of them for use in
+            context. The checkpoint is chosen by tasks, unless it is 1.
         pretraining_steps: Steps in which the crop encoder learns to match prompt and scene; 0 leaves it out,
             and the image encoder then learns while cloning. None is as the preset wants: 400 with an
-            appearance embedding (nano, nano-bins), 0 without one.
+            appearance embedding (nano, nano-bins), 0 without one or with `init`.
         pretraining_scenes: Scenes drawn for that.
         pretraining_batch: Pairs of one object a step.
         pretraining_learning_rate: Highest learning rate of that.
@@ -98,6 +107,9 @@ class TrainingConfig:
     data: Path
     out: Path
     preset: str = "nano"
+    autoregressive: bool | None = None
+    visual_residual: bool | None = None
+    init: str | None = None
     steps: int = 400
     epochs: float | None = None
     batch: int = 64
@@ -109,6 +121,7 @@ class TrainingConfig:
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
+    motion_share: float = 0.0
     pretraining_steps: int | None = None
     pretraining_scenes: int = 2500
     pretraining_batch: int = 128

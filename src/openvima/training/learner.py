@@ -20,6 +20,7 @@ from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
 from openvima.training.collate import Collator
 from openvima.training.dataset import Batch, Example, stack_images, token_kind
+from openvima.training.inverse_dynamics import as_motion
 
 # From examples and, while training, one generator for each of them, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -83,20 +84,34 @@ class PolicyLearner(Learner):
         network: The network; it is trained in place.
         reader: How it sees prompts and observations.
         spurious_probability: How often each view of each step shows an object that is none.
+        motion_share: Share of demonstrations that are read as motions, see `as_motion`; the others keep the
+            prompts of their tasks.
     """
 
-    def __init__(self, network: PolicyNetwork, reader: Reader, *, spurious_probability: float = 0.0) -> None:
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        reader: Reader,
+        *,
+        spurious_probability: float = 0.0,
+        motion_share: float = 0.0,
+    ) -> None:
         super().__init__()
         self.network = network
         self.reader = reader
         self.token_kind = token_kind(reader)
         self.score = network.head.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
-        self._spurious_probability = spurious_probability
+        self._spurious_probability, self._motion_share = spurious_probability, motion_share
 
     def collator(self) -> "PolicyCollate":
         """Return what makes batches; see `Learner`."""
-        return PolicyCollate(self.reader, self._spurious_probability, with_images=self.features is None)
+        return PolicyCollate(
+            self.reader,
+            self._spurious_probability,
+            with_images=self.features is None,
+            motion_share=self._motion_share,
+        )
 
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the loss of the action head, and its metrics."""
@@ -132,11 +147,16 @@ class PolicyCollate:
         spurious_probability: How often each view of each step shows an object that is none.
         with_images: Put the images that are used into the batch, each once. Without, numbers count through
             the images of all demonstrations.
+        motion_share: Share of demonstrations that are read as motions. When validating they all are if it is
+            1, and else none.
     """
 
-    def __init__(self, reader: Reader, spurious_probability: float, *, with_images: bool) -> None:
+    def __init__(
+        self, reader: Reader, spurious_probability: float, *, with_images: bool, motion_share: float = 0.0
+    ) -> None:
         self._collate = Collator(reader)
         self._probability, self._with_images = spurious_probability, with_images
+        self._motion_share = motion_share
 
     def __call__(
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
@@ -145,10 +165,25 @@ class PolicyCollate:
         reader, stack = self._collate.reader, None
         if self._with_images:
             examples, stack = stack_images([example.tokens for example in examples], reader)
+        examples = self._with_prompts(examples, rngs)
         batch = self._collate(examples)
         if rngs is not None:
             batch = augmented(batch, reader.layout, probability=self._probability, rngs=rngs)
         return batch if stack is None else _with_used_images(batch, stack)
+
+    def _with_prompts(
+        self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None
+    ) -> Sequence[Example]:
+        """Read as many as are wanted as motions; a demonstration has either prompt, never parts of both."""
+        share = self._motion_share
+        if share in (0, 1) or rngs is None:
+            are_motions = [share == 1] * len(examples)
+        else:
+            are_motions = [rng.random() < share for rng in rngs]
+        return [
+            replace(example, tokens=as_motion(example.tokens)) if is_motion else example
+            for example, is_motion in zip(examples, are_motions, strict=True)
+        ]
 
 
 def make_learner(name: str) -> Learner:

@@ -17,14 +17,11 @@ from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.data.tokens.cache import TokenCache, open_tokens
 from openvima.errors import ConfigError
-from openvima.policies.inputs import Reader
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.network import build_network
-from openvima.policies.presets import preset
-from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.board import Board
-from openvima.training.config import MATCHING_STEPS, TrainingConfig
-from openvima.training.learner import Learner, PolicyLearner, make_learner
+from openvima.training.building import build_learner, resolved
+from openvima.training.config import TrainingConfig
+from openvima.training.inverse_dynamics import MOTION_TEXT
+from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.parallel import Parallel, joined, set_whole_state, whole_state
 from openvima.training.pretrain import render_pairs
 from openvima.training.provenance import provenance
@@ -86,11 +83,11 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         PromptError: A prompt has a word that the policy's vocabulary lacks.
         MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
-    config = _resolved(config)
+    config = resolved(config)
     load_assets(config.assets)  # what is wrong is found before there is a run folder
     dataset = Dataset(config.data)
     with _threads(config.threads), joined(config.device, config.sharding) as parallel:
-        learner = _learner(config)
+        learner = build_learner(config)
         run = RunFolder(
             config.out,
             _settings(config, dataset, learner),
@@ -105,46 +102,6 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         finally:
             trainer.board.close()
     return run.path
-
-
-def _resolved(config: TrainingConfig) -> TrainingConfig:
-    """Fill in what the settings leave to the preset, and check that both fit together."""
-    if ":" in config.preset:
-        if config.pretraining_steps or config.t5:
-            raise ConfigError("a learner of your own knows neither pretraining_steps nor t5; leave them out.")
-        return replace(config, pretraining_steps=0)
-    sizes = preset(config.preset)
-    reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
-    if reads_with_t5 and config.t5 is None:
-        raise ConfigError(
-            f"preset {config.preset!r} reads prompts with T5; set t5 to the folder that holds it, or to "
-            "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
-        )
-    if config.t5 is not None and not reads_with_t5:
-        raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
-    has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
-    if config.pretraining_steps and not has_appearance:
-        raise ConfigError(
-            f"pretraining_steps is {config.pretraining_steps}, but preset {config.preset!r} has no "
-            "appearance embedding to match prompt and scene with; leave it out, or set it to 0."
-        )
-    if config.pretraining_steps is None:
-        return replace(config, pretraining_steps=MATCHING_STEPS if has_appearance else 0)
-    return config
-
-
-def _learner(config: TrainingConfig) -> Learner:
-    if ":" in config.preset:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(step_seed(config.seed, "weights", 0))
-            return make_learner(config.preset)
-    sizes = preset(config.preset)
-    tokenizer = tokenizer_for(sizes.prompt, config.t5)
-    network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
-    if config.t5:
-        load_t5(network, config.t5)
-    reader = Reader.of(sizes.images, tokenizer)
-    return PolicyLearner(network, reader, spurious_probability=config.spurious_probability)
 
 
 class _Trainer:
@@ -320,7 +277,7 @@ class _Trainer:
         )
 
     def _matching(self) -> Stage:
-        assert isinstance(self.learner, PolicyLearner)  # `_resolved` has seen to it
+        assert isinstance(self.learner, PolicyLearner)  # `resolved` has seen to it
         tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
         pairs = render_pairs(
             tasks,
@@ -336,6 +293,8 @@ class _Trainer:
         tokens, config = self._tokens(), self.config
         if isinstance(self.learner, PolicyLearner):
             check_words(tokens, self.learner.reader)
+            if config.motion_share:
+                self.learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
             if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
                 freeze_crops(self.learner, tokens)
         self.module = self.parallel.wrap(self.learner)

@@ -11,25 +11,40 @@ import yaml
 from openvima.errors import ConfigError, unknown_name
 from openvima.training.config import TrainingConfig
 
+# VIMA, Jiang et al. 2023, with what later re-implementations report where the paper is silent: AdamW without
+# decay, the rate falls to its end within the first half of the run.
+_PAPER: Mapping[str, Any] = {
+    "preset": "vima-200m",
+    "epochs": 10,
+    "batch": 128,
+    "learning_rate": 1e-4,
+    "final_learning_rate": 1e-7,
+    "warmup_steps": 7000,
+    "decay_steps": 17000,
+    "weight_decay": 0.0,
+    "validation_share": 1 / 13,
+    "checkpoint_every": 1000,
+    "precision": "bfloat16",
+    "loader_workers": 4,
+}
+# MIDAS, Li et al. 2023: rates and batches are not published, so they are VIMA's.
+_MIDAS: Mapping[str, Any] = {**_PAPER, "preset": "midas-92m"}
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
-        # VIMA, Jiang et al. 2023, with what later re-implementations report where the paper is silent: AdamW
-        # without decay, the rate falls to its end within the first half of the run.
-        "paper": {
-            "preset": "vima-200m",
-            "epochs": 10,
-            "batch": 128,
-            "learning_rate": 1e-4,
-            "final_learning_rate": 1e-7,
-            "warmup_steps": 7000,
-            "decay_steps": 17000,
-            "weight_decay": 0.0,
-            "validation_share": 1 / 13,
-            "checkpoint_every": 1000,
-            "precision": "bfloat16",
-            "loader_workers": 4,
+        "paper": _PAPER,
+        # 10,300 iterations is the longest pretraining of the paper; shorter ones helped less.
+        "midas-pretrain": {
+            **_MIDAS,
+            "epochs": None,
+            "steps": 10300,
+            "warmup_steps": 1000,
+            "decay_steps": None,
+            "motion_share": 1.0,
         },
+        "midas-finetune": _MIDAS,
+        # The paper mixes motions into the tasks for use in context and does not say how many.
+        "midas-in-context": {**_MIDAS, "motion_share": 0.5},
         # One GPU of 24 GB and a tenth of the data; the rate falls until the end, which wastes nothing.
         "workstation": {
             "preset": "vima-20m",

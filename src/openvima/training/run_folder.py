@@ -209,7 +209,7 @@ class RunFolder:
             old = yaml.safe_load(file.read_text(encoding="utf-8"))
         except yaml.YAMLError:
             return [f"its {CONFIG_FILE} is no valid YAML"]
-        old, new = _flattened(old), _flattened(settings)
+        old, new = flattened(old), flattened(settings)
         names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         return [f"{name} is {old.get(name)!r} there and {new.get(name)!r} here" for name in names]
 
@@ -234,10 +234,11 @@ def _read_progress(checkpoint: Path) -> Progress:
         raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
 
 
-def _flattened(values: Any, prefix: str = "") -> dict[str, Any]:
+def flattened(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
+    """Return nested settings as one mapping; names are joined by dots."""
     if not isinstance(values, dict):
         return {prefix: values}
     result: dict[str, Any] = {}
     for name, value in values.items():
-        result |= _flattened(value, f"{prefix}.{name}" if prefix else str(name))
+        result |= flattened(value, f"{prefix}.{name}" if prefix else str(name))
     return result

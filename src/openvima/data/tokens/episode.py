@@ -22,7 +22,7 @@ ACTION_PARTS = tuple(ACTION_SHAPES)
 # What stands where in a row of the three tables. Numbers name images, front view then top view, 0 where the
 # object is hidden; boxes are centre x, centre y, height, width in pixels; grasps column and row.
 ID, NUMBERS, BOXES, GRASPS = 0, slice(1, 3), slice(3, 11), slice(11, 15)  # of an object
-PROMPT_WIDTH, OBJECT_WIDTH = 11, 15  # objects of the prompt have no grasps
+PROMPT_WIDTH, OBJECT_WIDTH = 11, 15  # objects of the prompt and of the end have no grasps
 COUNT, PICK, PLACE, SPURIOUS_NUMBERS, SPURIOUS_BOXES = 0, 1, 2, slice(3, 5), slice(5, 13)  # of a step
 STEP_WIDTH = 13
 
@@ -47,6 +47,7 @@ class TokenEpisode:
             and boxes of two false detections; shape (T, 13), int16.
         objects: One row an object in view, step after step, from left to right: id, numbers of its two
             images, boxes, grasp points; shape (O, 15), int16.
+        final: One row an object in view after the last step, like those of the prompt; shape (F, 11), int16.
         actions: What the oracle did, shape (T, 12), float32: positions in metres and quaternions.
         images: All crops or halved frames, shape (K, 3, height, width), uint8; number n is `images[n - 1]`.
     """
@@ -59,6 +60,7 @@ class TokenEpisode:
     prompt: np.ndarray
     steps: np.ndarray
     objects: np.ndarray
+    final: np.ndarray
     actions: np.ndarray
     images: np.ndarray
 
@@ -95,6 +97,7 @@ def tokens_of(demo: Demonstration, kind: TokenKind) -> TokenEpisode:
         # By the content alone, so that the cache does not depend on who makes it and in what order.
         rng = np.random.default_rng([demo.seed, *demo.task.encode()])
         _draw_spurious(steps, observations, views, stack, rng)
+    final_rows = _rows(_see(demo.observation(demo.num_steps), kind), stack)
     return TokenEpisode(
         task=demo.task,
         seed=demo.seed,
@@ -104,6 +107,7 @@ def tokens_of(demo: Demonstration, kind: TokenKind) -> TokenEpisode:
         prompt=prompt_rows.astype(np.int16),
         steps=steps,
         objects=object_rows.astype(np.int16),
+        final=final_rows.astype(np.int16),
         actions=np.array([_action_row(action) for action in demo.actions], np.float32).reshape(-1, 12),
         images=stack.stacked(),
     )

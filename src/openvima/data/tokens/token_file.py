@@ -25,7 +25,7 @@ from openvima.data.tokens.episode import (
 from openvima.errors import ShardError
 from openvima.files import whole_file
 
-TOKENS_VERSION = 1  # grows whenever the same demonstration gives other tokens
+TOKENS_VERSION = 2  # grows whenever the same demonstration gives other tokens
 IMAGE_CODEC = "lz4_raw"  # blocks, without the frame around them
 _KEY = b"openvima.tokens"
 
@@ -54,12 +54,13 @@ COLUMNS = pa.schema(
             OBJECT_WIDTH,
             f"id, front image, top image, {_BOX}, front grasp x, front grasp y, top grasp x, top grasp y",
         ),
+        _table("final", pa.int16(), PROMPT_WIDTH, f"id, front image, top image, {_BOX}"),
         _table("actions", pa.float32(), 12, ", ".join(ACTION_PARTS)),
         pa.field("num_images", pa.int32(), nullable=False),
         pa.field("images", pa.large_binary(), nullable=False, metadata={"codec": IMAGE_CODEC}),
     ]
 )
-_TABLES = ("prompt_counts", "prompt", "steps", "objects", "actions")
+_TABLES = ("prompt_counts", "prompt", "steps", "objects", "final", "actions")
 
 
 def write_tokens(path: Path, episodes: Sequence[TokenEpisode], kind: TokenKind, source: str) -> None:
@@ -142,6 +143,7 @@ class TokenFile:
             prompt=tables["prompt"][row],
             steps=tables["steps"][row],
             objects=tables["objects"][row],
+            final=tables["final"][row],
             actions=tables["actions"][row],
             images=self.images(row),
         )

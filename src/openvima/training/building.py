@@ -1,0 +1,116 @@
+"""What a run trains: the network of a preset, with parts switched on or off, or a learner of one's own."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from openvima.errors import ConfigError
+from openvima.policies.base import find_checkpoint
+from openvima.policies.checkpoint import load_network
+from openvima.policies.config import PolicyConfig
+from openvima.policies.families.midas import with_autoregression, with_visual_residual
+from openvima.policies.inputs import Reader
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.network import PolicyNetwork, build_network
+from openvima.policies.presets import preset
+from openvima.policies.t5 import load_t5, tokenizer_for
+from openvima.training.config import MATCHING_STEPS, TrainingConfig
+from openvima.training.learner import Learner, PolicyLearner, make_learner
+from openvima.training.run_folder import flattened
+from openvima.training.schedule import step_seed
+
+# Settings that only networks of this package have.
+_OF_PRESETS = ("pretraining_steps", "t5", "motion_share", "autoregressive", "visual_residual")
+
+
+def resolved(config: TrainingConfig) -> TrainingConfig:
+    """Fill in what the settings leave to the preset, and check that both fit together.
+
+    Raises:
+        ConfigError: They do not.
+    """
+    if ":" in config.preset:
+        unknown = [name for name in _OF_PRESETS if getattr(config, name)]
+        if unknown:
+            raise ConfigError(f"a learner of your own does not know {' or '.join(unknown)}; leave it out.")
+        return replace(config, pretraining_steps=0)
+    sizes = _sizes(config)
+    reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
+    if reads_with_t5 and config.t5 is None and config.init is None:
+        raise ConfigError(
+            f"preset {config.preset!r} reads prompts with T5; set t5 to the folder that holds it, or to "
+            "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
+        )
+    if config.t5 is not None and not reads_with_t5:
+        raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
+    has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
+    if config.pretraining_steps and not has_appearance:
+        raise ConfigError(
+            f"pretraining_steps is {config.pretraining_steps}, but preset {config.preset!r} has no "
+            "appearance embedding to match prompt and scene with; leave it out, or set it to 0."
+        )
+    if config.pretraining_steps is None:
+        return replace(config, pretraining_steps=MATCHING_STEPS if has_appearance and not config.init else 0)
+    return config
+
+
+def _sizes(config: TrainingConfig) -> PolicyConfig:
+    """The sizes of the preset, with what is switched on or off."""
+    sizes = preset(config.preset)
+    if config.autoregressive is not None:
+        sizes = with_autoregression(sizes, config.autoregressive)
+    if config.visual_residual is not None:
+        sizes = with_visual_residual(sizes, config.visual_residual)
+    return sizes
+
+
+def build_learner(config: TrainingConfig) -> Learner:
+    """Build what a run trains, with fresh weights or with those it begins with.
+
+    Args:
+        config: All settings, as `resolved` returned them.
+
+    Raises:
+        CheckpointError: T5 or the weights to begin with are not where the settings say.
+        ConfigError: The weights to begin with are those of a network of other sizes.
+        MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
+    """
+    if ":" in config.preset:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(step_seed(config.seed, "weights", 0))
+            learner = make_learner(config.preset)
+        if config.init:
+            learner.read(find_checkpoint(config.init))
+        return learner
+    sizes, stored = _sizes(config), None
+    network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+    if config.init:
+        stored = _begin_with(network, config.init)
+    elif config.t5:
+        load_t5(network, config.t5)
+    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, config.t5 or stored))
+    return PolicyLearner(
+        network,
+        reader,
+        spurious_probability=config.spurious_probability,
+        motion_share=config.motion_share,
+    )
+
+
+def _begin_with(network: PolicyNetwork, source: str) -> Path | None:
+    """Copy the weights of another network, and return the folder of its tokenizer, if it has one."""
+    other, tokenizer = load_network(source)
+    ours, theirs = flattened(network.config.to_dict()), flattened(other.config.to_dict())
+    differing = [
+        f"{name} is {theirs.get(name)!r} there and {ours.get(name)!r} here"
+        for name in {**theirs, **ours}
+        if theirs.get(name) != ours.get(name)
+    ]
+    if differing:
+        raise ConfigError(
+            f"init is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that it "
+            "was trained with, and the same autoregressive and visual_residual."
+        )
+    network.load_state_dict(other.state_dict())
+    return tokenizer

@@ -1,0 +1,186 @@
+"""Demonstrations read as motions: nothing is lost, nothing leaks, and runs go on from one another."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.data import Demonstration  # noqa: E402
+from openvima.data.tokens.episode import BOXES, ID, NUMBERS, tokens_of  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.perception.image_stack import ImageStack  # noqa: E402
+from openvima.perception.objects import observe, whole_frames  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.inputs import Reader, batch_prompts  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.building import build_learner  # noqa: E402
+from openvima.training.dataset import Example, token_kind  # noqa: E402
+from openvima.training.inverse_dynamics import as_motion, motion_prompt, motion_text  # noqa: E402
+from openvima.training.learner import PolicyCollate  # noqa: E402
+from training_examples import rngs_of  # noqa: E402
+
+READERS = {
+    name: Reader.of(preset(name).images) for name in ("nano", "midas-nano", "gpt-nano")
+}  # objects, views, frames
+
+
+def whole_motion(demo: Demonstration) -> list[dict]:
+    return [demo.observation(t) for t in range(demo.num_steps + 1)]
+
+
+@pytest.mark.parametrize("kind", ["objects", "frames"])
+def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
+    kind, demonstrations_of_several_steps
+) -> None:
+    for demo in demonstrations_of_several_steps:
+        motion = as_motion(tokens_of(demo, kind))
+        assert motion.text == motion_text(demo.num_steps + 1)
+        assert len(motion.prompt_counts) == demo.num_steps + 1
+        ends = np.cumsum(motion.prompt_counts)[:-1]
+        for rows, seen in zip(np.split(motion.prompt, ends), whole_motion(demo), strict=True):
+            expected = whole_frames(seen["rgb"]) if kind == "frames" else observe(seen, left_to_right=False)
+            assert rows[:, ID].tolist() == expected.ids.tolist()
+            np.testing.assert_array_equal(rows[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1), expected.boxes)
+            shown = rows[:, NUMBERS].T > 0
+            np.testing.assert_array_equal(shown, expected.masks)
+            np.testing.assert_array_equal(
+                motion.images[rows[:, NUMBERS].T[shown] - 1], expected.crops[expected.masks]
+            )
+        actions = [np.concatenate(list(action.to_arrays().values())) for action in demo.actions]
+        np.testing.assert_array_equal(motion.actions, np.float32(actions))
+
+
+def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
+    tokens = tokens_of(demonstrations_of_several_steps[0], "objects")
+    motion = as_motion(tokens)
+    for name in ("images", "objects", "steps", "actions"):
+        assert getattr(motion, name) is getattr(tokens, name)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
+    name, demonstrations_of_several_steps
+) -> None:
+    reader, demos = READERS[name], demonstrations_of_several_steps
+    episodes = [tokens_of(demo, token_kind(reader)) for demo in demos]
+    collate = PolicyCollate(reader, 0.0, with_images=True, motion_share=1.0)
+    ours = collate([Example(episode) for episode in episodes])
+    read = [reader.read_prompt(motion_prompt(whole_motion(demo), demo.objects)) for demo in demos]
+    stack = ImageStack(reader.image_size)
+    theirs = batch_prompts(read, [stack.add(prompt.objects.crops) for prompt in read])
+    for field in ("words_BL", "images_BL", "mask_BL", "boxes_VS4", "masks_VS"):
+        assert torch.equal(getattr(ours.prompts, field), getattr(theirs, field)), field
+    seen = torch.from_numpy(stack.stacked())[theirs.crops_VS]
+    assert torch.equal(ours.images[ours.prompts.crops_VS], seen)
+
+
+def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:
+    """The prompt of each demonstration, collated by itself."""
+    found = []
+    for number, episode in enumerate(episodes):
+        batch = collate([Example(episode, row=number)], None if rngs is None else rngs[number : number + 1])
+        length = int(batch.prompts.mask_BL.sum())
+        crops = batch.images[batch.prompts.crops_VS].sum().item()
+        found.append((length, batch.prompts.words_BL.tolist(), batch.prompts.boxes_VS4.tolist(), crops))
+    return found
+
+
+def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_steps) -> None:
+    """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
+    reader = READERS["midas-nano"]
+    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps] * 4
+    mixed = PolicyCollate(reader, 0.0, with_images=True, motion_share=0.5)
+    tasks = prompts_of(PolicyCollate(reader, 0.0, with_images=True), episodes)
+    motions = prompts_of(PolicyCollate(reader, 0.0, with_images=True, motion_share=1.0), episodes)
+    with_motions = prompts_of(mixed, episodes, rngs_of(episodes))
+    are_motions = [prompt == motion for prompt, motion in zip(with_motions, motions, strict=True)]
+    assert 4 < sum(are_motions) < len(episodes) - 4
+    for prompt, task, is_motion in zip(with_motions, tasks, are_motions, strict=True):
+        assert is_motion or prompt == task
+        assert task not in motions
+    elsewhere = [
+        replace(
+            tokens, actions=tokens.actions[::-1] + 0.1, objects=tokens.objects * 0 + 1, final=tokens.final[:0]
+        )
+        for tokens in episodes
+    ]
+    assert prompts_of(PolicyCollate(reader, 0.0, with_images=True), elsewhere) == tasks
+
+
+def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
+    reader = READERS["nano"]
+    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
+    mixed = PolicyCollate(reader, 0.0, with_images=True, motion_share=0.5)
+    examples = [Example(episode) for episode in episodes]
+    together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
+    assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
+
+
+def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
+    demonstrations_of_several_steps,
+) -> None:
+    reader = READERS["nano"]
+    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
+    plain, half, all_of_them = (
+        prompts_of(PolicyCollate(reader, 0.0, with_images=True, motion_share=share), episodes)
+        for share in (0.0, 0.5, 1.0)
+    )
+    assert half == plain != all_of_them
+
+
+def last_weights(run: Path) -> dict[str, "torch.Tensor"]:
+    return load_file(sorted((run / "checkpoints").glob("2-cloning-*"))[-1] / "model.safetensors")
+
+
+def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
+    words = ["--data", str(data), "--preset", "midas-nano", "--steps", "1", "--batch", "2"]
+    before, after = str(tmp_path / "before"), str(tmp_path / "after")
+    assert main(["train", *words, "--motion-share", "1", "--out", before]) == 0
+    config = TrainingConfig(data=data, out=Path(after), preset="midas-nano", init=before)
+    begun = build_learner(config).network.state_dict()
+    weights = last_weights(Path(before))
+    assert begun.keys() == weights.keys()
+    assert all(torch.equal(begun[name], weights[name]) for name in weights)
+    assert main(["train", *words, "--init", before, "--learning-rate", "0", "--out", after]) == 0
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in last_weights(Path(after)).items())
+
+
+def test_what_has_matched_looks_need_not_do_so_again(settings, tmp_path) -> None:
+    first = train(TrainingConfig(**{**settings, "steps": 1}))
+    again = {**settings, "pretraining_steps": None, "steps": 1, "out": tmp_path / "on", "init": str(first)}
+    train(TrainingConfig(**again))
+    assert [path.name for path in (tmp_path / "on" / "checkpoints").glob("*-0*")] == ["2-cloning-000001"]
+
+
+def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
+    first = train(TrainingConfig(**{**settings, "steps": 1}))
+    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano-bins", init=str(first))
+    with pytest.raises(ConfigError, match=r"of other sizes: images\.crop\.width is 4 there and 32 here"):
+        train(other)
+    assert not other.out.exists()
+
+
+@pytest.mark.parametrize("switch", ["motion_share", "autoregressive", "visual_residual"])
+def test_a_learner_of_ones_own_has_no_such_switch(switch, data, tmp_path) -> None:
+    config = TrainingConfig(data=data, out=tmp_path / "run", preset="some:learner", **{switch: True})
+    with pytest.raises(ConfigError, match=f"does not know {switch}; leave it out"):
+        train(config)
+
+
+def test_parts_of_midas_can_be_switched_on_and_off(data, tmp_path) -> None:
+    def sizes(preset_name: str, **switches: bool):
+        config = TrainingConfig(data=data, out=tmp_path, preset=preset_name, **switches)
+        return build_learner(config).network.config
+
+    plain = preset("vima-nano")
+    midas = preset("midas-nano")
+    both = {"autoregressive": True, "visual_residual": True}
+    assert replace(sizes("vima-nano", **both), trunk=midas.trunk) == midas
+    off = sizes("midas-nano", autoregressive=False, visual_residual=False)
+    assert replace(off, trunk=plain.trunk) == plain
