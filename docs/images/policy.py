@@ -105,7 +105,7 @@ def image_token(reader: Reader, images: ObjectViews, entry: int, part: int) -> T
     """Return one token of an image: a crop, a patch, or a blank where frames are summed up."""
     if reader.layout == "views":
         name, colour = VIEWS[part]
-        return Token(picture(images.crops[part, entry]), colour, f"{'ABC'[entry]} {name}")
+        return Token(picture(images.crops[part, entry]), colour, f"{chr(ord('A') + entry)} {name}")
     if reader.tokens_per_frame_pair < 2 * PATCHES:
         return Token("", SUMMARY)
     view, place = divmod(part, PATCHES)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openvima.env import TabletopEnv
-from openvima.errors import ConfigError
+from openvima.errors import CheckpointError, ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 from openvima.evaluation.boxes import load_finder
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
@@ -96,6 +96,14 @@ def test_where_something_is_found_it_is_left_as_it_is():
 def test_what_makes_no_detector_is_named(hook, message):
     with pytest.raises(ConfigError, match=message):
         load_finder(hook)
+
+
+def test_a_trained_detector_is_found_by_its_folder(tmp_path):
+    pytest.importorskip("torch")
+    with pytest.raises(CheckpointError, match="no folder"):
+        load_finder(f"detector={tmp_path / 'none'}")
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        load_finder(f"detector={tmp_path}")
 
 
 def test_a_missing_detector_is_named_before_anything_is_played(tmp_path):

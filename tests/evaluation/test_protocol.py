@@ -1,6 +1,7 @@
 """What is played: tasks, levels, seeds, batches, and the names of policies."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -100,6 +101,8 @@ def test_boxes_are_detected_under_their_control_only_and_not_by_servers():
     config = EvaluationConfig(policies, ("rotate",), ("L1",), 1, controls=("all",), boxes="finder.py:make")
     detected = [batch for batch in plan(config) if batch.boxes]
     assert [(batch.policy, batch.control) for batch in detected] == [("mine", "detected_boxes")]
+    (trained,) = (replace(batch, boxes="detector=run").with_whole_paths().boxes for batch in detected)
+    assert trained == f"detector={Path('run').absolute()}"
     (moved,) = (batch.with_whole_paths().boxes for batch in detected)
     assert moved.endswith("/finder.py:make")
 

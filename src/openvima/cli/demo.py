@@ -17,6 +17,7 @@ def main(
     compat: bool = False,
     difficulty: str = "easy",
     device: str = "cpu",
+    boxes: str | None = None,
 ) -> int:
     """Film one episode: the prompt above, the table and the arm below.
 
@@ -33,6 +34,9 @@ def main(
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
+        boxes: Let the policy see the boxes of a detector instead of the true ones: "detector" for the one
+            that comes with the package, detector=FOLDER for one that `openvima detector train` made, or
+            MODULE:FUNCTION.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -43,13 +47,25 @@ def main(
     level = task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
+    if boxes is not None and policy in ("oracle", "random"):
+        raise ConfigError(f"--boxes is {boxes!r}, but {policy} looks at no boxes; name a trained policy.")
     from openvima.env import Setup
     from openvima.evaluation.film import film_episode
     from openvima.evaluation.players import load_player
     from openvima.evaluation.protocol import Batch
 
     setup = Setup(assets, compat, difficulty)
-    batch = Batch(policy, policy, task, level, first_seed=seed, episodes=1, setup=setup, device=device)
+    batch = Batch(
+        policy,
+        policy,
+        task,
+        level,
+        first_seed=seed,
+        episodes=1,
+        setup=setup,
+        device=device,
+        boxes=boxes or "",
+    )
     env = setup.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = film_episode(env, load_player(batch), seed, out, title=title)

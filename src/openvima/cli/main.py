@@ -18,6 +18,7 @@ VERBS = {
     "assets": "show all objects and textures, or import those of the original benchmark",
     "policies": "list the named networks and their sizes, or convert published files",
     "train": "train a policy on demonstrations",
+    "detector": "train and score the detector that finds objects in pixels",
     "evaluate": "score policies on levels L1 to L4",
     "serve": "let a policy be scored over the network, or from programs in other languages",
     "report": "make the HTML report of evaluation results",

@@ -4,12 +4,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from openvima.detection.config import DETECTORS, BackboneConfig, DetectorConfig, detector_config
+from openvima.errors import CheckpointError
 
 if TYPE_CHECKING:
     from openvima.detection.detector import FrameDetector
     from openvima.policies.detection import DetectedObjects
 
 PACKAGED = Path(__file__).parent / "trained"  # the small detector for the default assets
+
+
+def detector_folder(folder: str | Path | None = None) -> Path:
+    """Return where a trained detector lies, if there is one; `load_detector` takes the same.
+
+    Raises:
+        CheckpointError: There is none.
+    """
+    path = PACKAGED if folder is None else Path(folder)
+    if path.is_dir():
+        return path
+    missing = (
+        "this version comes without a trained detector" if folder is None else f"there is no folder {path}"
+    )
+    raise CheckpointError(
+        f"{missing}; `openvima detector train --data DIR --out RUN` makes one. Give its folder."
+    )
 
 
 def load_detector(
@@ -32,7 +50,7 @@ def load_detector(
     from openvima.detection.checkpoint import load_network
     from openvima.detection.detector import FrameDetector
 
-    return FrameDetector(load_network(PACKAGED if folder is None else folder), **options)
+    return FrameDetector(load_network(detector_folder(folder)), **options)
 
 
 def load_finder(folder: str | Path | None = None, **options: Any) -> "DetectedObjects":  # Any: as above
@@ -52,6 +70,7 @@ __all__ = [
     "BackboneConfig",
     "DetectorConfig",
     "detector_config",
+    "detector_folder",
     "load_detector",
     "load_finder",
 ]

@@ -69,10 +69,6 @@ def load_network(path: str | Path) -> MaskRCNN:
     """
     path = Path(path)
     restore_folder(path)
-    if not path.is_dir():
-        raise CheckpointError(
-            f"there is no detector in {path}; `openvima detector train --data DIR --out RUN` makes one."
-        )
     folder = checkpoint_folder(path)
     network = MaskRCNN(read_config(folder))
     load_weights(network, folder / WEIGHTS_FILE)

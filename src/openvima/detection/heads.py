@@ -41,7 +41,7 @@ class BoxHead(nn.Module):
         x = cut.flatten(1)
         for layer in self.hidden:
             x = F.relu(layer(x))
-        return self.kinds(x), self.deltas(x).view(len(x), -1, 4)
+        return self.kinds(x), self.deltas(x).unflatten(1, (-1, 4))
 
 
 class MaskHead(nn.Module):

@@ -5,26 +5,38 @@ import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import cast
 
+from openvima.detection import detector_folder
+from openvima.detection import load_finder as load_detecting_finder
 from openvima.errors import ConfigError
 from openvima.perception.objects import ObjectFinder, ObjectViews, see_nothing
 from openvima.scene import PromptImage
 
-_FORM = "MODULE:FUNCTION or FILE.py:FUNCTION, a function without arguments that gives an ObjectFinder"
+DETECTOR = "detector"  # the one that comes with the package; or detector=FOLDER
+_FORM = (
+    "detector, detector=FOLDER of a trained one, or MODULE:FUNCTION or FILE.py:FUNCTION, a function without "
+    "arguments that gives an ObjectFinder"
+)
 
 
 def finder_maker(hook: str) -> Callable[[], object]:
     """Find the function that makes the detector.
 
     Args:
-        hook: "module:function", or "file.py:function" for a file that lies anywhere.
+        hook: "detector" for the one that comes with the package, "detector=folder" for another trained one;
+            "module:function", or "file.py:function" for a file that lies anywhere.
 
     Raises:
         ConfigError: There is no such module, file or function.
+        CheckpointError: There is no trained detector.
     """
+    name, _, folder = hook.partition("=")
+    if name == DETECTOR:
+        return partial(load_detecting_finder, detector_folder(folder or None))
     where, _, name = hook.rpartition(":")
     if not where or not name:
         raise ConfigError(f"boxes is {hook!r}; give {_FORM}.")
@@ -43,6 +55,7 @@ def load_finder(hook: str) -> ObjectFinder:
 
     Raises:
         ConfigError: There is no such function, or it gives something else.
+        CheckpointError: There is no trained detector, or it is damaged.
     """
     finder = finder_maker(hook)()
     if not (hasattr(finder, "in_observation") and hasattr(finder, "in_prompt_image")):

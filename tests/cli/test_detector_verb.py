@@ -1,0 +1,97 @@
+"""The verb `detector`, and `--boxes detector` of evaluate and demo."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("pycocotools")
+
+from openvima.cli.main import main  # noqa: E402
+from openvima.data import GenerateConfig, generate  # noqa: E402
+from openvima.detection import config as sizes  # noqa: E402
+from openvima.detection.checkpoint import load_network, save_network  # noqa: E402
+from openvima.detection.config import BackboneConfig, DetectorConfig  # noqa: E402
+from openvima.detection.network import MaskRCNN  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    return generate(GenerateConfig(out=folder / "demos", tasks=("rotate",), episodes=8))
+
+
+@pytest.fixture
+def tiny() -> DetectorConfig:
+    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, pyramid_width=8)
+    return DetectorConfig(backbone, (32.0,), box_widths=(8,), mask_widths=(8,), proposals=4, candidates=8)
+
+
+@pytest.fixture
+def detector(tiny, tmp_path) -> Path:
+    torch.manual_seed(0)
+    save_network(MaskRCNN(tiny), tmp_path / "detector")
+    return tmp_path / "detector"
+
+
+def test_train_makes_a_run_that_evaluate_and_show_take(data, tiny, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
+    run = tmp_path / "run"
+    words = ["--data", str(data), "--out", str(run), "--steps", "1", "--batch", "2"]
+    more = ["--validation-share", "0.4", "--validation-frames", "2", "--device", "cpu"]
+    assert main(["detector", "train", *words, *more]) == 0
+    assert capsys.readouterr().out == f"{run}\n"
+    assert load_network(run).config == tiny
+    words = [str(run), "--data", str(data), "--frames", "4", "--held-out", "0.4", "--json"]
+    assert main(["detector", "evaluate", *words]) == 0
+    score = json.loads(capsys.readouterr().out)
+    assert score["frames"] == 4 and 0 <= score["boxes"]["ap50"] <= 1
+    picture = tmp_path / "seen.png"
+    words = [str(run), "--data", str(data), "--frames", "2", "--out", str(picture)]
+    assert main(["detector", "show", *words]) == 0
+    with Image.open(picture) as shown:
+        assert shown.size[0] > 2 * 256
+
+
+def test_frames_of_a_level_are_played_where_no_folder_is_given(detector, capsys):
+    assert main(["detector", "evaluate", str(detector), "--level", "L4", "--frames", "2"]) == 0
+    table = capsys.readouterr().out
+    assert "AP50" in table and "boxes" in table and "masks" in table
+
+
+def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
+    from openvima.detection import detectron2
+
+    monkeypatch.setattr(detectron2, "load_detectron2", lambda file: MaskRCNN(tiny))
+    words = ["detector", "convert", "weights.pth", str(tmp_path / "converted")]
+    assert main(words) == 0
+    assert load_network(tmp_path / "converted").config == tiny
+    assert main(words) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+
+
+def test_a_missing_detector_is_told_in_one_line(tmp_path, capsys):
+    assert main(["detector", "show", str(tmp_path / "none")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+    assert main(["detector", "show", "--out", "seen.jpg"]) == 2
+    assert ".png" in capsys.readouterr().err
+
+
+def test_evaluate_plays_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
+    words = ["--policy", "untrained", "--tasks", "rotate", "--levels", "L1", "--episodes", "1"]
+    more = ["--boxes", f"detector={detector}", "--out", str(tmp_path / "out"), "--no-report", "--json"]
+    assert main(["evaluate", *words, *more]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row.get("control", "") for row in rows] == ["", "detected_boxes"]
+
+
+def test_demo_films_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
+    film = tmp_path / "film.mp4"
+    words = ["demo", "rotate", "--policy", "untrained", "--out", str(film)]
+    assert main([*words, "--boxes", f"detector={detector}"]) == 0
+    assert film.stat().st_size > 0
+    assert main(["demo", "rotate", "--boxes", "detector"]) == 2
+    assert "looks at no boxes" in capsys.readouterr().err

@@ -1,0 +1,68 @@
+"""Prompted with a demonstration: it is that of the very episode, and the episode is left as it was."""
+
+import numpy as np
+import pytest
+
+from openvima.cli.main import main
+from openvima.data.records import rollout_oracle
+from openvima.env import TabletopEnv
+from openvima.evaluation import EvaluationConfig, Results
+from openvima.evaluation.controls import CONTROLS, IN_CONTEXT, sight
+from openvima.evaluation.in_context import HELD_OUT_TASKS
+from openvima.evaluation.players import PolicyPlayer
+from openvima.evaluation.rollout import play
+from openvima.evaluation.sources import policy_sources
+from openvima.policies import RandomPolicy
+from openvima.policies.tokenizer import encode_text
+from openvima.tasks import task_spec
+
+
+@pytest.mark.parametrize("task", HELD_OUT_TASKS)
+def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
+    env = TabletopEnv(task, level=task_spec(task).levels[-1], domain="eval")
+    observation, _ = env.reset(seed=3)
+    before = env.scene
+    prompt = sight(env, IN_CONTEXT).prompt
+    assert env.scene == before
+    demo = rollout_oracle(TabletopEnv(task, level=env.level, domain="eval"), 3)
+    assert demo.outcome.success
+    assert list(prompt.images) == [f"frame_{t}" for t in range(demo.num_steps + 1)]
+    for t, image in enumerate(prompt.images.values()):
+        for view in ("front", "top"):
+            np.testing.assert_array_equal(image.rgb[view], demo.rgb[view][t])
+            np.testing.assert_array_equal(image.segm[view], demo.segm[view][t])
+    np.testing.assert_array_equal(prompt.images["frame_0"].rgb["top"], observation["rgb"]["top"])
+    words = [piece for piece in prompt.sequence() if isinstance(piece, str)]
+    assert words[0] == "Follow this motion:"
+    encode_text(" ".join(words))
+
+
+class Noting(RandomPolicy):
+    """Notes what it is told."""
+
+    def reset(self, prompts):
+        super().reset(prompts)
+        self.prompts = prompts
+
+
+def test_players_are_told_the_motion() -> None:
+    policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
+    play([env], [0], PolicyPlayer(policy, IN_CONTEXT))
+    assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")
+
+
+def test_it_is_asked_for_by_name_only() -> None:
+    (source,) = policy_sources(("untrained",))
+    asked = EvaluationConfig(("untrained",), controls=("all", IN_CONTEXT)).controls_of(source)
+    assert asked == (*(name for name in CONTROLS if name != "detected_boxes"), IN_CONTEXT)
+    assert IN_CONTEXT not in EvaluationConfig(("untrained",), controls=("all",)).controls_of(source)
+
+
+def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> None:
+    pytest.importorskip("torch")
+    words = ["evaluate", "--policy", "untrained", "--in-context", "--episodes", "1", "--no-report"]
+    assert main([*words, "--levels", "L1,L4", "--out", str(tmp_path), "--batch", "1"]) == 0
+    rows = Results.read(tmp_path / "results.json").rows
+    assert {(row.task, row.control) for row in rows} == {
+        (task, control) for task in HELD_OUT_TASKS for control in ("", IN_CONTEXT)
+    }
