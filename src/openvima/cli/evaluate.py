@@ -28,6 +28,7 @@ def main(
     compat: bool = False,
     difficulty: str = "easy",
     controls: str = "",
+    in_context: bool = False,
     boxes: str | None = None,
     batch: int = 16,
     engine: Literal["processes", "ray"] = "processes",
@@ -62,9 +63,9 @@ def main(
         difficulty: easy, as for all published results, medium or hard.
         controls: What to play besides, to show what the score is made of, with commas in between: no_prompt,
             other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
-        boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
-            comes with the package, detector=FOLDER for one that `openvima detector train` made, or
-            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
+        boxes: Detector for detected_boxes: MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
+        in_context: Play each episode also with a demonstration of it as the prompt, "Follow this motion: …";
+            by default of twist, follow_motion and follow_order, for policies trained without these tasks.
         batch: Episodes that are played together; a policy decides for all of them at once.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
@@ -82,10 +83,14 @@ def main(
     """
     from openvima.env import Setup
     from openvima.evaluation import EvaluationConfig, Results, evaluate
+    from openvima.evaluation.controls import IN_CONTEXT
+    from openvima.evaluation.in_context import HELD_OUT_TASKS
 
+    if in_context:
+        controls = f"{controls},{IN_CONTEXT}"
     config = EvaluationConfig(
         policies=_words(policy),
-        tasks=_words(tasks),
+        tasks=HELD_OUT_TASKS if in_context and tasks == "all" else _words(tasks),
         levels=_words(levels),
         episodes=episodes,
         seed=seed,
@@ -98,7 +103,7 @@ def main(
         force=force,
         device=device,
         precision=precision,
-        controls=_with_boxes(_words(controls), boxes),
+        controls=_words(controls),
         boxes=boxes,
         film=_words(film),
         engine=engine,
@@ -173,14 +178,6 @@ def _strict_mean(results: "Results", policy: str, level: str) -> str:
 
 def _cell(rate: float, interval: tuple[float, float]) -> str:
     return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
-
-
-def _with_boxes(controls: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
-    """Add the control that uses the boxes, if some are given and it is not asked for yet."""
-    from openvima.evaluation.controls import DETECTED_BOXES
-
-    asked = boxes is None or {"all", DETECTED_BOXES} & set(controls)
-    return controls if asked else (*controls, DETECTED_BOXES)
 
 
 def _words(text: str) -> tuple[str, ...]:

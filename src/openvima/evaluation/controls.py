@@ -7,6 +7,7 @@
 | `scrambled_words` | its own images; each word, number and mark of the text is some word of the vocabulary |
 | `shuffled_objects` | object ids dealt out anew, in the segmentations and in the records of the prompt |
 | `detected_boxes` | boxes that a plugged-in detector finds in the pixels |
+| `in_context` | in place of the task's prompt the motion of the oracle in the same episode |
 
 What is drawn follows from the episode's task, level and seed, so neither the batch nor the number of workers
 changes it. Starts, goals and time limits are those of the plain score.
@@ -25,6 +26,7 @@ import numpy as np
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import SamplingError
+from openvima.evaluation.in_context import demonstrated
 from openvima.policies.tokenizer import word_ids
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectRecord, Prompt, PromptImage, RenderedPrompt
@@ -36,6 +38,7 @@ OTHER_PROMPT_IMAGES = "other_prompt_images"
 SCRAMBLED_WORDS = "scrambled_words"
 SHUFFLED_OBJECTS = "shuffled_objects"
 DETECTED_BOXES = "detected_boxes"
+IN_CONTEXT = "in_context"  # takes the task away and gives its solution; not among "all"
 CONTROLS = (NO_PROMPT, OTHER_PROMPT_IMAGES, SCRAMBLED_WORDS, SHUFFLED_OBJECTS, DETECTED_BOXES)
 
 NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
@@ -68,12 +71,15 @@ def sight(env: TabletopEnv, control: str) -> Sight:
 
     Args:
         env: The environment; it is left as it is.
-        control: One of `CONTROLS`, or empty for none. Boxes are the policy's matter: see
+        control: One of `CONTROLS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
             `openvima.evaluation.boxes`.
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.
+        OracleError: The oracle finds no action to show.
     """
+    if control == IN_CONTEXT:
+        return Sight(demonstrated(env))
     if control == NO_PROMPT:
         return Sight(NEUTRAL_PROMPT)
     if control in ("", DETECTED_BOXES):

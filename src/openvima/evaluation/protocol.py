@@ -15,7 +15,7 @@ from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import ConfigError, LevelError, unknown_name
-from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES
+from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES, IN_CONTEXT
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -55,10 +55,10 @@ class EvaluationConfig:
             elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
         controls: What to play besides, to show what a score is made of: names of
             `openvima.evaluation.controls.CONTROLS`, of which each policy that reads prompts plays all;
-            "random" and "oracle", which then are played too; or ("all",).
-        boxes: For the control "detected_boxes": "detector" for the one that comes with the package,
-            "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
-            the `ObjectFinder` to plug in. "all" takes this control in only where boxes are given.
+            "random" and "oracle", which then are played too; or ("all",). "in_context", which prompts with a
+            demonstration of the episode, is asked for by its name.
+        boxes: For the control "detected_boxes": "module:function" or "file.py:function", which makes the
+            `ObjectFinder` to plug in. "all" takes this control in only where boxes are given.
         film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
             levels that holds the task, or "task/level/seed".
         engine: "processes" of this machine, or "ray".
@@ -111,7 +111,7 @@ class EvaluationConfig:
             raise ConfigError(" ".join(problems))
 
     def _unknown_names(self) -> Iterator[str]:
-        allowed = ("all", *CONTROLS, *POLICY_CONTROLS)
+        allowed = ("all", *CONTROLS, IN_CONTEXT, *POLICY_CONTROLS)
         yield from (unknown_name("control", name, allowed) for name in self.controls if name not in allowed)
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
@@ -122,7 +122,7 @@ class EvaluationConfig:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
         if DETECTED_BOXES in self.controls and self.boxes is None:
-            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
+            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, as MODULE:FUNCTION."
         if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.controls):
             yield f"boxes is {self.boxes!r}, which only the control {DETECTED_BOXES} plugs in; ask for it."
         if self.film and not self.report:
@@ -148,9 +148,10 @@ class EvaluationConfig:
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
-        asked = CONTROLS if "all" in self.controls else self.controls
+        asked = {*self.controls, *(CONTROLS if "all" in self.controls else ())}
         usable = self.boxes is not None and source.kind != "remote"
-        return tuple(name for name in CONTROLS if name in asked and (name != DETECTED_BOXES or usable))
+        names = (name for name in (*CONTROLS, IN_CONTEXT) if name in asked)
+        return tuple(name for name in names if name != DETECTED_BOXES or usable)
 
     def record(self) -> dict[str, object]:
         """Settings that the results depend on, as plain JSON values; not who plays, nor where to."""
@@ -221,10 +222,7 @@ class Batch:
             source = str(Path(source).absolute())
         if assets not in ASSET_PACKS:
             assets = str(Path(assets).expanduser().absolute())
-        name, is_trained, folder = boxes.partition("=")
-        if is_trained:
-            boxes = f"{name}={Path(folder).absolute()}"
-        elif ".py:" in boxes:
+        if ".py:" in boxes:
             boxes = str(Path(boxes).absolute())
         return replace(self, source=source, setup=replace(self.setup, assets=assets), boxes=boxes)
 
@@ -266,7 +264,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
         ConfigError: A control fits none of the policies.
     """
     played = [(source, control) for source in config.sources for control in ("", *config.controls_of(source))]
-    asked = [name for name in config.controls if name in CONTROLS]
+    asked = [name for name in config.controls if name in (*CONTROLS, IN_CONTEXT)]
     if useless := [name for name in asked if name not in {control for _, control in played}]:
         raise ConfigError(
             f"control {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "

@@ -31,6 +31,7 @@ _CONTROL_MEANINGS = {
     "scrambled_words": "The prompt has its own images; each word is some word of the vocabulary.",
     "shuffled_objects": "Objects have other numbers, which only under compat say how the table was laid.",
     "detected_boxes": "Objects are found by a detector in the pixels, not given by the simulator.",
+    "in_context": "The prompt is no task but a motion: what the oracle did in this very episode.",
 }
 
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
