@@ -63,7 +63,9 @@ def main(
         difficulty: easy, as for all published results, medium or hard.
         controls: What to play besides, to show what the score is made of, with commas in between: no_prompt,
             other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
-        boxes: Detector for detected_boxes: MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
+        boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
+            comes with the package, detector=FOLDER for one that `openvima detector train` made, or
+            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
         in_context: Play each episode also with a demonstration of it as the prompt, "Follow this motion: …";
             by default of twist, follow_motion and follow_order, for policies trained without these tasks.
         batch: Episodes that are played together; a policy decides for all of them at once.
@@ -103,7 +105,7 @@ def main(
         force=force,
         device=device,
         precision=precision,
-        controls=_words(controls),
+        controls=_with_boxes(_words(controls), boxes),
         boxes=boxes,
         film=_words(film),
         engine=engine,
@@ -178,6 +180,14 @@ def _strict_mean(results: "Results", policy: str, level: str) -> str:
 
 def _cell(rate: float, interval: tuple[float, float]) -> str:
     return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
+
+
+def _with_boxes(controls: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
+    """Add the control that uses the boxes, if some are given and it is not asked for yet."""
+    from openvima.evaluation.controls import DETECTED_BOXES
+
+    asked = boxes is None or {"all", DETECTED_BOXES} & set(controls)
+    return controls if asked else (*controls, DETECTED_BOXES)
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -57,8 +57,9 @@ class EvaluationConfig:
             `openvima.evaluation.controls.CONTROLS`, of which each policy that reads prompts plays all;
             "random" and "oracle", which then are played too; or ("all",). "in_context", which prompts with a
             demonstration of the episode, is asked for by its name.
-        boxes: For the control "detected_boxes": "module:function" or "file.py:function", which makes the
-            `ObjectFinder` to plug in. "all" takes this control in only where boxes are given.
+        boxes: For the control "detected_boxes": "detector" for the one that comes with the package,
+            "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
+            the `ObjectFinder` to plug in. "all" takes this control in only where boxes are given.
         film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
             levels that holds the task, or "task/level/seed".
         engine: "processes" of this machine, or "ray".
@@ -122,7 +123,7 @@ class EvaluationConfig:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
         if DETECTED_BOXES in self.controls and self.boxes is None:
-            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, as MODULE:FUNCTION."
+            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
         if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.controls):
             yield f"boxes is {self.boxes!r}, which only the control {DETECTED_BOXES} plugs in; ask for it."
         if self.film and not self.report:
@@ -222,7 +223,10 @@ class Batch:
             source = str(Path(source).absolute())
         if assets not in ASSET_PACKS:
             assets = str(Path(assets).expanduser().absolute())
-        if ".py:" in boxes:
+        name, is_trained, folder = boxes.partition("=")
+        if is_trained:
+            boxes = f"{name}={Path(folder).absolute()}"
+        elif ".py:" in boxes:
             boxes = str(Path(boxes).absolute())
         return replace(self, source=source, setup=replace(self.setup, assets=assets), boxes=boxes)
 
