@@ -15,7 +15,7 @@ from openvima.detection.config import FIRST_STRIDE, DetectorConfig
 from openvima.detection.matching import match, subsample
 
 WEIGHTS = (1.0, 1.0, 1.0, 1.0)  # of the coding of boxes
-BACKGROUND_OVERLAP, OBJECT_OVERLAP = 0.3, 0.7  # of anchors with objects
+BACKGROUND_OVERLAP = 0.3  # anchors that overlap no object more than that show background
 SAMPLED, POSITIVE_SHARE = 256, 0.5  # anchors of an image that the loss looks at
 
 
@@ -89,7 +89,7 @@ class ProposalNetwork(nn.Module):
         score_loss = delta_loss = all_scores.new_zeros(())
         for scores, deltas, boxes in zip(all_scores, all_deltas, objects, strict=True):
             numbers, labels = match(
-                anchors, boxes, low=BACKGROUND_OVERLAP, high=OBJECT_OVERLAP, every_object=True
+                anchors, boxes, low=BACKGROUND_OVERLAP, high=self.config.anchor_overlap, every_object=True
             )
             positive, negative = subsample(
                 labels, count=SAMPLED, positive_share=POSITIVE_SHARE, generator=generator

@@ -1,0 +1,114 @@
+"""Make detector.png beside this file: the steps of the detector, on one frame and with true boxes.
+
+Anchors, their matching, the points that RoIAlign reads, and masks on grids are those of openvima.
+"""
+
+from pathlib import Path
+from typing import Any  # the type of matplotlib's axes is not public
+
+import numpy as np
+import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+import openvima
+from openvima.detection.anchors import pyramid_anchors
+from openvima.detection.config import FIRST_STRIDE, small
+from openvima.detection.frames import Frame, frame_of
+from openvima.detection.masks import cut_masks, paste_masks
+from openvima.detection.matching import match
+from openvima.detection.proposals import BACKGROUND_OVERLAP
+from openvima.detection.roi_align import box_levels
+from openvima.render.camera import FRONT
+from openvima.scene import FIRST_OBJECT_ID
+
+TASK, SEED = "visual_manipulation", 6  # a scene with objects of two sizes; any other will do
+COLOURS = ("#0072b2", "#d98200", "#9b2393")  # of the levels, the finest first
+INK = "#1f2933"
+STYLE = {"font.family": "DejaVu Sans", "font.size": 9, "text.color": INK, "axes.titlelocation": "left"}
+
+
+def frame() -> Frame:
+    """What the front camera sees of the scene."""
+    env = openvima.make(TASK, level="train")
+    observation, _ = env.reset(seed=SEED)
+    ids = range(FIRST_OBJECT_ID["suction"], 255)
+    return frame_of(observation["rgb"]["front"], observation["segm"]["front"], ids)
+
+
+def draw_anchors(axes: Any, shown: Frame) -> None:
+    """All anchors that are to learn an object, in the colour of their level."""
+    sizes = small()
+    shapes = [(FRONT.height // (4 * 2**k), FRONT.width // (4 * 2**k)) for k in range(len(sizes.anchor_sizes))]
+    levels = pyramid_anchors(sizes.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
+    _, labels = match(
+        torch.cat(levels),
+        torch.from_numpy(shown.boxes),
+        low=BACKGROUND_OVERLAP,
+        high=sizes.anchor_overlap,
+        every_object=True,
+    )
+    parts = labels.split([len(level) for level in levels])
+    for colour, level, own in zip(COLOURS, levels, parts, strict=True):
+        for edges in level[own == 1].tolist():
+            draw_box(axes, edges, colour)
+    total = sum(len(level) for level in levels)
+    axes.set_title(f"1  of {total:,} anchors these learn an object; colours: the three levels", fontsize=9)
+
+
+def draw_grids(axes: Any, shown: Frame) -> None:
+    """The cells of the box head's cut-outs, in the colour of the level that they come from."""
+    sizes = small()
+    boxes = torch.from_numpy(shown.boxes)
+    levels = box_levels(
+        boxes, 3, canonical_size=sizes.canonical_size, canonical_level=sizes.canonical_level
+    ).tolist()
+    for (left, upper, right, lower), level in zip(shown.boxes.tolist(), levels, strict=True):
+        columns = np.linspace(left, right, sizes.box_size + 1)
+        rows = np.linspace(upper, lower, sizes.box_size + 1)
+        axes.vlines(columns, upper, lower, COLOURS[level], linewidth=0.7)
+        axes.hlines(rows, left, right, COLOURS[level], linewidth=0.7)
+    axes.set_title(f"2  RoIAlign: {sizes.box_size} × {sizes.box_size} cells a box", fontsize=9)
+
+
+def draw_masks(axes: Any, shown: Frame) -> None:
+    """Masks after they were put on the grid of the mask head and back."""
+    sizes = small()
+    boxes = torch.from_numpy(shown.boxes)
+    grids = cut_masks(torch.from_numpy(shown.masks), boxes, size=2 * sizes.mask_size)
+    pasted = paste_masks(grids.float(), boxes, height=FRONT.height, width=FRONT.width).numpy()
+    for number, (mask, edges) in enumerate(zip(pasted, shown.boxes.tolist(), strict=True)):
+        colour = np.array([int(COLOURS[number % 3][k : k + 2], 16) for k in (1, 3, 5)]) / 255
+        overlay = np.zeros((*mask.shape, 4))
+        overlay[mask] = [*colour, 0.6]
+        axes.imshow(overlay, extent=(0, FRONT.width, FRONT.height, 0))
+        draw_box(axes, edges, COLOURS[number % 3])
+    shared = (pasted & shown.masks).sum() / (pasted | shown.masks).sum()
+    side = 2 * sizes.mask_size
+    axes.set_title(f"3  masks on {side} × {side} cells and back keep {100 * shared:.0f} %", fontsize=9)
+
+
+def draw_box(axes: Any, edges: list[float], colour: str) -> None:
+    """A box as a frame."""
+    left, upper, right, lower = edges
+    axes.add_patch(
+        Rectangle((left, upper), right - left, lower - upper, fill=False, edgecolor=colour, linewidth=0.9)
+    )
+
+
+def draw() -> Figure:
+    """Draw the three steps side by side."""
+    shown = frame()
+    with rc_context(STYLE):
+        figure = Figure(figsize=(13.5, 2.7), layout="constrained")
+        for axes, step in zip(figure.subplots(1, 3), (draw_anchors, draw_grids, draw_masks), strict=True):
+            axes.imshow(shown.rgb.transpose(1, 2, 0), extent=(0, FRONT.width, FRONT.height, 0))
+            step(axes, shown)
+            axes.set_axis_off()
+    return figure
+
+
+if __name__ == "__main__":
+    with rc_context(STYLE):
+        draw().savefig(Path(__file__).with_suffix(".png"), dpi=110, metadata={"Software": None})
