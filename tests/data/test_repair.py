@@ -319,7 +319,7 @@ def test_records_without_anything_that_says_what_they_are_stay_where_they_are(me
 def test_tokens_that_are_not_those_of_the_demonstrations_are_found_and_deleted(folder: Path) -> None:
     first, second = (path for path in sorted(open_tokens(Dataset(folder)).folder.glob("rotate-*")))
     assert verify(folder, LOOK).is_clean
-    flip(first, 2 * first.stat().st_size // 3)
+    flip(first, first.stat().st_size // 2)  # elsewhere a bit of a packed run may give the same pixels
     cut(second, 100)
     names = [str(path.relative_to(folder)) for path in (first, second)]
     assert sorted({problem.file for problem in verify(folder, LOOK).problems}) == names
