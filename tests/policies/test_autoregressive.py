@@ -253,3 +253,34 @@ def test_switches_change_nothing_else_and_can_be_undone() -> None:
 def test_vectors_without_spread_are_refused() -> None:
     with pytest.raises(ConfigError, match="token_std is 0; it must be above 0"):
         AutoregressiveConfig(token_std=0)
+
+
+def chance_of_either(config: PolicyConfig, demonstration) -> float:
+    """Train on one situation that was answered in two ways; return how likely either is then told."""
+    network = build_network(config, seed=0).eval()
+    batch, _ = read(network, [demonstration] * 2)
+    actions = batch.targets.actions_BTC.clone()
+    actions[1, :, [0, 1, 6]] = actions[1, :, [1, 0, 7]] + 0.3  # another place to pick from, and one to put
+    targets, prompts, history = replace(batch.targets, actions_BTC=actions), batch.prompts, batch.history
+    _, images = examples_of([demonstration] * 2, Reader.of(config.images))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.0)
+    for _ in range(50):
+        features = network.encode_images(images)
+        inputs = network(network.encode_prompts(prompts, features), history, features, actions)
+        optimizer.zero_grad()
+        network.head.loss(inputs, targets)[0].backward()
+        optimizer.step()
+    bins_BTC = encode_bins(to_unit_range(actions))
+    chances = [
+        score.softmax(-1).gather(-1, bins_BTC[..., c, None])[:, 0, 0]
+        for c, score in enumerate(network.head.scores(inputs))
+    ]
+    return torch.stack(chances).prod(0).sum().item()
+
+
+def test_two_right_answers_are_not_mixed(demonstrations) -> None:
+    """Three components differ: told independently, one of the two actions comes out once in four times."""
+    single = next(demo for demo in demonstrations if demo.num_steps == 1)
+    plain = preset("vima-nano")
+    assert chance_of_either(with_autoregression(plain), single) > 0.9
+    assert chance_of_either(plain, single) < 0.3

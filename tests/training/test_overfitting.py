@@ -51,7 +51,7 @@ def demonstrations() -> dict[str, list[Demonstration]]:
     return runs
 
 
-@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt"])
+@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt", "midas"])
 def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family, demonstrations) -> None:
     model = build_network(preset(f"{family}-nano"), seed=0).eval()  # that is, without dropout
     tasks = [read(model, group) for group in demonstrations.values()]
