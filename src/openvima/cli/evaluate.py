@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from openvima.cli.progress import progress_bar
+from openvima.cli.words import words_in
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -82,9 +83,9 @@ def main(
     from openvima.evaluation import EvaluationConfig, Results, evaluate
 
     config = EvaluationConfig(
-        policies=_words(policy),
-        tasks=_words(tasks),
-        levels=_words(levels),
+        policies=words_in(policy),
+        tasks=words_in(tasks),
+        levels=words_in(levels),
         episodes=episodes,
         seed=seed,
         workers=workers,
@@ -96,9 +97,9 @@ def main(
         force=force,
         device=device,
         precision=precision,
-        controls=_words(controls),
+        controls=words_in(controls),
         boxes=boxes,
-        film=_words(film),
+        film=words_in(film),
         engine=engine,
         address=address,
     )
@@ -171,7 +172,3 @@ def _strict_mean(results: "Results", policy: str, level: str) -> str:
 
 def _cell(rate: float, interval: tuple[float, float]) -> str:
     return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
