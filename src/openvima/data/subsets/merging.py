@@ -12,7 +12,7 @@ import pyarrow as pa
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset
-from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, of_tasks, provenance
+from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, provenance
 from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shard
 from openvima.errors import DatasetError, unknown_name
 from openvima.files import whole_folder
@@ -118,7 +118,7 @@ def _parts(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> list[_Pa
 
 def _parts_of(dataset: Dataset, tasks: Sequence[str] | None) -> list[_Part]:
     present = [task for task in dataset.manifest["tasks"] if tasks is None or task in tasks]
-    wanted = of_tasks(dataset, present)
+    wanted = np.isin(dataset.index.column("task").to_pylist(), present)
     names, shard_of = np.unique(dataset.index.column("shard").to_pylist(), return_inverse=True)
     seeds = dataset.index.column("seed").to_numpy()
     parts = []
@@ -206,7 +206,9 @@ def _plan(parts: Sequence[_Part], folder: Path, compression: str | None) -> list
 
 
 def _check_tasks(datasets: Sequence[Dataset], tasks: Sequence[str]) -> None:
-    present = {task for dataset in datasets for task in dataset.manifest["tasks"]}
+    present = sorted({task for dataset in datasets for task in dataset.manifest["tasks"]})
+    if not tasks:
+        raise DatasetError(f"no task is named; the sources have {', '.join(present)}.")
     for task in tasks:
         if task not in present:
-            raise DatasetError(unknown_name("task in the sources called", task, sorted(present)))
+            raise DatasetError(unknown_name("task in the sources called", task, present))

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from openvima.data.manifest import finish_folder
-from openvima.data.reader import Dataset
+from openvima.data.reader import Dataset, of_tasks
 from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
-from openvima.data.subsets.folders import check_out, of_tasks, provenance
+from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shard
 from openvima.errors import DatasetError
 from openvima.files import whole_folder
@@ -73,7 +73,9 @@ def sample(config: SubsetConfig, share: float, *, report: Report | None = None) 
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
-    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(dataset, config.tasks)
+    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(
+        dataset.index, config.tasks, dataset.path
+    )
     settings = {**config.settings(dataset), "share": share}
     with whole_folder(config.out) as folder:
         _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
@@ -100,7 +102,7 @@ def split(config: SubsetConfig, parts: Parts, *, report: Report | None = None) -
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
-    wanted = of_tasks(dataset, config.tasks)
+    wanted = of_tasks(dataset.index, config.tasks, dataset.path)
     chosen = {name: mask & wanted for name, mask in chosen_parts(dataset.index, parts, config.seed).items()}
     empty = [name for name, mask in chosen.items() if not mask.any()]
     if empty:

@@ -8,11 +8,10 @@ from functools import lru_cache
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
+from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset
 from openvima.data.writer import ShardWriter
 from openvima.errors import DatasetError, ShardError
-
-LARGEST_SHARD = 1000  # episodes, as where data are generated
 
 
 @dataclass(frozen=True, slots=True)
