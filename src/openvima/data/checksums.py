@@ -102,6 +102,12 @@ def measure(path: Path) -> tuple[Frame, list[Span]]:
     return Frame(len(content), head, tail, _frame_crc32(content, head, tail)), spans
 
 
+def spans_of(index: pa.Table) -> list[Span]:
+    """Return where the records of a shard lie, from its part of the index."""
+    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
+    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
+
+
 def _frame_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
     return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
 

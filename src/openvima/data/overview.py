@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
-from openvima.data.planning import FAILED_FOLDER
+from openvima.data.manifest import FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME, TOKENS_FOLDER
 from openvima.data.reader import Dataset, Shard
 from openvima.data.schema import COLUMNS
 from openvima.errors import ShardError
 
-TOKENS_FOLDER = "tokens"  # as in `tokens.cache`, which is slow to import
 _IMAGE_COLUMNS = ("rgb_", "segm_", "prompt_rgb_", "prompt_segm_")  # how their names begin
 _NUM_MEASURED = 3  # episodes of each task whose images are told from the rest
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from openvima.data.checksums import Frame, Span, mapped
+from openvima.data.checksums import Frame, mapped, spans_of
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import ShardSummary, fingerprint, summarise
 from openvima.data.reader import Shard, remedy
@@ -84,12 +84,6 @@ def check_shard(task: ShardTask, count: Callable[[int], None]) -> ShardFindings:
     causes = by_cause(((row, cause) for row, cause, _ in found), len(shard))
     causes += [*_info_faults(task, shard.info), *_summary_faults(task, summary)]
     return ShardFindings(_problems(task, causes), is_damaged, summary, shard.info, len(shard))
-
-
-def spans_of(index: pa.Table) -> list[Span]:
-    """Return where the records of a shard lie, from its part of the index."""
-    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
-    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
 
 
 def _problems(task: ShardTask, causes: Sequence[str]) -> tuple[Problem, ...]:
