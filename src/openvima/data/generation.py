@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from openvima.data.manifest import MANIFEST_NAME, finish_folder
-from openvima.data.planning import COMMAND, FAILED_FOLDER, Block, GenerateConfig, plan
+from openvima.data.manifest import FAILED_FOLDER, MANIFEST_NAME, finish_folder
+from openvima.data.planning import COMMAND, Block, GenerateConfig, plan
 from openvima.data.resuming import check_folder, clear, is_done, is_finished, remove_leftovers
 from openvima.data.tally import NUM_COUNTS, Report, reporter
 from openvima.data.trials import write_block

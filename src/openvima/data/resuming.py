@@ -4,9 +4,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
-from openvima.data.planning import FAILED_FOLDER, Block, GenerateConfig
-from openvima.data.reader import Shard
+from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
+from openvima.data.planning import COMMAND, Block, GenerateConfig
+from openvima.data.reader import Shard, read_manifest
 from openvima.errors import DatasetError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
@@ -38,6 +38,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
         ShardError: A shard is damaged.
     """
+    _check_origin(config.out)
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):
         shard = Shard(path)
@@ -63,7 +64,8 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 def clear(folder: Path) -> None:
     """Delete a data set, its failed episodes too; other files stay."""
     for part in (folder, folder / FAILED_FOLDER):
-        for path in [part / MANIFEST_NAME, part / INDEX_NAME, *part.glob("*.arrow")]:
+        names = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
+        for path in [*(part / name for name in names), *part.glob("*.arrow")]:
             path.unlink(missing_ok=True)
 
 
@@ -76,6 +78,18 @@ def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
         for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
             if file.name[1:].rsplit(".", 2)[0] in names:
                 file.unlink(missing_ok=True)
+
+
+def _check_origin(folder: Path) -> None:
+    """Refuse what other commands made: shards of a sample say the same of themselves, with other episodes."""
+    if not (folder / MANIFEST_NAME).is_file():
+        return
+    manifest = read_manifest(folder)
+    if manifest["command"] != COMMAND or "kept" in manifest["config"]:
+        raise DatasetError(
+            f"{folder} belongs to another data set: `{manifest['command']}` made it. "
+            "Give another --out, or --force to delete it."
+        )
 
 
 def _has_failed(shard: Shard) -> bool:

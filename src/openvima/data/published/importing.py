@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, finish_folder
+from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
 from openvima.data.published.reader import (
     Broken,
@@ -20,16 +20,15 @@ from openvima.data.published.reader import (
     read_place,
 )
 from openvima.data.reader import Shard
-from openvima.data.writer import ShardWriter
+from openvima.data.resuming import clear, is_finished
+from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.errors import ConfigError, DatasetError, StorageError
 from openvima.files import write_whole
-from openvima.processes import Counts, in_watched_processes
+from openvima.processes import MAX_WORKERS, Counts, in_watched_processes
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
-BROKEN_NAME = "broken.json"
 SHARD_SIZE = 1000  # episodes read; broken ones leave their shard smaller
-MAX_WORKERS = 1024
 _NUM_PROBES = 3  # episodes of each task
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -119,7 +118,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
     _probe(blocks)
     config.out.mkdir(parents=True, exist_ok=True)
     if config.force:
-        _clear(config.out)
+        clear(config.out)
     _check_folder(config.out, blocks)
     broken = {block.path: _broken_in(block) for block in blocks}
     missing = [block for block in blocks if broken[block.path] is None]
@@ -140,8 +139,8 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
             "and were kept. Make room; the same command then goes on from there."
         ) from error
     finally:
-        _remove_leftovers(config.out)
-    if not all((config.out / name).is_file() for name in (INDEX_NAME, MANIFEST_NAME)):
+        remove_leftovers(config.out)
+    if not is_finished(config.out):
         _finish(config, data, blocks, [entry for block in blocks for entry in broken[block.path] or ()])
     return config.out
 
@@ -286,20 +285,6 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
         versions=blocks[0].info.versions,
         licence=LICENCE,
     )
-
-
-def _clear(folder: Path) -> None:
-    for path in [
-        *(folder / name for name in (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)),
-        *folder.glob("*.arrow"),
-    ]:
-        path.unlink(missing_ok=True)
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Delete what writers that were killed have left."""
-    for file in folder.glob(".*.tmp"):
-        file.unlink(missing_ok=True)
 
 
 def _watch(
