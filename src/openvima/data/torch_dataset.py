@@ -63,9 +63,9 @@ def tensors_of(demo: Demonstration) -> dict[str, Any]:  # Any: tensors, texts an
         "pick_ids": torch.tensor(demo.pick_ids, dtype=torch.int64),
         "place_ids": torch.tensor(demo.place_ids, dtype=torch.int64),
     }
-    for key in ACTION_SHAPES:
+    for key, width in ACTION_SHAPES.items():
         rows = np.array([getattr(action, key) for action in demo.actions], np.float32)
-        item[key] = torch.from_numpy(rows.reshape(demo.num_steps, -1))
+        item[key] = torch.from_numpy(rows.reshape(-1, width))
     return item
 
 
