@@ -1,8 +1,10 @@
 """`openvima train`: train a policy on demonstrations."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,17 +43,20 @@ def run(words: Sequence[str]) -> int:
     import tyro
 
     from openvima.training import TrainingConfig, train
-    from openvima.training.recipes import default_recipe, read_settings, recipe_settings
+    from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
 
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--recipe")
     first.add_argument("--config", type=Path)
-    first.add_argument("--preset")
+    for name in ("--preset", "--steps", "--epochs"):
+        first.add_argument(name)
     known, _ = first.parse_known_args(list(words))
     file = read_settings(known.config) if known.config else {}
     preset = known.preset or file.get("preset")
     recipe = known.recipe or default_recipe(preset or "nano")
-    settings = {**recipe_settings(recipe), **file}
+    settings = overridden(recipe_settings(recipe), file)
+    if known.steps and not known.epochs:
+        settings["epochs"] = None
     rest = _without(_without(list(words), "--recipe"), "--config")
     given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
     others = {name: value for name, value in settings.items() if name not in given}
@@ -64,8 +69,11 @@ def run(words: Sequence[str]) -> int:
         args=rest,
         default=TrainingConfig(**given, **others),
     )
-    with progress_bar("training") as report:
+    is_first = os.environ.get("RANK", "0") == "0"  # among those that torchrun starts
+    with progress_bar("training") if is_first else nullcontext() as report:
         folder = train(config, report, _rollout(config) if config.rollout_every else None)
+    if not is_first:
+        return 0
     if ":" not in config.preset:
         print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
     print(folder)

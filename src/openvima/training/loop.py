@@ -25,7 +25,13 @@ from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.board import Board
 from openvima.training.config import MATCHING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
-from openvima.training.parallel import Parallel, joined, set_whole_state, whole_state
+from openvima.training.parallel import (
+    Parallel,
+    compile_layers,
+    joined,
+    set_whole_state,
+    whole_state,
+)
 from openvima.training.pretrain import render_pairs
 from openvima.training.provenance import provenance
 from openvima.training.run_folder import (
@@ -36,7 +42,7 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.source import check_words, split_examples
+from openvima.training.source import ExampleSource, check_words, split_examples
 from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops
 
 Report = Callable[[int, int, str], None]
@@ -162,7 +168,6 @@ class _Trainer:
     ) -> None:
         self.config, self.dataset, self.learner, self.run = config, dataset, learner, run
         self.parallel, self.report, self.rollout = parallel, report, rollout
-        self.board = Board(run.path, wanted=config.tensorboard and parallel.is_first)
         self.started = time.monotonic()
         self._last = (0, self.started)  # step and time of the last line of metrics
         self.progress = run.resume(learner)
@@ -175,8 +180,9 @@ class _Trainer:
         if config.pretraining_steps:
             self.stages.insert(0, (config.pretraining_steps, self._matching))
         self.num_steps = sum(steps for steps, _ in self.stages)
+        self.board = Board(run.path, self._done() + 1, wanted=config.tensorboard and parallel.is_first)
         if parallel.is_first:
-            run.forget_after(self.progress)
+            run.go_back_to(self.progress)
             here = {"stage": self.progress.stage, "step": self.progress.step}
             run.append(SESSIONS_FILE, {**here, "processes": parallel.num_ranks, **provenance(dataset)})
 
@@ -197,15 +203,24 @@ class _Trainer:
         if self.progress.step:
             self._load_optimizer(optimizer)
         window: list[Metrics] = []
+        self._last = (self.progress.step, time.monotonic())
         for step in range(self.progress.step, num_steps):
             window.append(self._step(stage, optimizer, step, num_steps))
             self.progress = replace(self.progress, step=step + 1)
-            saves = (step + 1) % self.config.checkpoint_every == 0 or step + 1 == num_steps
+            saves = self._saves_at(step + 1) or step + 1 == num_steps
             if saves or (step + 1) % LOG_EVERY == 0:
                 self._log(stage, self.parallel.mean(_mean(window)))
                 window = []
             if saves:
                 self._save(stage, optimizer)
+
+    def _saves_at(self, step: int) -> bool:
+        """Whether a checkpoint is due, be it to go on from, to keep, or to play."""
+        config = self.config
+        return any(
+            every and step % every == 0
+            for every in (config.checkpoint_every, config.keep_every, config.rollout_every)
+        )
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
         config = self.config
@@ -228,7 +243,7 @@ class _Trainer:
                 step_seed(config.seed, purpose, step)
             )  # dropout draws from the global generator
             metrics = stage.backward(step)
-        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))
+        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))  # of all processes
         if not math.isfinite(norm):
             raise ConfigError(
                 f"the gradient is {norm} at step {step} of {stage.name}, with learning_rate {rate:g} and "
@@ -244,7 +259,7 @@ class _Trainer:
             self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
             seconds = round(time.monotonic() - self.started, 2)
             self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
-            self.board.add(stage.name, metrics, self.progress.step)
+            self.board.add(stage.name, metrics, self._done())
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
@@ -279,7 +294,7 @@ class _Trainer:
         if metrics and self.parallel.is_first:
             here = {"stage": self.progress.stage, "step": self.progress.step}
             self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
-            self.board.add(stage.name, metrics, self.progress.step)
+            self.board.add(stage.name, metrics, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
         if self.parallel.is_sharded:
@@ -311,7 +326,8 @@ class _Trainer:
         training, _ = self._split(self._tokens())
         return max(1, round(epochs * len(training) / min(self.config.batch, len(training))))
 
-    def _split(self, tokens: TokenCache):  # two `ExampleSource`
+    def _split(self, tokens: TokenCache) -> tuple[ExampleSource, ExampleSource]:
+        """Return what to learn from, and what is held out."""
         config = self.config
         return split_examples(
             tokens,
@@ -338,9 +354,9 @@ class _Trainer:
             check_words(tokens, self.learner.reader)
             if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
                 freeze_crops(self.learner, tokens)
-        self.module = self.parallel.wrap(self.learner)
         if config.compile:
-            self.module.compile(dynamic=True)
+            compile_layers(self.learner)
+        self.module = self.parallel.wrap(self.learner)
         return Cloning(self.learner, self.module, config, *self._split(tokens), self.parallel)
 
     def _say(self, done: int, total: int, note: str) -> None:
@@ -348,8 +364,11 @@ class _Trainer:
 
     def _report(self, note: str) -> None:
         if self.parallel.is_first:
-            before = sum(steps for steps, _ in self.stages[: self.progress.stage])
-            self.report(before + self.progress.step, self.num_steps, note)
+            self.report(self._done(), self.num_steps, note)
+
+    def _done(self) -> int:
+        """Steps that are done, counted through all stages."""
+        return sum(steps for steps, _ in self.stages[: self.progress.stage]) + self.progress.step
 
 
 def _optimizer(learner: Learner, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
