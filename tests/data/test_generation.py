@@ -14,7 +14,8 @@ from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.scene import Outcome
-from small_datasets import TASKS, config, contents
+from small_data_sets import contents
+from small_generations import TASKS, config
 
 
 @pytest.fixture(scope="module")
