@@ -124,6 +124,25 @@ def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, 
     assert_alike(plain, parts)
 
 
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # of the tracer itself
+def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
+    """Traced as for the compiler, but run as they are: generating code takes a minute."""
+    bins |= {"steps": 2, "checkpoint_every": 2}
+    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
+    traced, compiled = [], torch.nn.Module.compile
+
+    def trace(module: torch.nn.Module, **options) -> None:
+        traced.append(type(module).__name__)
+        compiled(module, backend="eager", fullgraph=True, **options)
+
+    monkeypatch.setattr(torch.nn.Module, "compile", trace)
+    torch.compiler.reset()
+    assert_alike(plain, train(TrainingConfig(**{**bins, "out": tmp_path / "traced", "compile": True})))
+    torch.compiler.reset()
+    assert {"CrossBlock", "SelfBlock", "TextBlock"} <= set(traced)
+    assert not {"Linear", "Sequential"} & set(traced)
+
+
 def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:
     plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
     half = train(TrainingConfig(**{**bins, "out": tmp_path / "half", "precision": "bfloat16"}))

@@ -58,7 +58,7 @@ class TrainingConfig:
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
         steps: Steps of behaviour cloning.
-        epochs: Passes over the demonstrations, instead of `steps`.
+        epochs: Passes over the demonstrations, instead of `steps`; None takes those.
         batch: Demonstrations a step, of all processes together; at most as many as there are.
         accumulate: Parts in which each process takes its share of a batch, one after the other, to save
             memory.
@@ -85,13 +85,14 @@ class TrainingConfig:
         seed: Decides weights, order and augmentation.
         validation_share: Share of the demonstrations that only serve to choose the best checkpoint.
         validation_episodes: At most so many of them.
-        checkpoint_every: Steps between checkpoints, each with a validation.
+        checkpoint_every: Steps between checkpoints, each with a validation; those to be kept or played come
+            on top.
         keep_every: Steps between checkpoints that are kept; None keeps the latest and the best only.
         rollout_every: Steps between trials in the simulator; None leaves them out.
         rollout_episodes: Episodes of each task of a trial.
         device: "auto" takes a GPU where there is one; or "cpu", "cuda".
         precision: "float32", or "bfloat16" for products of matrices, with weights in float32.
-        compile: Compile the network with torch.compile: slow to start, then faster on a GPU.
+        compile: Compile the layers of the network with torch.compile: slow to start, then faster on a GPU.
         sharding: With several processes "ddp" keeps the network whole in each, "fsdp" divides it.
         loader_workers: Processes that read batches ahead.
         threads: Threads to compute with; equal numbers give equal weights. The nano network gains a fifth
