@@ -207,7 +207,7 @@ class Results:
                 )
             rows = tuple(_row_from_record(record) for record in content["rows"])
             return Results(rows, content["config"], content["versions"], content["policies"])
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
             raise DatasetError(f"{path} is damaged ({error!r}); evaluate again with --force.") from error
 
 
