@@ -45,19 +45,20 @@ def run(words: Sequence[str]) -> int:
     from openvima.training import TrainingConfig, train
     from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
 
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--recipe")
-    first.add_argument("--config", type=Path)
+    basis = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    basis.add_argument("--recipe")
+    basis.add_argument("--config", type=Path)
+    begun, rest = basis.parse_known_args(list(words))
+    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--preset", "--steps", "--epochs"):
-        first.add_argument(name)
-    known, _ = first.parse_known_args(list(words))
-    file = read_settings(known.config) if known.config else {}
+        peek.add_argument(name)
+    known, _ = peek.parse_known_args(rest)
+    file = read_settings(begun.config) if begun.config else {}
     preset = known.preset or file.get("preset")
-    recipe = known.recipe or default_recipe(preset or "nano")
+    recipe = begun.recipe or default_recipe(preset or "nano")
     settings = overridden(recipe_settings(recipe), file)
     if known.steps and not known.epochs:
         settings["epochs"] = None
-    rest = _without(_without(list(words), "--recipe"), "--config")
     given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
     others = {name: value for name, value in settings.items() if name not in given}
     if preset:
@@ -78,19 +79,6 @@ def run(words: Sequence[str]) -> int:
         print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
     print(folder)
     return 0
-
-
-def _without(words: list[str], option: str) -> list[str]:
-    """Leave out an option and its value."""
-    kept, skip = [], False
-    for word in words:
-        if skip:
-            skip = False
-        elif word == option:
-            skip = True
-        elif not word.startswith(f"{option}="):
-            kept.append(word)
-    return kept
 
 
 def _rollout(config: "TrainingConfig") -> "Trial":

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -183,8 +184,8 @@ class _Trainer:
         self.board = Board(run.path, self._done() + 1, wanted=config.tensorboard and parallel.is_first)
         if parallel.is_first:
             run.go_back_to(self.progress)
-            here = {"stage": self.progress.stage, "step": self.progress.step}
-            run.append(SESSIONS_FILE, {**here, "processes": parallel.num_ranks, **provenance(dataset)})
+            origin = {"processes": parallel.num_ranks, **provenance(dataset)}
+            run.append(SESSIONS_FILE, {**self._here(), **origin})
 
     def train(self) -> None:
         """Run what is left of the stages."""
@@ -239,9 +240,7 @@ class _Trainer:
         device, rank = self.parallel.device, self.parallel.rank
         purpose = f"dropout of {stage.name}" + (f" in process {rank}" if rank else "")
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(
-                step_seed(config.seed, purpose, step)
-            )  # dropout draws from the global generator
+            torch.manual_seed(step_seed(config.seed, purpose, step))  # from it dropout draws
             metrics = stage.backward(step)
         norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))  # of all processes
         if not math.isfinite(norm):
@@ -254,12 +253,10 @@ class _Trainer:
         return {**metrics, "gradient_norm": norm}
 
     def _log(self, stage: Stage, metrics: Metrics) -> None:
-        here = {"stage": self.progress.stage, "step": self.progress.step}
+        self._note(stage, metrics)
         if self.parallel.is_first:
-            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
             seconds = round(time.monotonic() - self.started, 2)
-            self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
-            self.board.add(stage.name, metrics, self._done())
+            self.run.append(TIMINGS_FILE, {**self._here(), "seconds_since_start": seconds})
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
@@ -292,8 +289,7 @@ class _Trainer:
 
     def _note(self, stage: Stage, metrics: Metrics) -> None:
         if metrics and self.parallel.is_first:
-            here = {"stage": self.progress.stage, "step": self.progress.step}
-            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
+            self.run.append(METRICS_FILE, {**self._here(), "name": stage.name, **metrics})
             self.board.add(stage.name, metrics, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
@@ -313,24 +309,28 @@ class _Trainer:
         values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
         optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
 
+    @cached_property
     def _tokens(self) -> TokenCache:
-        """Open the token cache; the first process makes it if need be."""
+        """The token cache; the first process makes it if need be."""
         kind, folder = self.learner.token_kind, self.config.tokens
-        if self.parallel.is_first:
-            open_tokens(self.dataset, kind, folder=folder, report=self._say)
+        if not self.parallel.is_first:
+            self.parallel.wait()
+            return TokenCache(self.dataset, kind, folder)
+        tokens = open_tokens(self.dataset, kind, folder=folder, report=self._say)
         self.parallel.wait()
-        return TokenCache(self.dataset, kind, folder)
+        return tokens
 
     def _steps_of_epochs(self, epochs: float) -> int:
         """Steps of so many passes over what is left to learn from when some is kept for validation."""
-        training, _ = self._split(self._tokens())
+        training, _ = self._examples
         return max(1, round(epochs * len(training) / min(self.config.batch, len(training))))
 
-    def _split(self, tokens: TokenCache) -> tuple[ExampleSource, ExampleSource]:
-        """Return what to learn from, and what is held out."""
+    @cached_property
+    def _examples(self) -> tuple[ExampleSource, ExampleSource]:
+        """What to learn from, and what is held out."""
         config = self.config
         return split_examples(
-            tokens,
+            self._tokens,
             validation_share=config.validation_share,
             validation_episodes=config.validation_episodes,
         )
@@ -349,7 +349,7 @@ class _Trainer:
 
     def _cloning(self) -> Stage:
         self._report(f"reading {len(self.dataset)} demonstrations")
-        tokens, config = self._tokens(), self.config
+        tokens, config = self._tokens, self.config
         if isinstance(self.learner, PolicyLearner):
             check_words(tokens, self.learner.reader)
             if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
@@ -357,7 +357,7 @@ class _Trainer:
         if config.compile:
             compile_layers(self.learner)
         self.module = self.parallel.wrap(self.learner)
-        return Cloning(self.learner, self.module, config, *self._split(tokens), self.parallel)
+        return Cloning(self.learner, self.module, config, *self._examples, self.parallel)
 
     def _say(self, done: int, total: int, note: str) -> None:
         self._report(f"{note or 'cutting out objects'}, {done} of {total}")
@@ -365,6 +365,9 @@ class _Trainer:
     def _report(self, note: str) -> None:
         if self.parallel.is_first:
             self.report(self._done(), self.num_steps, note)
+
+    def _here(self) -> dict[str, int]:
+        return {"stage": self.progress.stage, "step": self.progress.step}
 
     def _done(self) -> int:
         """Steps that are done, counted through all stages."""

@@ -44,13 +44,14 @@ class TokenCache(Sequence[TokenEpisode]):
     def __init__(self, dataset: Dataset, kind: TokenKind = "objects", folder: Path | None = None) -> None:
         self.dataset, self.kind, self._root = dataset, kind, folder
         self.folder = _cache_folder(dataset, kind, folder)
-        missing = [source.name for source in sources(dataset) if not _is_made(self.folder, source, kind)]
+        found = {source.name: _made(self.folder, source, kind) for source in sources(dataset)}
+        missing = [name for name, file in found.items() if file is None]
         if missing:
             raise DatasetError(
                 f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
                 f"`openvima data tokens {shlex.quote(str(dataset.path))} --kind {kind}` makes them."
             )
-        self._files: dict[str, TokenFile] = {}
+        self._files = {name: file for name, file in found.items() if file is not None}
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -63,7 +64,7 @@ class TokenCache(Sequence[TokenEpisode]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         name, row = self.dataset.locate(index)
-        return self._file(name)[row]
+        return self._files[name][row]
 
     def __iter__(self) -> Iterator[TokenEpisode]:
         return (self[index] for index in range(len(self)))
@@ -81,18 +82,13 @@ class TokenCache(Sequence[TokenEpisode]):
 
     def texts(self) -> set[str]:
         """Return the different prompts, with their placeholders."""
-        return {text for name in self.dataset.shard_names() for text in self._file(name).texts()}
+        return {text for file in self._files.values() for text in file.texts()}
 
     def _gathered(self, column: Callable[[TokenFile], np.ndarray], width: int) -> np.ndarray:
         """Read a column of numbers of all files, and put it into the order of the episodes."""
-        of_file = {name: column(self._file(name)) for name in self.dataset.shard_names()}
+        of_file = {name: column(file) for name, file in self._files.items()}
         places = [self.dataset.locate(index) for index in range(len(self))]
         return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, width)
-
-    def _file(self, name: str) -> TokenFile:
-        if name not in self._files:
-            self._files[name] = TokenFile(self.folder / name)
-        return self._files[name]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +146,7 @@ def open_tokens(
             kind,
         )
         for source in sources(dataset)
-        if not _is_made(target, source, kind)
+        if _made(target, source, kind) is None
     ]
     if work:
         try:
@@ -193,15 +189,13 @@ def _cache_folder(dataset: Dataset, kind: TokenKind, folder: Path | None) -> Pat
     return (folder or dataset.path / TOKENS_FOLDER) / f"{kind}-v{TOKENS_VERSION}"
 
 
-def _is_made(folder: Path, source: Source, kind: TokenKind) -> bool:
-    path = folder / source.name
-    if not path.is_file():
-        return False
+def _made(folder: Path, source: Source, kind: TokenKind) -> TokenFile | None:
+    """Open the tokens of a shard; None if they are missing, damaged, or of another version or content."""
     try:
-        file = TokenFile(path)
-    except ShardError:  # damaged, or of another version: made anew
-        return False
-    return file.source == source.content_hash and file.kind == kind
+        file = TokenFile(folder / source.name)
+    except ShardError:
+        return None
+    return file if file.source == source.content_hash and file.kind == kind else None
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
