@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from openvima.errors import ShardError
 
-_MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
+MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def _message_ends(path: Path) -> list[int]:
     """Where the schema ends, and each record."""
     ends = []
     with pa.memory_map(str(path)) as file:
-        file.seek(_MAGIC_BYTES)
+        file.seek(MAGIC_BYTES)
         while True:
             try:
                 pa.ipc.read_message(file)

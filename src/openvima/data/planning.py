@@ -197,7 +197,6 @@ def plan(config: GenerateConfig) -> list[Block]:
     blocks = []
     for task in config.resolved_tasks():
         for number, episodes, seeds in _division(config):
-            name = f"{task}-{config.level}-{number:05d}.arrow"
             info = ShardInfo(
                 task=task,
                 level=config.level,
@@ -212,8 +211,8 @@ def plan(config: GenerateConfig) -> list[Block]:
                 compression=config.compression,
                 images=config.images,
             )
-            failed = config.out / FAILED_FOLDER / name if config.keep_failed else None
-            blocks.append(Block(config.out / name, info, episodes, seeds, config.setup, failed))
+            failed = config.out / FAILED_FOLDER / info.file_name if config.keep_failed else None
+            blocks.append(Block(config.out / info.file_name, info, episodes, seeds, config.setup, failed))
     return blocks
 
 

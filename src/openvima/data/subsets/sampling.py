@@ -11,10 +11,9 @@ from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset, of_tasks
 from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
 from openvima.data.subsets.folders import check_out, provenance
-from openvima.data.subsets.shards import NewShard, plan_shards, write_shard
+from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
 from openvima.files import whole_folder
-from openvima.processes import in_processes
 
 Report = Callable[[int, int, str], None]
 
@@ -137,10 +136,7 @@ def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, r
         episodes = np.flatnonzero(subset.mask).tolist()
         plans.append(plan_shards(dataset, episodes, subset.folder, config.compression))
     shards = [shard for plan in plans for shard in plan]
-    total = sum(len(shard.episodes) for shard in shards)
-    count = None if report is None else (lambda done: report(done, total, ""))
-    for _ in in_processes(write_shard, shards, config.workers, report=count):
-        pass  # a shard's result is its file
+    write_shards(shards, config.workers, report)
     for subset, plan in zip(subsets, plans, strict=True):
         finish_folder(
             subset.folder,
