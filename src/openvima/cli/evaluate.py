@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from openvima.evaluation import Results
+    from openvima.evaluation.results import LevelMean
 
 
 def main(
@@ -128,7 +130,7 @@ def print_results(results: "Results") -> None:
     from rich.table import Table
 
     policies = results.policy_names()
-    means = {(mean.policy, mean.level): mean for mean in results.level_means() if not mean.control}
+    means = results.means()
     table = Table("level", title="solved episodes in per cent (95 % interval)")
     table.add_column("task", overflow="fold", min_width=12)
     for policy in policies:
@@ -137,22 +139,21 @@ def print_results(results: "Results") -> None:
         for task in results.tasks(level):
             rows = (results.row(policy, task, level) for policy in policies)
             table.add_row(level, task, *(_cell(row.rate, row.interval) if row else "–" for row in rows))
-        level_means = (means.get((policy, level)) for policy in policies)
+        level_means = (means.get((policy, "", level)) for policy in policies)
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
         table.add_row(level, "mean", *cells, style="bold")
         strict = (_strict_mean(results, policy, level) for policy in policies)
         table.add_row(level, "mean, strict limit", *strict, end_section=True)
     Console().print(table)
     if any(row.control for row in results.rows):
-        Console().print(_control_table(results))
+        Console().print(_control_table(results, means))
 
 
-def _control_table(results: "Results") -> "Table":
+def _control_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":
     """Level means of each policy, plain and under each control."""
     from rich.table import Table
 
     table = Table("policy", "control", title="what the scores are made of: means in per cent (95 % interval)")
-    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
     for level in results.levels():
         table.add_column(level, justify="right", no_wrap=True)
     for policy, control in dict.fromkeys((row.policy, row.control) for row in results.rows):

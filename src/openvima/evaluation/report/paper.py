@@ -1,6 +1,6 @@
 """Tables of an evaluation for papers: the same content as Markdown and as LaTeX."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from openvima.evaluation.comparison import CONTROL_MARK, Comparison, Difference
@@ -8,6 +8,7 @@ from openvima.evaluation.report.published import leading_models, published_tasks
 from openvima.evaluation.report.wording import control_name, counted
 from openvima.evaluation.results import LevelMean, Results
 
+_Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, control and level
 _NOISE_MARK = "≈"
 _LATEX_TEXT = {
     "\\": r"\textbackslash{}",
@@ -75,13 +76,14 @@ class Table:
 
 def paper_tables(results: Results, comparisons: Sequence[Comparison] = ()) -> list[Table]:
     """Choose what a paper would print: level means, tasks by level of each policy, controls, differences."""
-    by_policy = [_task_table(results, policy) for policy in results.policy_names()]
+    means = results.means()
+    by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
     with_controls = [
-        _control_table(results, policy)
+        _control_table(results, means, policy)
         for policy in results.policy_names()
         if any(row.policy == policy and row.control for row in results.rows)
     ]
-    return [_mean_table(results), *by_policy, *with_controls, *map(_difference_table, comparisons)]
+    return [_mean_table(results, means), *by_policy, *with_controls, *map(_difference_table, comparisons)]
 
 
 def markdown(tables: Sequence[Table]) -> str:
@@ -105,9 +107,8 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX_TEXT.get(letter, letter) for letter in text)
 
 
-def _mean_table(results: Results) -> Table:
+def _mean_table(results: Results, means: _Means) -> Table:
     levels = results.levels()
-    means = _means(results)
     lines = [
         Line(
             policy,
@@ -132,10 +133,9 @@ def _mean_table(results: Results) -> Table:
     return Table("levels", caption, ("policy", *levels), tuple(lines))
 
 
-def _task_table(results: Results, policy: str) -> Table:
+def _task_table(results: Results, means: _Means, policy: str) -> Table:
     levels = [level for level in results.levels() if any(r.level == level for r in _plain(results, policy))]
     tasks = list(dict.fromkeys(row.task for row in _plain(results, policy)))
-    means = _means(results)
     lines = []
     for task in tasks:
         rows = [results.row(policy, task, level) for level in levels]
@@ -146,8 +146,8 @@ def _task_table(results: Results, policy: str) -> Table:
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
 
 
-def _control_table(results: Results, policy: str) -> Table:
-    levels, means = results.levels(), _means(results)
+def _control_table(results: Results, means: _Means, policy: str) -> Table:
+    levels = results.levels()
     controls = dict.fromkeys(row.control for row in results.rows if row.policy == policy)
     lines = [
         Line(
@@ -196,10 +196,6 @@ def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
 
 def _plain(results: Results, policy: str) -> list:
     return [row for row in results.rows if (row.policy, row.control) == (policy, "")]
-
-
-def _means(results: Results) -> dict[tuple[str, str, str], LevelMean]:
-    return {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
 
 
 def _mean_cell(mean: LevelMean | None, num_tasks: int) -> Estimate | str:
