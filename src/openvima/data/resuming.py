@@ -1,5 +1,6 @@
 """What a folder already holds of the data set that is asked for, and what does not belong to it."""
 
+import errno
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -7,9 +8,10 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.planning import COMMAND, Block, GenerateConfig
 from openvima.data.reader import Shard, read_manifest
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def is_done(block: Block) -> bool:
@@ -78,6 +80,22 @@ def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
         for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
             if file.name[1:].rsplit(".", 2)[0] in names:
                 file.unlink(missing_ok=True)
+
+
+def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:
+    """Return the error to raise where a folder cannot be written to; it says how much of the work is kept.
+
+    Args:
+        folder: The data set's folder.
+        shards: All its shards, written or not.
+        error: What the system said.
+    """
+    num_there = sum(path.is_file() for path in shards)
+    remedy = "Make room" if error.errno in FULL_DISK else "Make sure that it can be written to"
+    return StorageError(
+        f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
+        f"whole and were kept. {remedy}; the same command then goes on from there."
+    )
 
 
 def _check_origin(folder: Path) -> None:
