@@ -11,11 +11,12 @@ import pyarrow.parquet as pq
 from openvima import __version__
 from openvima.data.lerobot import layout
 from openvima.data.lerobot.features import FrameLayout
-from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat, import_av
+from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.files import whole_folder
+from openvima.films import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
 
