@@ -1,12 +1,13 @@
 """Files and folders are whole under their name, whatever happens while they are written."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from openvima.files import restore_folder, whole_folder
+from openvima.files import remove_abandoned, restore_folder, whole_folder
 
 KILLED = 9
 # Writes a folder and dies at the n-th time that a folder is to be renamed or deleted.
@@ -95,3 +96,14 @@ def test_there_may_be_nothing_to_put_back(tmp_path) -> None:
     restore_folder(tmp_path / "folder")
     restore_folder(Path("."))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX tells which processes run")
+def test_files_of_processes_that_still_run_are_not_abandoned(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    names = [f".a.arrow.{os.getpid()}.tmp", f".b.arrow.{gone.pid}.tmp", ".c.tmp", f".d.{10**30}.tmp"]
+    for name in names:
+        (tmp_path / name).touch()
+    remove_abandoned(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {names[0], names[2]}

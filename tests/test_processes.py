@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import worker_jobs
-from openvima.errors import SceneError, WorkerError
+from openvima.errors import ConfigError, SceneError, WorkerError
 from openvima.processes import in_processes
 
 
@@ -81,3 +81,9 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     finally:
         for pid in filter(is_alive, workers):
             os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("num_workers", [0, -1, 5000])
+def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: int) -> None:
+    with pytest.raises(ConfigError, match=rf"workers is {num_workers}; it must lie within 1 … 1024\."):
+        list(in_processes(worker_jobs.write_number, [], num_workers))

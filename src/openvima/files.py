@@ -90,6 +90,29 @@ def restore_folder(path: Path) -> None:
         os.replace(aside, path)
 
 
+def remove_abandoned(folder: Path) -> None:
+    """Delete what writers have left in a folder that were killed; those that still run keep their files.
+
+    Where the system does not tell which processes run, nothing is deleted.
+    """
+    if os.name != "posix":
+        return
+    for file in folder.glob(".*.tmp"):
+        process = file.name.split(".")[-2]
+        if process.isdecimal() and not _runs(int(process)):
+            file.unlink(missing_ok=True)
+
+
+def _runs(process_id: int) -> bool:
+    try:
+        os.kill(process_id, 0)  # sends nothing
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # it is somebody else's
+        return True
+    return True
+
+
 def _aside(path: Path) -> Path:
     return path.with_name(f".{path.name}.old")
 

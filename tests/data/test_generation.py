@@ -10,10 +10,12 @@ import pytest
 from openvima.data import Dataset, Demonstration, GenerateConfig, GenerationProgress, generate, trials
 from openvima.data.encoding import Skipped
 from openvima.data.planning import SEEDS_PER_EPISODE, SPARE_SEEDS
+from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OracleError, SamplingError
 from openvima.scene import Outcome
-from small_datasets import TASKS, config, contents
+from small_data_sets import contents
+from small_generations import TASKS, config
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +102,11 @@ def test_another_data_set_in_the_folder_is_not_touched(whole: Path, changes: dic
 def test_force_replaces_a_data_set(tmp_path: Path) -> None:
     generate(config(tmp_path, tasks=("rotate",), episodes=1))
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "broken.json").write_text("[]")  # of an import
     generate(config(tmp_path, tasks=("rotate",), episodes=1, start_seed=7, force=True))
     assert Dataset(tmp_path)[0].seed >= 7
     assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "broken.json").exists()
 
 
 def test_seeds_that_fail_are_skipped_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,3 +268,18 @@ def test_folders_that_are_no_data_set_are_refused(whole: Path, tmp_path: Path) -
     (tmp_path / "dataset.json").write_bytes((whole / "dataset.json").read_bytes())
     with pytest.raises(DatasetError, match=r"index\.parquet is missing"):
         Dataset(tmp_path)
+
+
+def test_what_another_command_made_is_not_taken_for_a_part_of_the_work(whole: Path, tmp_path: Path) -> None:
+    out = sample(SubsetConfig(whole, tmp_path / "sample"), 1.0)
+    before = contents(out)
+    with pytest.raises(DatasetError, match="`openvima data sample` made it"):
+        generate(config(out, shard_size=None))
+    assert contents(out) == before
+
+
+@pytest.mark.usefixtures("clumsy")
+def test_nothing_is_generated_into_the_folder_of_failed_episodes(tmp_path: Path) -> None:
+    generate(config(tmp_path, tasks=("rotate",), keep_failed=True))
+    with pytest.raises(DatasetError, match="belongs to another data set"):
+        generate(config(tmp_path / "failed", tasks=("rotate",)))

@@ -12,7 +12,8 @@ from openvima.cluster import on_cluster
 from openvima.data import GenerateConfig, GenerationProgress, generate, plan
 from openvima.data.resuming import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
-from small_datasets import config, contents
+from small_data_sets import contents
+from small_generations import config
 
 
 @pytest.fixture(scope="module")

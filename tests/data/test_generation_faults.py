@@ -20,7 +20,8 @@ from openvima.cli.main import main
 from openvima.data import Dataset, GenerationProgress, generate
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, ShardError, StorageError
-from small_datasets import TASKS, config, contents
+from small_data_sets import contents
+from small_generations import TASKS, config
 
 NUM_KILLS = 10  # for each of two beginnings
 

@@ -13,11 +13,10 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, GenerateConfig, ShardWriter, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
-from openvima.data.overview import TOKENS_FOLDER, Histogram, Overview, Unfinished, look_at
+from openvima.data.overview import Histogram, Overview, Unfinished, look_at
 from openvima.data.page import write_page
 from openvima.data.page.charts import bar_chart
 from openvima.data.page.episodes import episode_card
-from openvima.data.tokens.cache import CACHE_FOLDER
 from openvima.errors import ConfigError, DatasetError
 from openvima.scene import Action
 
@@ -104,7 +103,6 @@ def test_objects_are_counted_only_on_demand(demos: Path) -> None:
 def test_failed_episodes_and_token_caches_are_told(
     demos: Path, tmp_path: Path, made_up: MadeUp, info: ShardInfo
 ) -> None:
-    assert TOKENS_FOLDER == CACHE_FOLDER
     folder = tmp_path / "demos"
     (folder / "failed").mkdir(parents=True)
     (folder / "tokens" / "objects-v1").mkdir(parents=True)

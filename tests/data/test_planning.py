@@ -11,7 +11,7 @@ from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, shard_episodes
 from openvima.env import Setup
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks.seeding import MAX_SEED
-from small_datasets import config
+from small_generations import config
 
 
 def test_shards_grow_with_their_number() -> None:

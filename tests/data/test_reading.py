@@ -16,6 +16,7 @@ from openvima.data.encoding import ShardInfo, encode
 from openvima.data.manifest import finish_folder
 from openvima.data.schema import ARRAYS, COLUMNS, VIEWS
 from openvima.errors import DatasetError, ShardError
+from small_data_sets import write_folder
 
 MadeUp = Callable[..., Demonstration]
 
@@ -187,3 +188,16 @@ def test_the_schema_says_how_images_are_shaped() -> None:
         told = (COLUMNS.field(name).metadata or {}).get(b"shape")
         if told is not None and name != "poses":
             assert json.loads(f"[{told.decode()}]") == list(shape)
+
+
+def test_a_loop_over_a_shard_ends_after_its_last_row(shard: Shard, demo: Demonstration) -> None:
+    hashes = [found.content_hash() for found in shard]
+    assert hashes[1:] == [demo.content_hash()]
+    with pytest.raises(IndexError, match=r"record 2 of 2 in .*a\.arrow; count from 0 to 1"):
+        shard[2]
+
+
+def test_naming_no_task_is_an_error(tmp_path: Path, info: ShardInfo, made_up: MadeUp) -> None:
+    write_folder(tmp_path, info, [[made_up(1)]])
+    with pytest.raises(DatasetError, match=r"no task is named; .* has stack\."):
+        Dataset(tmp_path, tasks=[])

@@ -306,6 +306,10 @@ def test_only_data_sets_are_replaced_and_only_on_demand(tmp_path: Path, write_fo
     with pytest.raises(DatasetError, match="holds other things"):
         sample(SubsetConfig(source, home, force=True), 1.0)
     assert contents(home) == {"letter.txt": b"dear"}
+    (out / "letter.txt").write_text("dear")
+    with pytest.raises(DatasetError, match="holds other things"):
+        sample(SubsetConfig(source, out, force=True), 1.0)
+    assert (out / "letter.txt").exists()
 
 
 def test_the_command_line_samples_splits_and_merges(
@@ -325,3 +329,7 @@ def test_the_command_line_samples_splits_and_merges(
     assert "at least two folders" in capsys.readouterr().err
     assert main(["data", "sample", str(source), str(tmp_path / "t"), "--share", "1.5"]) == 2
     assert "share is 1.5" in capsys.readouterr().err
+    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--share", "1", "--tasks", ","]) == 2
+    assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; ")
+    assert main(["data", "merge", str(source), str(tmp_path / "t"), "--tasks", ","]) == 2
+    assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; the sources have ")

@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.batching import BatchOrder  # noqa: E402
 from openvima.data.tokens.cache import open_tokens  # noqa: E402
-from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset  # noqa: E402
+from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, tensors_of  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 
 
@@ -136,3 +136,14 @@ def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> 
     loader = BatchLoader(episodes, BatchOrder(8, batch=4, seed=0), workers=1)
     seen = [(episode.task, episode.seed) for batch in loader for episode in batch]
     assert sorted(seen) == sorted((demo.task, demo.seed) for demo in demos)
+
+
+def test_a_demonstration_without_steps_has_tensors_without_rows(demos: Dataset) -> None:
+    demo = demos[0]
+    start = {
+        "rgb": {view: images[:1] for view, images in demo.rgb.items()},
+        "segm": {view: images[:1] for view, images in demo.segm.items()},
+    }
+    item = tensors_of(replace(demo, actions=(), pick_ids=(), place_ids=(), joint_paths=(), **start))
+    assert item["pose0_position"].shape == (0, 2)
+    assert item["pose1_rotation"].shape == (0, 4)

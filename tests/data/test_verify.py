@@ -94,6 +94,18 @@ def test_a_shard_that_the_manifest_does_not_list_is_named(folder: Path) -> None:
     assert causes(verify(folder, NONE)) == {"rotate-train-00009.arrow": ["the manifest does not list it"]}
 
 
+def test_failed_episodes_can_be_verified_where_they_lie(
+    tmp_path: Path, made_up: MadeUp, info: ShardInfo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_folder(tmp_path, info, [[with_plain_images(made_up(1))]], command=COMMAND)
+    failed = dataclasses.replace(with_plain_images(made_up(2)), outcome=Outcome(failure=True))
+    write_folder(tmp_path / "failed", info, [[failed]], command=COMMAND)
+    config = VerifyConfig(replay=0)
+    by_name = verify(tmp_path / "failed", config)
+    monkeypatch.chdir(tmp_path / "failed")
+    assert causes(verify(".", config)) == causes(by_name)
+
+
 def test_what_killed_writers_left_is_noted(folder: Path) -> None:
     (folder / ".rotate-train-00000.arrow.17.tmp").write_bytes(b"half")
     found = verify(folder, NONE)

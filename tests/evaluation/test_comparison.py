@@ -130,3 +130,9 @@ def test_the_record_is_plain_values(found):
         "p_holm": mcnemar(8, 2)[0],
         "verdict": "noise",
     }
+
+
+def test_a_colon_in_the_name_of_a_policy_is_no_mark_of_a_control(found):
+    renamed = replace(found, rows=tuple(replace(r, policy=f"{r.policy}@10:30") for r in found.rows))
+    pairs = [("a@10:30", "b@10:30"), ("a@10:30:no_prompt", "a@10:30")]
+    assert [c.a for c in compare_pairs(renamed, pairs)] == [a for a, _ in pairs]

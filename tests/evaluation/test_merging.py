@@ -60,7 +60,7 @@ def test_a_contradiction_means_that_the_policies_differ(results, other):
 
 def test_other_settings_stand_for_other_episodes_and_are_refused(results):
     config = {**results.config, "assets": "original"}
-    with pytest.raises(ConfigError, match=r"assets is None in a, original in b"):
+    with pytest.raises(ConfigError, match=r"assets is procedural in a, original in b"):
         merge({"a": results, "b": replace(results, config=config)})
 
 
@@ -69,3 +69,9 @@ def test_other_versions_are_noted(results):
     merged = merge({"a": results, "b": newer})
     assert merged.results.versions["mujoco"] == "1.2.3 / 2.0"
     assert "mujoco 1.2.3 / 2.0" in merged.notes[0]
+
+
+def test_files_that_do_not_name_a_setting_had_the_default(results):
+    config = {key: value for key, value in results.config.items() if key != "difficulty"}
+    merged = merge({"old": replace(results, config=config), "new": results})
+    assert merged.results.policy_names() == results.policy_names()

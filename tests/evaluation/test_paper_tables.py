@@ -97,3 +97,18 @@ def test_all_special_letters_of_latex_are_escaped():
 def test_own_tasks_only_make_tables_without_published_rows(results):
     own = Results(tuple(r for r in results.rows if r.task != "rotate"), policies=results.policies)
     assert "rotate" not in markdown(paper_tables(own))
+
+
+def test_means_over_fewer_tasks_than_others_say_so(results):
+    (first, *_), level = results.tasks("L1"), "L1"
+    rows = tuple(
+        row for row in results.rows if row.policy != "random" or (row.task, row.level) == (first, level)
+    )
+    text = markdown(paper_tables(replace(results, rows=rows)))
+    assert cells_of(text, "random")[0][0].endswith(f") 1 of {len(results.tasks('L1'))} tasks")
+    assert "tasks" not in cells_of(text, "mine")[0][0]
+
+
+def test_a_single_episode_is_counted_in_the_singular(results):
+    row = replace(results.rows[0], outcomes=results.rows[0].outcomes[:1])
+    assert "1 episode a task." in paper_tables(replace(results, rows=(row,)))[0].caption

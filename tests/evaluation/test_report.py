@@ -12,6 +12,8 @@ from openvima.evaluation.clips import load_clips, save_clips
 from openvima.evaluation.comparison import compare
 from openvima.evaluation.report import write_report
 from openvima.evaluation.report.curves import read_charts, read_run_charts, run_labels
+from openvima.evaluation.report.figures import curve_chart
+from openvima.evaluation.report.page import default_command
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 
 
@@ -331,3 +333,30 @@ def test_a_damaged_training_record_names_the_line(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 1, "loss": 2}\n{"loss": 1}\n')
     with pytest.raises(DatasetError, match="line 2"):
         read_charts(tmp_path / "metrics.jsonl")
+
+
+def test_charts_with_curves_of_the_same_name_have_names_of_their_own():
+    curves = {"training data": [(0, 1.0), (1, 0.5)], "held out": [(0, 1.0), (1, 0.8)]}
+    names = [
+        re.findall(r'\bid="([^"]*)"', curve_chart(curves, title="Loss", name=name)) for name in ("a", "b")
+    ]
+    assert names[0] and not set(names[0]) & set(names[1])
+    assert not any(" " in name for name in names[0])  # links to them would lead nowhere
+
+
+def test_the_command_names_what_policies_are_whatever_they_are_called(results):
+    kinds = {
+        "mine": {"kind": "remote", "metadata": {}},
+        "oracle": {"kind": "oracle"},
+        "random": {"kind": "untrained", "preset": "nano"},
+    }
+    config = {**results.config, "boxes": "my boxes.py:make"}
+    command = default_command(replace(results, policies=kinds, config=config))
+    assert "--policy mine=ws://HOST:PORT,oracle,random=nano --tasks" in command
+    assert "--boxes 'my boxes.py:make'" in command
+
+
+def test_a_single_episode_is_counted_in_the_singular(results, tmp_path):
+    row = replace(results.rows[0], outcomes=results.rows[0].outcomes[:1])
+    path = write_report(replace(results, rows=(row,)), tmp_path / "report.html")
+    assert "1 level, 1 episode each; 1 episode in all" in path.read_text(encoding="utf-8")

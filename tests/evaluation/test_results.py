@@ -110,3 +110,9 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
 )
 def test_equal_causes_of_different_objects_count_as_one(reason, kind):
     assert failure_kind(reason) == kind
+
+
+def test_a_file_that_is_no_text_is_damaged(tmp_path):
+    (tmp_path / "results.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DatasetError, match="damaged"):
+        Results.read(tmp_path)

@@ -119,6 +119,14 @@ def test_another_policy_at_the_same_address_is_refused() -> None:
         policy.close()
 
 
+def test_the_same_policy_with_other_limits_goes_on_under_those() -> None:
+    with serve_in_thread(ForMany(), ServerConfig(port=0, max_episodes=1)) as url:
+        policy = RemotePolicy(url)
+    with serve_in_thread(ForMany(), ServerConfig(port=port_of(url), max_episodes=2)):
+        policy.reset([made_up_prompt(1)] * 2)
+        policy.close()
+
+
 def test_a_server_that_falls_silent_is_given_up() -> None:
     with (
         scripted_server(RESET, lambda connection: connection.recv()) as url,

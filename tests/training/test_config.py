@@ -15,7 +15,7 @@ BAD = {
     "learning_rate": (-1e-3, math.nan, math.inf),
     "warmup_steps": (-1,),
     "weight_decay": (-0.1,),
-    "clip_norm": (-1.0,),
+    "clip_norm": (-1.0, 0.0),
     "spurious_probability": (-0.1, 1.1, math.nan),
     "pretraining_steps": (-1,),
     "pretraining_scenes": (0,),
@@ -42,6 +42,22 @@ BAD = {
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name in BAD for value in BAD[name]])
 def test_a_value_out_of_range_is_named_with_what_is_allowed(name: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"^{name} is .+it must be"):
+        TrainingConfig(**FOLDERS, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("steps", "many", "steps is 'many'; it must be a whole number"),
+        ("steps", None, "steps is None; it must be a whole number"),
+        ("batch", 2.5, "batch is 2.5; it must be a whole number"),
+        ("learning_rate", True, "learning_rate is True; it must be a number"),
+        ("tensorboard", "no", "tensorboard is 'no'; it must be true or false"),
+        ("preset", 3, "preset is 3; it must be text"),
+    ],
+)
+def test_a_value_of_another_type_is_named(name: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         TrainingConfig(**FOLDERS, **{name: value})
 
 

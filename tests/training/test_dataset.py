@@ -9,12 +9,19 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.tokens.cache import open_tokens  # noqa: E402
-from openvima.errors import DatasetError, PromptError  # noqa: E402
+from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.training.augment import augmented  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.source import ExampleSource, Parts, by_length, check_words, split_examples  # noqa: E402
+from openvima.training.source import (  # noqa: E402
+    ExampleSource,
+    Parts,
+    by_length,
+    check_words,
+    order_of,
+    split_examples,
+)
 from training_examples import examples_of, rngs_of  # noqa: E402
 
 OBJECTS, VIEWS = Reader("objects"), Reader("views")
@@ -54,6 +61,15 @@ def test_the_split_follows_from_the_episode_and_keeps_everything(data):
     assert names_of(least) <= names_of(kept)
     with pytest.raises(DatasetError, match="no demonstration to learn from"):
         split_examples(cache, validation_share=1.0, validation_episodes=1)
+
+
+def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
+    cache = open_tokens(Dataset(data))
+    _, few = split_examples(cache, validation_share=0.3, validation_episodes=3)
+    orders = [order_of(few, batch=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
+    assert [order.batch for order in orders] == [2, 2]
+    with pytest.raises(ConfigError, match="there are 3 demonstrations to learn from and 4 processes"):
+        order_of(few, batch=64, seed=0, bucket=0, rank=0, num_ranks=4)
 
 
 def test_an_example_of_a_source_knows_its_images_among_all(data):

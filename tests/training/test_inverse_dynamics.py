@@ -166,9 +166,11 @@ def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
     assert not other.out.exists()
 
 
-@pytest.mark.parametrize("switch", ["motion_share", "autoregressive", "visual_residual"])
-def test_a_learner_of_ones_own_has_no_such_switch(switch, data, tmp_path) -> None:
-    config = TrainingConfig(data=data, out=tmp_path / "run", preset="some:learner", **{switch: True})
+@pytest.mark.parametrize(
+    ("switch", "value"), [("motion_share", 0.5), ("autoregressive", True), ("visual_residual", True)]
+)
+def test_a_learner_of_ones_own_has_no_such_switch(switch, value, data, tmp_path) -> None:
+    config = TrainingConfig(data=data, out=tmp_path / "run", preset="some:learner", **{switch: value})
     with pytest.raises(ConfigError, match=f"does not know {switch}; leave it out"):
         train(config)
 

@@ -55,12 +55,30 @@ def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, t
     [
         ("nowhere:make", "No module named 'nowhere'"),
         ("json:make", "no attribute 'make'"),
+        ("math:pi", "preset is 'math:pi', which is a float; it must be a function"),
         ("builtins:dict", "builtins:dict returned a dict; it must return a Learner"),
     ],
 )
 def test_a_learner_that_cannot_be_made_is_named(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_learner(name)
+
+
+def test_mistakes_in_a_learner_of_ones_own_are_shown_as_they_are(monkeypatch, example) -> None:
+    import custom_learner
+
+    monkeypatch.setattr(custom_learner, "Matcher", None)
+    with pytest.raises(TypeError, match="not callable"):
+        make_learner(example)
+
+
+def test_a_learner_that_does_not_tell_its_score_is_named_at_once(example, settings, monkeypatch) -> None:
+    import custom_learner
+
+    monkeypatch.setattr(custom_learner.Matcher, "score", "accuracy")
+    with pytest.raises(ConfigError, match=r"score is 'accuracy', but .* pick_accuracy, place_accuracy; name"):
+        train(TrainingConfig(**{**settings, "preset": example, "pretraining_steps": 0}))
+    assert not (settings["out"] / "metrics.jsonl").exists()
 
 
 def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
@@ -94,9 +112,10 @@ def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
 
 
 def test_checkpoints_that_are_to_be_kept_are_kept(settings) -> None:
-    run = train(TrainingConfig(**settings, keep_every=2))
+    """Also between those from which a run could go on."""
+    run = train(TrainingConfig(**{**settings, "keep_every": 2, "checkpoint_every": 5}))
     kept = {folder.name for folder in (run / "checkpoints").glob("2-*")}
-    assert kept == {"2-cloning-000002", "2-cloning-000004", "2-cloning-000006"}
+    assert kept >= {"2-cloning-000002", "2-cloning-000004", "2-cloning-000006"}
 
 
 def test_a_run_of_epochs_takes_as_many_steps_as_they_have(settings) -> None:
@@ -105,18 +124,33 @@ def test_a_run_of_epochs_takes_as_many_steps_as_they_have(settings) -> None:
     assert [folder.name for folder in (run / "checkpoints").glob("2-*-000009")] == ["2-cloning-000009"]
 
 
+def _interrupts_at(step: int):
+    """Stop when metrics of a step were told, and before its checkpoint."""
+
+    def report(done: int, total: int, note: str) -> None:
+        if done == step:
+            raise KeyboardInterrupt
+
+    return report
+
+
 @pytest.mark.skipif(find_spec("tensorboard") is None, reason="tensorboard is not installed")
 @pytest.mark.filterwarnings("ignore")  # of the reader, whose package is not ours
 def test_tensorboard_shows_the_metrics(settings) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    with pytest.raises(KeyboardInterrupt):  # what it told of step 4 comes again
+        train(TrainingConfig(**settings), _interrupts_at(4 + 4))
     run = train(TrainingConfig(**settings))
     events = EventAccumulator(str(run / "tensorboard_log"))
     events.Reload()
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    told = {line["step"]: line["loss"] for line in lines if line["stage"] == 1 and "loss" in line}
-    shown = {event.step: event.value for event in events.Scalars("2-cloning/loss")}
-    assert shown == pytest.approx(told)
+    for name, before in (("1-matching", 0), ("2-cloning", 4)):
+        told = [
+            (before + line["step"], line["loss"]) for line in lines if line["name"] == name and "loss" in line
+        ]
+        shown = [(event.step, event.value) for event in events.Scalars(f"{name}/loss")]
+        assert shown == [(step, pytest.approx(loss)) for step, loss in told]
     assert not (
         train(TrainingConfig(**{**settings, "out": run.with_name("b"), "tensorboard": False}))
         / "tensorboard_log"

@@ -146,6 +146,14 @@ def test_metrics_name_stage_and_step_and_hold_no_times(settings):
     assert not any("second" in key for line in lines for key in line)
 
 
+def test_a_run_that_was_killed_before_it_could_name_its_best_checkpoint_names_it_later(settings):
+    best = train(TrainingConfig(**settings)) / "checkpoints" / "best.txt"
+    name = best.read_text()
+    best.unlink()
+    train(TrainingConfig(**settings))
+    assert best.read_text() == name
+
+
 def test_a_damaged_checkpoint_is_named(settings):
     config = TrainingConfig(**settings)
     train_until(config, 3)

@@ -95,12 +95,14 @@ def assert_alike(ours: Path, theirs: Path) -> None:
             assert a.get(name) == (pytest.approx(b[name]) if name in b else None)
         for name in ("loss", "validation_loss"):
             assert a.get(name) == (pytest.approx(b[name], rel=1e-5) if name in b else None)
+        assert a.get("gradient_norm", 0) == pytest.approx(b.get("gradient_norm", 0), rel=1e-3)
 
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
 def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
     one = train(TrainingConfig(**{**bins, "out": tmp_path / "one"}))
-    two = run_in_processes(2, {**bins, "out": tmp_path / "two", "sharding": sharding})
+    parts = {"accumulate": 8}  # more than demonstrations of a process
+    two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two", "sharding": sharding})
     assert_alike(one, two)
     load_policy(str(two))
 
@@ -120,6 +122,25 @@ def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, 
     assert (plain / "metrics.jsonl").read_bytes() == (ahead / "metrics.jsonl").read_bytes()
     parts = train(TrainingConfig(**{**bins, "out": tmp_path / "parts", "accumulate": 4}))
     assert_alike(plain, parts)
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # of the tracer itself
+def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
+    """Traced as for the compiler, but run as they are: generating code takes a minute."""
+    bins |= {"steps": 2, "checkpoint_every": 2}
+    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
+    traced, compiled = [], torch.nn.Module.compile
+
+    def trace(module: torch.nn.Module, **options) -> None:
+        traced.append(type(module).__name__)
+        compiled(module, backend="eager", fullgraph=True, **options)
+
+    monkeypatch.setattr(torch.nn.Module, "compile", trace)
+    torch.compiler.reset()
+    assert_alike(plain, train(TrainingConfig(**{**bins, "out": tmp_path / "traced", "compile": True})))
+    torch.compiler.reset()
+    assert {"CrossBlock", "SelfBlock", "TextBlock"} <= set(traced)
+    assert not {"Linear", "Sequential"} & set(traced)
 
 
 def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:

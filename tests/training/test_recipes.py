@@ -77,6 +77,30 @@ def test_the_settings_of_another_run_can_be_taken(trained, tmp_path) -> None:
     assert trained[0].steps == 5
 
 
+def test_steps_replace_the_epochs_of_a_recipe(trained, tmp_path) -> None:
+    words = ["train", "--recipe", "workstation", "--preset", "nano", "--data", "demos", "--out", "run"]
+    file = tmp_path / "mine.yaml"
+    file.write_text("steps: 7")
+    for more in ([], ["--steps", "5"], ["--config", str(file)], ["--steps", "5", "--epochs", "2"]):
+        assert main([*words, *more]) == 0
+    assert [config.epochs for config in trained] == [10, None, None, 2]
+    assert [config.steps for config in trained][1:] == [5, 7, 5]
+
+
+def test_numbers_of_files_may_have_an_exponent_and_no_point(tmp_path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("learning_rate: 1e-4\ntokens: cache\nkeep_every: null")
+    assert read_settings(file) == {"learning_rate": 1e-4, "tokens": Path("cache"), "keep_every": None}
+
+
+def test_only_the_first_of_several_processes_prints(trained, monkeypatch, capsys) -> None:
+    words = ["train", "--data", "demos", "--out", "run"]
+    for rank, printed in (("0", "run\n"), ("1", "")):
+        monkeypatch.setenv("RANK", rank)
+        assert main(words) == 0
+        assert capsys.readouterr().out == printed
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -2,17 +2,20 @@
 
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from openvima.cli.progress import progress_bar
+from openvima.cli.words import words_in
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from openvima.evaluation import Results
+    from openvima.evaluation.results import LevelMean
 
 
 def main(
@@ -91,9 +94,9 @@ def main(
     if in_context:
         controls = f"{controls},{IN_CONTEXT}"
     config = EvaluationConfig(
-        policies=_words(policy),
-        tasks=HELD_OUT_TASKS if in_context and tasks == "all" else _words(tasks),
-        levels=_words(levels),
+        policies=words_in(policy),
+        tasks=HELD_OUT_TASKS if in_context and tasks == "all" else words_in(tasks),
+        levels=words_in(levels),
         episodes=episodes,
         seed=seed,
         workers=workers,
@@ -105,9 +108,9 @@ def main(
         force=force,
         device=device,
         precision=precision,
-        controls=_with_boxes(_words(controls), boxes),
+        controls=_with_boxes(words_in(controls), boxes),
         boxes=boxes,
-        film=_words(film),
+        film=words_in(film),
         engine=engine,
         address=address,
     )
@@ -136,7 +139,7 @@ def print_results(results: "Results") -> None:
     from rich.table import Table
 
     policies = results.policy_names()
-    means = {(mean.policy, mean.level): mean for mean in results.level_means() if not mean.control}
+    means = results.means()
     table = Table("level", title="solved episodes in per cent (95 % interval)")
     table.add_column("task", overflow="fold", min_width=12)
     for policy in policies:
@@ -145,22 +148,21 @@ def print_results(results: "Results") -> None:
         for task in results.tasks(level):
             rows = (results.row(policy, task, level) for policy in policies)
             table.add_row(level, task, *(_cell(row.rate, row.interval) if row else "–" for row in rows))
-        level_means = (means.get((policy, level)) for policy in policies)
+        level_means = (means.get((policy, "", level)) for policy in policies)
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
         table.add_row(level, "mean", *cells, style="bold")
         strict = (_strict_mean(results, policy, level) for policy in policies)
         table.add_row(level, "mean, strict limit", *strict, end_section=True)
     Console().print(table)
     if any(row.control for row in results.rows):
-        Console().print(_control_table(results))
+        Console().print(_control_table(results, means))
 
 
-def _control_table(results: "Results") -> "Table":
+def _control_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":
     """Level means of each policy, plain and under each control."""
     from rich.table import Table
 
     table = Table("policy", "control", title="what the scores are made of: means in per cent (95 % interval)")
-    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
     for level in results.levels():
         table.add_column(level, justify="right", no_wrap=True)
     for policy, control in dict.fromkeys((row.policy, row.control) for row in results.rows):
@@ -188,7 +190,3 @@ def _with_boxes(controls: tuple[str, ...], boxes: str | None) -> tuple[str, ...]
 
     asked = boxes is None or {"all", DETECTED_BOXES} & set(controls)
     return controls if asked else (*controls, DETECTED_BOXES)
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())

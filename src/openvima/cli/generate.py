@@ -1,11 +1,13 @@
 """`openvima generate`: write demonstrations with the oracle."""
 
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Literal
 
 from openvima.cli.progress import generation_table
+from openvima.cli.words import words_in
 from openvima.errors import ConfigError
 
 
@@ -67,7 +69,7 @@ def main(
 
     config = GenerateConfig(
         out=out,
-        tasks=tuple(name.strip() for name in tasks.split(",") if name.strip()),
+        tasks=words_in(tasks),
         episodes=episodes,
         level=level,
         start_seed=seed,
@@ -89,7 +91,7 @@ def main(
     with generation_table() as report:
         folder = generate(config, report)
     if is_finished(folder):
-        print(f"`openvima data info {folder}` shows what is there.", file=sys.stderr)
+        print(f"`openvima data info {shlex.quote(str(folder))}` shows what is there.", file=sys.stderr)
     else:
         print(f"{folder} is not finished yet: shards of other ranges are missing.", file=sys.stderr)
     print(folder)

@@ -17,7 +17,7 @@ REDRAW_S = 0.25
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Report]:
-    """Show one bar with count, time taken and time left while the block runs.
+    """Show one bar with count, time taken and time left while the block runs; nothing if nothing is done.
 
     Args:
         label: What is being done, in a word or two.
@@ -45,18 +45,28 @@ def progress_bar(label: str) -> Iterator[Report]:
         TextColumn("left", table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
     )
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4, expand=True) as progress:
-        task = progress.add_task(label, total=None, note="")
+    console = Console(stderr=True)
+    progress = Progress(*columns, console=console, refresh_per_second=4, expand=True)
+    task = progress.add_task(label, total=None, note="")
+    has_begun = False
 
-        def report(done: int, total: int, note: str) -> None:
-            progress.update(task, completed=done, total=total, note=note)
+    def report(done: int, total: int, note: str) -> None:
+        nonlocal has_begun
+        if not has_begun:
+            progress.start()
+            has_begun = True
+        progress.update(task, completed=done, total=total, note=note)
 
-        try:
-            yield report
-        except BaseException:
-            if progress.tasks[0].total is None:  # nothing had begun: the message that follows says it all
-                progress.update(task, visible=False)
-            raise
+    if console.is_terminal:
+        progress.start()
+    try:
+        yield report
+    finally:
+        if not has_begun:  # what follows, mostly an error, says it all
+            progress.update(task, visible=False)
+            progress.live.transient = True
+        if has_begun or console.is_terminal:  # else even stopping would print a line
+            progress.stop()
 
 
 @contextmanager

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from openvima.cli.words import words_in
+
 if TYPE_CHECKING:
     from openvima.evaluation.clips import Clip
     from openvima.evaluation.comparison import Comparison
@@ -118,7 +120,7 @@ def _pairs(names: str) -> list[tuple[str, str]]:
     """Pair the first name with each of the others."""
     from openvima.errors import ConfigError
 
-    first, *others = [name.strip() for name in names.split(",") if name.strip()] or [""]
+    first, *others = words_in(names) or ("",)
     if not others:
         raise ConfigError(f"--compare is {names!r}; give two or more policies with commas in between.")
     return [(first, other) for other in others]

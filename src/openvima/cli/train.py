@@ -1,8 +1,10 @@
 """`openvima train`: train a policy on demonstrations."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,18 +43,22 @@ def run(words: Sequence[str]) -> int:
     import tyro
 
     from openvima.training import TrainingConfig, train
-    from openvima.training.recipes import default_recipe, read_settings, recipe_settings
+    from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
 
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--recipe")
-    first.add_argument("--config", type=Path)
-    first.add_argument("--preset")
-    known, _ = first.parse_known_args(list(words))
-    file = read_settings(known.config) if known.config else {}
+    basis = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    basis.add_argument("--recipe")
+    basis.add_argument("--config", type=Path)
+    begun, rest = basis.parse_known_args(list(words))
+    peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("--preset", "--steps", "--epochs"):
+        peek.add_argument(name)
+    known, _ = peek.parse_known_args(rest)
+    file = read_settings(begun.config) if begun.config else {}
     preset = known.preset or file.get("preset")
-    recipe = known.recipe or default_recipe(preset or "nano")
-    settings = {**recipe_settings(recipe), **file}
-    rest = _without(_without(list(words), "--recipe"), "--config")
+    recipe = begun.recipe or default_recipe(preset or "nano")
+    settings = overridden(recipe_settings(recipe), file)
+    if known.steps and not known.epochs:
+        settings["epochs"] = None
     given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
     others = {name: value for name, value in settings.items() if name not in given}
     if preset:
@@ -64,25 +70,15 @@ def run(words: Sequence[str]) -> int:
         args=rest,
         default=TrainingConfig(**given, **others),
     )
-    with progress_bar("training") as report:
+    is_first = os.environ.get("RANK", "0") == "0"  # among those that torchrun starts
+    with progress_bar("training") if is_first else nullcontext() as report:
         folder = train(config, report, _rollout(config) if config.rollout_every else None)
+    if not is_first:
+        return 0
     if ":" not in config.preset:
         print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
     print(folder)
     return 0
-
-
-def _without(words: list[str], option: str) -> list[str]:
-    """Leave out an option and its value."""
-    kept, skip = [], False
-    for word in words:
-        if skip:
-            skip = False
-        elif word == option:
-            skip = True
-        elif not word.startswith(f"{option}="):
-            kept.append(word)
-    return kept
 
 
 def _rollout(config: "TrainingConfig") -> "Trial":

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from openvima.errors import ShardError
 
-_MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
+MAGIC_BYTES = 8  # "ARROW1" and padding, before the first message
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +102,12 @@ def measure(path: Path) -> tuple[Frame, list[Span]]:
     return Frame(len(content), head, tail, _frame_crc32(content, head, tail)), spans
 
 
+def spans_of(index: pa.Table) -> list[Span]:
+    """Return where the records of a shard lie, from its part of the index."""
+    columns = (index.column(name).to_pylist() for name in ("offset", "num_bytes", "crc32"))
+    return [Span(*numbers) for numbers in zip(*columns, strict=True)]
+
+
 def _frame_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
     return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
 
@@ -110,7 +116,7 @@ def _message_ends(path: Path) -> list[int]:
     """Where the schema ends, and each record."""
     ends = []
     with pa.memory_map(str(path)) as file:
-        file.seek(_MAGIC_BYTES)
+        file.seek(MAGIC_BYTES)
         while True:
             try:
                 pa.ipc.read_message(file)

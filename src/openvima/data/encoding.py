@@ -79,6 +79,11 @@ class ShardInfo:
         if self.compression not in CODECS:
             raise ShardError(unknown_name("compression", self.compression, CODECS))
 
+    @property
+    def file_name(self) -> str:
+        """Name of the shard's file."""
+        return f"{self.task}-{self.level}-{self.number:05d}.arrow"
+
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
         fields = {name: getattr(self, name) for name in self.__slots__}

@@ -1,16 +1,22 @@
 """Writing data sets: oracle demonstrations by many processes, the same bytes whatever their number."""
 
-import errno
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from openvima.data.manifest import MANIFEST_NAME, finish_folder
-from openvima.data.planning import COMMAND, FAILED_FOLDER, Block, GenerateConfig, plan
-from openvima.data.resuming import check_folder, clear, is_done, is_finished, remove_leftovers
+from openvima.data.manifest import FAILED_FOLDER, MANIFEST_NAME, finish_folder
+from openvima.data.planning import COMMAND, Block, GenerateConfig, plan
+from openvima.data.resuming import (
+    check_folder,
+    clear,
+    is_done,
+    is_finished,
+    remove_leftovers,
+    storage_error,
+)
 from openvima.data.tally import NUM_COUNTS, Report, reporter
 from openvima.data.trials import write_block
-from openvima.errors import ConfigError, DatasetError, StorageError
+from openvima.errors import ConfigError, DatasetError
 from openvima.processes import Counts, in_watched_processes
 
 
@@ -51,7 +57,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     except BrokenPipeError:  # of `report`
         raise
     except OSError as error:
-        raise StorageError(_storage_message(config, blocks, error)) from error
+        raise storage_error(config.out, [block.path for block in blocks], error) from error
     finally:
         remove_leftovers(config, own)
     return config.out
@@ -132,13 +138,3 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
     paths = [block.path for block in blocks]
     finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions)
-
-
-def _storage_message(config: GenerateConfig, blocks: Sequence[Block], error: OSError) -> str:
-    num_there = sum(block.path.is_file() for block in blocks)
-    is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    remedy = "Make room" if is_full else "Make sure that it can be written to"
-    return (
-        f"cannot write to {config.out}: {error.strerror or error}. {num_there} of {len(blocks)} shards are "
-        f"whole and were kept. {remedy}; the same command then goes on from there."
-    )

@@ -20,6 +20,9 @@ from openvima.files import write_whole
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
+BROKEN_NAME = "broken.json"  # episodes that an import left out
+FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
+TOKENS_FOLDER = "tokens"  # made of the shards, safe to delete
 LICENCE = "MIT"
 
 INDEX_SCHEMA = pa.schema(
@@ -138,8 +141,15 @@ def finish_folder(
     write_whole(folder / MANIFEST_NAME, text + "\n")
 
 
-def summarise(path: Path) -> ShardSummary:
+def summarise(
+    path: Path,
+    known: Mapping[str, Any] | None = None,  # Any: a number and a text
+) -> ShardSummary:
     """Read what index and manifest hold of a shard.
+
+    Args:
+        path: The shard.
+        known: Its `fingerprint`, if that has been taken already.
 
     Raises:
         ShardError: It is damaged.
@@ -149,7 +159,7 @@ def summarise(path: Path) -> ShardSummary:
     table = Shard(path).table(_COLUMNS)
     frame, spans = measure(path)
     counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
-    entry = {**counts, **fingerprint(path), **frame.to_entry()}
+    entry = {**counts, **(known or fingerprint(path)), **frame.to_entry()}
     return ShardSummary(path.name, entry, _index_part(table, path.name, spans), _counts(table))
 
 

@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
-from openvima.data.planning import FAILED_FOLDER
+from openvima.data.manifest import FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME, TOKENS_FOLDER
 from openvima.data.reader import Dataset, Shard
-from openvima.data.schema import COLUMNS
+from openvima.data.schema import COLUMNS, IMAGES
 from openvima.errors import ShardError
 
-TOKENS_FOLDER = "tokens"  # as in `tokens.cache`, which is slow to import
-_IMAGE_COLUMNS = ("rgb_", "segm_", "prompt_rgb_", "prompt_segm_")  # how their names begin
 _NUM_MEASURED = 3  # episodes of each task whose images are told from the rest
 
 Report = Callable[[int, int, str], None]
@@ -179,7 +176,7 @@ def _task_overview(dataset: Dataset, task_of: np.ndarray, task: str) -> TaskOver
 
 def _image_share(dataset: Dataset, episodes: Iterable[int]) -> float:
     """Share of the images in the bytes of some records."""
-    without = [name for name in COLUMNS.names if not name.startswith(_IMAGE_COLUMNS)]
+    without = [name for name in COLUMNS.names if name not in IMAGES]
     total = rest = 0
     for episode_index in episodes:
         info = dataset.shard(dataset.locate(episode_index)[0]).info

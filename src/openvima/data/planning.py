@@ -12,10 +12,12 @@ from typing import Any, Literal
 
 from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import ConfigError
+from openvima.processes import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
@@ -24,8 +26,7 @@ Compression = Literal["lz4", "zstd"]
 
 COMMAND = "openvima generate"  # what manifests name as their maker
 DOMAIN = "train"
-FAILED_FOLDER = "failed"
-LARGEST_SHARD = 1000  # episodes, about 25 MB
+LARGEST_SHARD = 1000  # episodes, about 44 MB
 SMALLEST_SHARD = 4
 # So many shards of a size, then the size doubles: a small data set has work for several processes, and a
 # large one few files.
@@ -35,7 +36,6 @@ SHARDS_OF_A_SIZE = 4
 SEEDS_PER_EPISODE = 4
 SPARE_SEEDS = 12
 MAX_EPISODES = 10**7  # of a task, in one folder
-MAX_WORKERS = 1024
 MAX_FIRST_SEED = MAX_SEED - 10**9  # leaves room for the seeds of all shards
 
 
@@ -197,7 +197,6 @@ def plan(config: GenerateConfig) -> list[Block]:
     blocks = []
     for task in config.resolved_tasks():
         for number, episodes, seeds in _division(config):
-            name = f"{task}-{config.level}-{number:05d}.arrow"
             info = ShardInfo(
                 task=task,
                 level=config.level,
@@ -212,8 +211,8 @@ def plan(config: GenerateConfig) -> list[Block]:
                 compression=config.compression,
                 images=config.images,
             )
-            failed = config.out / FAILED_FOLDER / name if config.keep_failed else None
-            blocks.append(Block(config.out / name, info, episodes, seeds, config.setup, failed))
+            failed = config.out / FAILED_FOLDER / info.file_name if config.keep_failed else None
+            blocks.append(Block(config.out / info.file_name, info, episodes, seeds, config.setup, failed))
     return blocks
 
 

@@ -1,9 +1,11 @@
 """Reading demonstrations: single shards, and whole folders by episode."""
 
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from openvima.data.checksums import Frame, Span, mapped
@@ -126,11 +128,14 @@ class Shard:
         """Read one row as it is stored.
 
         Raises:
+            IndexError: There are fewer rows.
             ShardError: It is damaged.
         """
         return self._batch(self._reader, row)
 
     def _batch(self, reader: pa.RecordBatchFileReader, row: int) -> pa.RecordBatch:
+        if not 0 <= row < len(self):  # which also ends loops over a shard
+            raise IndexError(f"record {row} of {len(self)} in {self.path}; count from 0 to {len(self) - 1}.")
         try:
             batch = reader.get_batch(row)
             batch.validate(full=True)  # 4 µs; offsets that lead out of a buffer would end the process
@@ -182,7 +187,8 @@ class Shard:
 class Dataset:
     """A folder of demonstrations as a sequence; an episode is read when it is asked for.
 
-    Episodes are sorted by task, then by seed. Objects can be sent to other processes: they open files anew.
+    Episodes come in the order in which they are stored. Objects can be sent to other processes: they open
+    files anew.
 
     Args:
         path: The folder.
@@ -203,7 +209,7 @@ class Dataset:
         self.tasks = None if tasks is None else tuple(tasks)
         self.manifest = read_manifest(self.path)
         index = _read_index(self.path, self.manifest)
-        self.index = index if self.tasks is None else _of_tasks(index, self.tasks, self.path)
+        self.index = index.filter(of_tasks(index, self.tasks, self.path)) if self.tasks is not None else index
         names = self.index.column("shard").combine_chunks().dictionary_encode()
         self._names = names.dictionary.to_pylist()
         self._name_of = names.indices.to_numpy()  # numbers instead of a million texts
@@ -290,7 +296,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
 
 def remedy(folder: Path) -> str:
     """Return a sentence that says what makes a damaged folder whole."""
-    return f"`openvima data verify {folder} --repair` makes it anew, or keeps what is whole."
+    return (
+        f"`openvima data verify {shlex.quote(str(folder))} --repair` makes it anew, or keeps what is whole."
+    )
 
 
 def why_no_data_set(folder: Path) -> str:
@@ -298,12 +306,39 @@ def why_no_data_set(folder: Path) -> str:
     if folder.is_file():
         return f"{folder} is a file; give the folder that holds the data set, such as {folder.parent}."
     if not folder.is_dir():
-        return f"there is no folder {folder}; `openvima generate --out {folder}` makes one."
+        out = shlex.quote(str(folder))
+        return f"there is no folder {folder}; `openvima generate --out {out}` makes one."
     if any(folder.glob("*.arrow")):
         return f"{folder} is not finished: repeat the command that writes it ({MANIFEST_NAME} is missing)."
     inner = sorted(str(path.parent) for path in folder.glob(f"*/{MANIFEST_NAME}"))
     hint = f", but these do: {', '.join(inner[:5])}{', …' if len(inner) > 5 else ''}" if inner else ""
     return f"{folder} holds no data set ({MANIFEST_NAME} is missing){hint}."
+
+
+def of_tasks(index: pa.Table, tasks: Sequence[str] | None, folder: Path) -> np.ndarray:
+    """Tell which episodes are of some tasks.
+
+    Args:
+        index: The episodes.
+        tasks: Names of tasks; None means all.
+        folder: Where they are, for the message.
+
+    Returns:
+        Shape (N,), bool.
+
+    Raises:
+        DatasetError: No task is named, or there are no episodes of one.
+    """
+    present = np.array(index.column("task").to_pylist(), dtype=str)
+    if tasks is None:
+        return np.ones(len(present), bool)
+    known = sorted(set(present.tolist()))
+    if not tasks:
+        raise DatasetError(f"no task is named; {folder} has {', '.join(known)}.")
+    for task in tasks:
+        if task not in known:
+            raise DatasetError(unknown_name(f"task in {folder} called", task, known))
+    return np.isin(present, tasks)
 
 
 def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
@@ -340,14 +375,6 @@ def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:  # Any: JSO
         raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
-
-
-def _of_tasks(index: pa.Table, tasks: Sequence[str], folder: Path) -> pa.Table:
-    present = index.column("task").to_pylist()
-    for task in tasks:
-        if task not in present:
-            raise DatasetError(unknown_name(f"task in {folder} called", task, sorted(set(present))))
-    return index.take([i for i, task in enumerate(present) if task in tasks])
 
 
 def _check_shards(folder: Path, names: Sequence[str]) -> None:

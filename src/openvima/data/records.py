@@ -1,8 +1,10 @@
 """A demonstration: everything that one run of the oracle showed, did and led to."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -157,13 +159,13 @@ def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
 
 def package_versions() -> dict[str, str]:
     """Return the versions of all packages that decide the bytes of a demonstration."""
-    return dict(_versions())
+    return dict(versions_of("mujoco", "numba", "numpy", "pyarrow"))
 
 
-@lru_cache(maxsize=1)
-def _versions() -> dict[str, str]:
-    others = {name: version(name) for name in ("mujoco", "numba", "numpy", "pyarrow")}
-    return {"openvima": __version__, **others}
+@lru_cache
+def versions_of(*packages: str) -> Mapping[str, str]:
+    """Return the versions of this package and of others, looked up once."""
+    return MappingProxyType({"openvima": __version__, **{name: version(name) for name in packages}})
 
 
 def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:

@@ -7,7 +7,6 @@ that samples and draws, so the result is compared with the content hash of the d
 import dataclasses
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from openvima.catalog.packs import load_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS
+from openvima.env.setup import Setup
 from openvima.errors import AssetError, OpenVimaError, ShardError
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import RenderedPrompt, Scene
@@ -75,9 +75,7 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         demo: Names the episode; its own prompt is not used.
         info: Of the shard that stores it.
     """
-    options: dict[str, Any] = {}  # Any: options are of whatever type a task declares
-    if info.difficulty != "easy":  # a task may have but one, and then no such option
-        options["difficulty"] = info.difficulty
+    options = Setup(info.assets, info.compat, info.difficulty).options()
     rasteriser = _rasteriser(info.assets)
     episode = sample_episode(
         demo.task,

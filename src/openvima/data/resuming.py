@@ -1,15 +1,17 @@
 """What a folder already holds of the data set that is asked for, and what does not belong to it."""
 
+import errno
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
-from openvima.data.planning import FAILED_FOLDER, Block, GenerateConfig
-from openvima.data.reader import Shard
-from openvima.errors import DatasetError
+from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
+from openvima.data.planning import COMMAND, Block, GenerateConfig
+from openvima.data.reader import Shard, read_manifest
+from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
+FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def is_done(block: Block) -> bool:
@@ -38,6 +40,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
         ShardError: A shard is damaged.
     """
+    _check_origin(config.out)
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):
         shard = Shard(path)
@@ -63,7 +66,8 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 def clear(folder: Path) -> None:
     """Delete a data set, its failed episodes too; other files stay."""
     for part in (folder, folder / FAILED_FOLDER):
-        for path in [part / MANIFEST_NAME, part / INDEX_NAME, *part.glob("*.arrow")]:
+        names = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
+        for path in [*(part / name for name in names), *part.glob("*.arrow")]:
             path.unlink(missing_ok=True)
 
 
@@ -76,6 +80,34 @@ def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
         for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
             if file.name[1:].rsplit(".", 2)[0] in names:
                 file.unlink(missing_ok=True)
+
+
+def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:
+    """Return the error to raise where a folder cannot be written to; it says how much of the work is kept.
+
+    Args:
+        folder: The data set's folder.
+        shards: All its shards, written or not.
+        error: What the system said.
+    """
+    num_there = sum(path.is_file() for path in shards)
+    remedy = "Make room" if error.errno in FULL_DISK else "Make sure that it can be written to"
+    return StorageError(
+        f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
+        f"whole and were kept. {remedy}; the same command then goes on from there."
+    )
+
+
+def _check_origin(folder: Path) -> None:
+    """Refuse what other commands made: shards of a sample say the same of themselves, with other episodes."""
+    if not (folder / MANIFEST_NAME).is_file():
+        return
+    manifest = read_manifest(folder)
+    if manifest["command"] != COMMAND or "kept" in manifest["config"]:
+        raise DatasetError(
+            f"{folder} belongs to another data set: `{manifest['command']}` made it. "
+            "Give another --out, or --force to delete it."
+        )
 
 
 def _has_failed(shard: Shard) -> bool:

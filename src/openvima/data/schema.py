@@ -8,6 +8,8 @@ and joint paths of imported demonstrations, images where they are redrawn on rea
 
 import pyarrow as pa
 
+from openvima.scene import ACTION_SHAPES
+
 SCHEMA_VERSION = 2  # grows whenever a column changes its name, type or meaning
 VIEWS = ("front", "top")
 CODECS = ("lz4", "zstd")
@@ -90,10 +92,7 @@ COLUMNS = pa.schema(
 # Columns that list arrays of one shape: their dtype and shape.
 ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
     "poses": ("<f8", (7,)),
-    "pose0_position": ("<f4", (2,)),
-    "pose0_rotation": ("<f4", (4,)),
-    "pose1_position": ("<f4", (2,)),
-    "pose1_rotation": ("<f4", (4,)),
+    **{name: ("<f4", (width,)) for name, width in ACTION_SHAPES.items()},
     **{f"{kind}rgb_{view}": ("u1", (*IMAGE_SHAPE, 3)) for kind in ("prompt_", "") for view in VIEWS},
     **{f"{kind}segm_{view}": ("u1", IMAGE_SHAPE) for kind in ("prompt_", "") for view in VIEWS},
 }

@@ -63,9 +63,9 @@ def tensors_of(demo: Demonstration) -> dict[str, Any]:  # Any: tensors, texts an
         "pick_ids": torch.tensor(demo.pick_ids, dtype=torch.int64),
         "place_ids": torch.tensor(demo.place_ids, dtype=torch.int64),
     }
-    for key in ACTION_SHAPES:
+    for key, width in ACTION_SHAPES.items():
         rows = np.array([getattr(action, key) for action in demo.actions], np.float32)
-        item[key] = torch.from_numpy(rows.reshape(demo.num_steps, -1))
+        item[key] = torch.from_numpy(rows.reshape(-1, width))
     return item
 
 
@@ -196,11 +196,20 @@ class BatchLoader(Generic[Episode]):
         stream = BatchStream(
             self.source, self.order, first=self._num_done, stop=stop, transform=self.transform
         )
-        # Without a generator it would draw from the global one.
-        options = {"batch_size": None, "collate_fn": _unchanged, "generator": torch.Generator()}
-        for batch in DataLoader(stream, **options, **self._options):
+        for batch in batches_of(stream, **self._options):
             self._num_done += 1
             yield batch
+
+
+def batches_of(stream: BatchStream, **options: Any) -> DataLoader:  # Any: of several kinds
+    """Return what reads the batches of a stream, perhaps ahead.
+
+    Args:
+        stream: The batches; they come as they are, untouched by PyTorch's ways of collating.
+        **options: Of `DataLoader`, such as `num_workers`.
+    """
+    # Without a generator it would draw from the global one.
+    return DataLoader(stream, batch_size=None, collate_fn=_unchanged, generator=torch.Generator(), **options)
 
 
 def _unchanged(batch: Any) -> Any:  # Any: see `Transform`; PyTorch's default would turn tuples into lists

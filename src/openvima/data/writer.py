@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from openvima.data.columns import Scratch
 from openvima.data.encoding import ShardInfo, Skipped, encode
+from openvima.data.manifest import BROKEN_NAME, INDEX_NAME, MANIFEST_NAME
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
 from openvima.files import whole_file
@@ -94,6 +95,6 @@ class _Sink:
 
 def remove_leftovers(folder: Path) -> None:
     """Delete what writers that were killed have left in a folder."""
-    for pattern in (".*.arrow.*.tmp", ".index.parquet.*.tmp", ".dataset.json.*.tmp"):
-        for file in folder.glob(pattern):
+    for name in ("*.arrow", INDEX_NAME, MANIFEST_NAME, BROKEN_NAME):
+        for file in folder.glob(f".{name}.*.tmp"):
             file.unlink(missing_ok=True)

@@ -44,9 +44,6 @@ class Setup:
         """
         from openvima.env.tabletop import TabletopEnv
 
-        options: dict[str, Any] = {}
-        if self.difficulty != "easy":  # a task may have but one, and then no such option
-            options["difficulty"] = self.difficulty
         return TabletopEnv(
             task,
             level=level,
@@ -54,8 +51,14 @@ class Setup:
             assets=self.assets,
             compat=self.compat,
             realtime=realtime,
-            **options,
+            **self.options(),
         )
+
+    def options(self) -> dict[str, Any]:
+        """Return the options of the task."""
+        if self.difficulty == "easy":  # a task may have but one, and then no such option
+            return {}
+        return {"difficulty": self.difficulty}
 
     def record(self) -> dict[str, str | bool]:
         """Return the settings as plain values, without a path."""

@@ -190,9 +190,10 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
     """Rows of a policy, plain or under a control, by level and task, levels one after the other."""
-    policy, _, control = name.partition(CONTROL_MARK)
-    if policy not in results.policy_names():
-        raise UnknownPolicyError(unknown_name("policy", policy, results.policy_names()))
+    known = results.policy_names()
+    policy, _, control = (name, "", "") if name in known else name.rpartition(CONTROL_MARK)  # mine@10:30
+    if policy not in known:
+        raise UnknownPolicyError(unknown_name("policy", policy or name, known))
     of_policy = [row for row in results.rows if row.policy == policy]
     rows = [row for row in of_policy if row.control == control]
     if control and not rows:

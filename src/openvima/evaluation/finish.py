@@ -125,7 +125,7 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
     policy and of the oracle, and as many unsolved ones of trained policies. Where there are neither trained
     policies nor the oracle, of all policies. And the episodes that were chosen by hand, of every policy.
     """
-    sources = config.sources
+    sources, by_hand = config.sources, chosen_episodes(config)
     worth = [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources
     jobs = []
     for source in worth:
@@ -134,14 +134,12 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
             row = next((row for row in levels if row is not None), None)
             if row is not None:
                 seeds = _seeds_to_film(row, config.videos, unsolved=source.kind != "oracle")
-                fingerprint = str(results.policies.get(source.name))
-                jobs += [FilmJob(_single(row, source, seed, config), fingerprint) for seed in seeds]
+                jobs += [_job(config, results, source, row, seed) for seed in seeds]
     for source in sources:
-        for task, level, seed in chosen_episodes(config):
+        for task, level, seed in by_hand:
             row = results.row(source.name, task, level)
             if row is not None:
-                fingerprint = str(results.policies.get(source.name))
-                jobs.append(FilmJob(_single(row, source, seed, config), fingerprint))
+                jobs.append(_job(config, results, source, row, seed))
     return list(dict.fromkeys(jobs))
 
 
@@ -214,8 +212,8 @@ def _seeds_to_film(row: Row, number: int, *, unsolved: bool) -> list[int]:
     return solved + failed
 
 
-def _single(row: Row, source: PolicySource, seed: int, config: EvaluationConfig) -> Batch:
-    return Batch(
+def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> FilmJob:
+    batch = Batch(
         row.policy,
         source.source,
         row.task,
@@ -226,3 +224,4 @@ def _single(row: Row, source: PolicySource, seed: int, config: EvaluationConfig)
         device=config.device,
         precision=config.precision or "",
     )
+    return FilmJob(batch, str(results.policies.get(source.name)))

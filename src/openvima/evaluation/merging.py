@@ -8,8 +8,8 @@ from openvima.catalog.partitions import LEVELS
 from openvima.errors import ConfigError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 
-# Settings that decide which episode a seed stands for.
-_SAME_EPISODES = ("domain", "assets", "compat", "difficulty")
+# Settings that decide which episode a seed stands for, with what holds for files that do not name them.
+_SAME_EPISODES = {"domain": "eval", "assets": "procedural", "compat": False, "difficulty": "easy"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +60,13 @@ def merge(evaluations: Mapping[str, Results]) -> Merged:
 
 
 def _check_same_episodes(evaluations: Mapping[str, Results]) -> None:
-    for key in _SAME_EPISODES:
-        values = {label: results.config.get(key) for label, results in evaluations.items()}
+    for key, usual in _SAME_EPISODES.items():
+        values = {label: results.config.get(key, usual) for label, results in evaluations.items()}
         if len({str(value) for value in values.values()}) > 1:
             listed = ", ".join(f"{value} in {label}" for label, value in values.items())
             raise ConfigError(
                 f"these results cannot stand side by side: {key} is {listed}, so a seed is not the same "
-                f"episode. "
-                "Make one report of each."
+                "episode. Make one report of each."
             )
 
 
@@ -135,7 +134,6 @@ def _versions(found: Sequence[Results]) -> tuple[dict[str, str], tuple[str, ...]
         return versions, ()
     note = (
         f"These evaluations ran with different versions ({', '.join(differing)}); the same seed may then be "
-        f"a "
-        "slightly different episode."
+        "a slightly different episode."
     )
     return versions, (note,)

@@ -6,7 +6,7 @@ take whole batches, so their number changes neither the batches nor the results.
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +16,7 @@ from openvima.catalog.partitions import LEVELS
 from openvima.env.setup import DEFAULT_SETUP, Setup
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES, IN_CONTEXT
+from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -292,3 +293,17 @@ def plan(config: EvaluationConfig) -> list[Batch]:
         for task, level in cells(config)
         for offset in range(0, config.episodes, config.batch)
     ]
+
+
+def rows_of(
+    batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]
+) -> tuple[Row, ...]:
+    """Join the batches of each policy, control, task and level."""
+    joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
+    for batch in batches:
+        cell = (batch.policy, batch.control, batch.task, batch.level)
+        joined.setdefault(cell, []).extend(outcomes[batch])
+    return tuple(
+        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
+        for (policy, control, task, level), played in joined.items()
+    )

@@ -172,6 +172,10 @@ class Results:
             means.append(LevelMean(policy, level, mean, interval, tasks, control))
         return means
 
+    def means(self) -> dict[tuple[str, str, str], LevelMean]:
+        """The same means by policy, control and level; the control is empty for the plain score."""
+        return {(mean.policy, mean.control, mean.level): mean for mean in self.level_means()}
+
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
         content = {
@@ -207,7 +211,7 @@ class Results:
                 )
             rows = tuple(_row_from_record(record) for record in content["rows"])
             return Results(rows, content["config"], content["versions"], content["policies"])
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
             raise DatasetError(f"{path} is damaged ({error!r}); evaluate again with --force.") from error
 
 

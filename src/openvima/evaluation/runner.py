@@ -14,12 +14,11 @@ from openvima.evaluation.boxes import finder_maker
 from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.finish import chosen_episodes, finish, require_extra
 from openvima.evaluation.players import load_player, one_thread
-from openvima.evaluation.protocol import Batch, EvaluationConfig, plan
-from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results, Row
+from openvima.evaluation.protocol import Batch, EvaluationConfig, plan, rows_of
+from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.versions import versions
 from openvima.files import write_whole
 from openvima.processes import in_processes
-from openvima.tasks.registry import task_spec
 
 Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
@@ -70,7 +69,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         load_assets(config.setup.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         outcomes = _play_all(config, batches, policies, found, report)
-        results = Results(_rows(batches, outcomes), config.record(), found, policies)
+        results = Results(rows_of(batches, outcomes), config.record(), found, policies)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)
         shutil.rmtree(config.out / _PARTS, ignore_errors=True)
@@ -157,18 +156,6 @@ def _kept(job: Job, folder: Path) -> tuple[EpisodeOutcome, ...] | None:
     except (OSError, ValueError, TypeError):
         return None
     return outcomes if [outcome.seed for outcome in outcomes] == list(job.batch.seeds) else None
-
-
-def _rows(batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]) -> tuple[Row, ...]:
-    """Join the batches of each policy, control, task and level."""
-    joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
-    for batch in batches:
-        cell = (batch.policy, batch.control, batch.task, batch.level)
-        joined.setdefault(cell, []).extend(outcomes[batch])
-    return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
-        for (policy, control, task, level), played in joined.items()
-    )
 
 
 def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> None:

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 
 from openvima.evaluation.players import PolicyPlayer, load_player
-from openvima.evaluation.protocol import DEFAULT_EPISODES, EvaluationConfig, plan
-from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.protocol import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
+from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
-from openvima.tasks.registry import task_spec
 
 
 def score(
@@ -53,19 +52,15 @@ def score(
         controls=controls,
         report=False,
     )
-    outcomes: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
-    for batch in plan(config):
+    batches = plan(config)
+    outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
+    for batch in batches:
         envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
         player = load_player(batch) if given is None else PolicyPlayer(given, batch.control)
-        cell = (batch.policy, batch.control, batch.task, batch.level)
-        outcomes.setdefault(cell, []).extend(play(envs, batch.seeds, player))
-    rows = tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
-        for (policy, control, task, level), played in outcomes.items()
-    )
+        outcomes[batch] = tuple(play(envs, batch.seeds, player))
     kinds = {
         source.name: {"kind": "object"} if source.name in policies else source.record()
         for source in config.sources
     }
-    return Results(rows, config.record(), versions(with_torch=True), kinds)
+    return Results(rows_of(batches, outcomes), config.record(), versions(with_torch=True), kinds)

@@ -92,7 +92,7 @@ def weights_hash(source: str | Path) -> str:
         raise UnknownPolicyError(unknown_name("policy", str(source), known, hint))
     found = find_checkpoint(source)
     files = [found] if found.is_file() else sorted(found.iterdir())
-    files = [file for file in files if file.suffix in _WEIGHTS]
+    files = [file for file in files if file.suffix in _WEIGHTS and file.stem != "optimizer"]
     if not files:
         raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
     digest = hashlib.sha256()

@@ -5,11 +5,11 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
-from openvima.errors import MissingExtraError, ShapeError
+from openvima.errors import ShapeError
+from openvima.films import import_av, open_film
 
 FRAMES_PER_SECOND = 30
 _QUALITY = "21"  # x264's constant rate factor: textures stay clear, a film of 5 s takes about 100 kB
@@ -41,15 +41,11 @@ class VideoWriter:
     ) -> None:
         if width % 2 or height % 2:
             raise ShapeError(f"a film of {width} × {height} pixels cannot be encoded; both must be even.")
-        av = _av()
+        import_av()  # before a folder is made
         path.parent.mkdir(parents=True, exist_ok=True)
         self._path, self._partial = path, path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._shape = (height, width, 3)
-        options = {"movflags": "+faststart", "fflags": "+bitexact"}
-        self._container: Any = av.open(  # Any: PyAV is optional
-            str(self._partial), "w", format="mp4", options=options
-        )
-        self._stream: Any = self._container.add_stream("libx264", rate=frames_per_second)
+        self._container, self._stream = open_film(self._partial, frames_per_second)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         # x264's macroblock tree gave other bytes in about 1 of 200 equal runs, in one thread as well
         options = {"crf": _QUALITY, "preset": "medium", "threads": "1", "x264-params": "mbtree=0"}
@@ -70,7 +66,7 @@ class VideoWriter:
                 f"picture is {picture.shape} {picture.dtype}; the film takes {self._shape} uint8."
             )
         for _ in range(times):
-            frame = _av().VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame = import_av().VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
@@ -123,11 +119,3 @@ def write_video(
         for picture in pictures:
             film.write(picture)
     return path
-
-
-def _av() -> Any:  # Any: PyAV is optional and loaded only where a film is made
-    try:
-        import av
-    except ImportError as error:
-        raise MissingExtraError("films need PyAV; install it with: pip install 'openvima[report]'") from error
-    return av

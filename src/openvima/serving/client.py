@@ -69,7 +69,7 @@ class RemotePolicy(Policy):
 
     def record(self) -> dict[str, Any]:  # Any: plain values
         """What the policy is, for results: all that the server says about it, apart from its limits."""
-        return {key: value for key, value in self.metadata.items() if key != "limits"}
+        return _without_limits(self.metadata)
 
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         """Begin a batch of episodes.
@@ -78,16 +78,17 @@ class RemotePolicy(Policy):
             PolicyError: The batch is larger than the server allows.
             ServerError: The server is lost, or refuses; or there is another policy at its address now.
         """
+        self._num_episodes, self.near_ties = 0, []
+        connection = self._connected()
         most = self._limit("episodes")
         if most is not None and len(prompts) > most:
             raise PolicyError(
                 f"{self.url} takes at most {most} episodes at once, got {len(prompts)}; lower --batch, or "
                 "serve with a higher --max-episodes."
             )
-        self._num_episodes, self.near_ties = 0, []
         sent = [encode_prompt(prompt) for prompt in prompts]
         request = self._packed({"type": "reset", "protocol": PROTOCOL, "prompts": sent}, "prompts")
-        self._connected().ask(request, "reset")
+        connection.ask(request, "reset")
         self._num_episodes = len(prompts)
 
     def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
@@ -127,10 +128,12 @@ class RemotePolicy(Policy):
         """Return the connection, or a new one to the same policy."""
         assert self._connection is not None
         if not self._connection.is_open:
+            before = self.record()
             self._connection = Connection(self.url, self._token, self._timeout_s)
-            if self._connection.metadata != self.metadata:
+            if _without_limits(self._connection.metadata) != before:
                 self._connection.close()
                 raise ServerError(f"{self.url} serves another policy than before; begin a new evaluation.")
+            self.metadata = self._connection.metadata  # its limits may be new
         return self._connection
 
     def _packed(self, message: Mapping[str, Any], what: str) -> bytes:
@@ -147,6 +150,10 @@ class RemotePolicy(Policy):
         limits = self.metadata.get("limits")
         most = limits.get(name) if isinstance(limits, dict) else None
         return most if isinstance(most, int) else None
+
+
+def _without_limits(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in metadata.items() if key != "limits"}
 
 
 def describe(url: str) -> dict[str, Any]:  # Any: plain values

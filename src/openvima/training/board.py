@@ -13,20 +13,23 @@ class Board:
 
     Args:
         run: The run folder.
+        first: Step, counted through all stages, from which on a resumed run tells what it told before.
         wanted: False writes nothing either.
     """
 
-    def __init__(self, run: Path, *, wanted: bool) -> None:
+    def __init__(self, run: Path, first: int, *, wanted: bool) -> None:
+        self._run, self._first = run, first
+        self._wanted = wanted and find_spec("tensorboard") is not None
         self._writer: Any = None  # Any: an optional package
-        if wanted and find_spec("tensorboard") is not None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._writer = SummaryWriter(str(run / BOARD_FOLDER))
 
     def add(self, prefix: str, values: Mapping[str, Any], step: int) -> None:
         """Write named numbers at a step, counted through all stages."""
-        if self._writer is None:
+        if not self._wanted:
             return
+        if self._writer is None:  # a finished run that is started again gets no empty file
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(self._run / BOARD_FOLDER), purge_step=self._first)
         for name, value in values.items():
             if isinstance(value, int | float):
                 self._writer.add_scalar(f"{prefix}/{name}", value, step)

@@ -1,15 +1,21 @@
 """Everything that decides a training run, as a frozen record that checks itself."""
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args, get_type_hints
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
 
 MATCHING_STEPS = 400  # of presets with an appearance embedding
-PRECISIONS = ("float32", "bfloat16")
-SHARDINGS = ("ddp", "fsdp")
+# What values of a type may be, and how that is called.
+_TYPES = {
+    int: (Integral, "a whole number"),
+    float: (Real, "a number"),
+    bool: (bool, "true or false"),
+    str: (str, "text"),
+}
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {
@@ -22,7 +28,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "warmup_steps": (0, None),
     "decay_steps": (1, None),
     "weight_decay": (0, None),
-    "clip_norm": (0, None),
+    "clip_norm": (1e-6, None),
     "spurious_probability": (0, 1),
     "motion_share": (0, 1),
     "pretraining_steps": (0, None),
@@ -58,7 +64,7 @@ class TrainingConfig:
         init: Weights to begin with: those of another run, or whatever else `load_policy` takes; None begins
             anew.
         steps: Steps of behaviour cloning.
-        epochs: Passes over the demonstrations, instead of `steps`.
+        epochs: Passes over the demonstrations, instead of `steps`; None takes those.
         batch: Demonstrations a step, of all processes together; at most as many as there are.
         accumulate: Parts in which each process takes its share of a batch, one after the other, to save
             memory.
@@ -88,13 +94,14 @@ class TrainingConfig:
         seed: Decides weights, order and augmentation.
         validation_share: Share of the demonstrations that only serve to choose the best checkpoint.
         validation_episodes: At most so many of them.
-        checkpoint_every: Steps between checkpoints, each with a validation.
+        checkpoint_every: Steps between checkpoints, each with a validation; those to be kept or played come
+            on top.
         keep_every: Steps between checkpoints that are kept; None keeps the latest and the best only.
         rollout_every: Steps between trials in the simulator; None leaves them out.
         rollout_episodes: Episodes of each task of a trial.
         device: "auto" takes a GPU where there is one; or "cpu", "cuda".
         precision: "float32", or "bfloat16" for products of matrices, with weights in float32.
-        compile: Compile the network with torch.compile: slow to start, then faster on a GPU.
+        compile: Compile the layers of the network with torch.compile: slow to start, then faster on a GPU.
         sharding: With several processes "ddp" keeps the network whole in each, "fsdp" divides it.
         loader_workers: Processes that read batches ahead.
         threads: Threads to compute with; equal numbers give equal weights. The nano network gains a fifth
@@ -150,16 +157,37 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         problems = []
-        if self.preset not in PRESETS and ":" not in self.preset:
+        if isinstance(self.preset, str) and self.preset not in PRESETS and ":" not in self.preset:
             hint = "`openvima policies` lists all."
             problems.append(unknown_name("preset", self.preset, PRESETS, hint))
-        for name, allowed in (("precision", PRECISIONS), ("sharding", SHARDINGS)):
-            if getattr(self, name) not in allowed:
-                problems.append(unknown_name(name, getattr(self, name), allowed))
-        for name, (low, high) in _BOUNDS.items():
-            value = getattr(self, name)
-            if value is not None and not (low <= value and (high is None or value <= high)):
-                allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"
-                problems.append(f"{name} is {value:g}; it must be {allowed}.")
+        for name, hint in get_type_hints(type(self)).items():
+            if problem := _problem(name, getattr(self, name), get_args(hint) or (hint,)):
+                problems.append(problem)
         if problems:
             raise ConfigError(" ".join(problems))
+
+
+def _problem(name: str, value: Any, kinds: tuple[Any, ...]) -> str | None:  # Any: words, or types
+    """Say why a setting cannot be so, if it cannot.
+
+    Args:
+        name: Of the setting.
+        value: Given for it, perhaps by a file, so that it may be anything.
+        kinds: The words from which to choose, or the types that it may have.
+    """
+    if isinstance(kinds[0], str):
+        return None if value in kinds else unknown_name(name, value, kinds)
+    if kinds[0] not in _TYPES or (value is None and type(None) in kinds):
+        return None
+    kind, called = _TYPES[kinds[0]]
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        return f"{name} is {value!r}; it must be {called}."
+    return _out_of_range(name, value) if name in _BOUNDS else None
+
+
+def _out_of_range(name: str, value: Any) -> str | None:  # Any: a number
+    low, high = _BOUNDS[name]
+    if low <= value and (high is None or value <= high):
+        return None
+    allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"
+    return f"{name} is {value:g}; it must be {allowed}."

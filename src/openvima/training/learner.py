@@ -197,11 +197,14 @@ def make_learner(name: str) -> Learner:
     """
     module, _, function = name.partition(":")
     try:
-        learner = getattr(importlib.import_module(module), function)()
+        make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"preset is {name!r}; it must name a function as module:function ({error})."
         ) from None
+    if not callable(make):
+        raise ConfigError(f"preset is {name!r}, which is a {type(make).__name__}; it must be a function.")
+    learner = make()
     if not isinstance(learner, Learner):
         raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
     return learner

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,13 @@ from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
 from openvima.training.inverse_dynamics import MOTION_TEXT
 from openvima.training.learner import Learner, PolicyLearner
-from openvima.training.parallel import Parallel, joined, set_whole_state, whole_state
+from openvima.training.parallel import (
+    Parallel,
+    compile_layers,
+    joined,
+    set_whole_state,
+    whole_state,
+)
 from openvima.training.pretrain import render_pairs
 from openvima.training.provenance import provenance
 from openvima.training.run_folder import (
@@ -33,7 +40,7 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.source import check_words, split_examples
+from openvima.training.source import ExampleSource, check_words, split_examples
 from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops
 
 Report = Callable[[int, int, str], None]
@@ -119,7 +126,6 @@ class _Trainer:
     ) -> None:
         self.config, self.dataset, self.learner, self.run = config, dataset, learner, run
         self.parallel, self.report, self.rollout = parallel, report, rollout
-        self.board = Board(run.path, wanted=config.tensorboard and parallel.is_first)
         self.started = time.monotonic()
         self._last = (0, self.started)  # step and time of the last line of metrics
         self.progress = run.resume(learner)
@@ -132,10 +138,11 @@ class _Trainer:
         if config.pretraining_steps:
             self.stages.insert(0, (config.pretraining_steps, self._matching))
         self.num_steps = sum(steps for steps, _ in self.stages)
+        self.board = Board(run.path, self._done() + 1, wanted=config.tensorboard and parallel.is_first)
         if parallel.is_first:
-            run.forget_after(self.progress)
-            here = {"stage": self.progress.stage, "step": self.progress.step}
-            run.append(SESSIONS_FILE, {**here, "processes": parallel.num_ranks, **provenance(dataset)})
+            run.go_back_to(self.progress)
+            origin = {"processes": parallel.num_ranks, **provenance(dataset)}
+            run.append(SESSIONS_FILE, {**self._here(), **origin})
 
     def train(self) -> None:
         """Run what is left of the stages."""
@@ -154,15 +161,24 @@ class _Trainer:
         if self.progress.step:
             self._load_optimizer(optimizer)
         window: list[Metrics] = []
+        self._last = (self.progress.step, time.monotonic())
         for step in range(self.progress.step, num_steps):
             window.append(self._step(stage, optimizer, step, num_steps))
             self.progress = replace(self.progress, step=step + 1)
-            saves = (step + 1) % self.config.checkpoint_every == 0 or step + 1 == num_steps
+            saves = self._saves_at(step + 1) or step + 1 == num_steps
             if saves or (step + 1) % LOG_EVERY == 0:
                 self._log(stage, self.parallel.mean(_mean(window)))
                 window = []
             if saves:
                 self._save(stage, optimizer)
+
+    def _saves_at(self, step: int) -> bool:
+        """Whether a checkpoint is due, be it to go on from, to keep, or to play."""
+        config = self.config
+        return any(
+            every and step % every == 0
+            for every in (config.checkpoint_every, config.keep_every, config.rollout_every)
+        )
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
         config = self.config
@@ -181,11 +197,9 @@ class _Trainer:
         device, rank = self.parallel.device, self.parallel.rank
         purpose = f"dropout of {stage.name}" + (f" in process {rank}" if rank else "")
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(
-                step_seed(config.seed, purpose, step)
-            )  # dropout draws from the global generator
+            torch.manual_seed(step_seed(config.seed, purpose, step))  # from it dropout draws
             metrics = stage.backward(step)
-        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))
+        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))  # of all processes
         if not math.isfinite(norm):
             raise ConfigError(
                 f"the gradient is {norm} at step {step} of {stage.name}, with learning_rate {rate:g} and "
@@ -196,12 +210,10 @@ class _Trainer:
         return {**metrics, "gradient_norm": norm}
 
     def _log(self, stage: Stage, metrics: Metrics) -> None:
-        here = {"stage": self.progress.stage, "step": self.progress.step}
+        self._note(stage, metrics)
         if self.parallel.is_first:
-            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
             seconds = round(time.monotonic() - self.started, 2)
-            self.run.append(TIMINGS_FILE, {**here, "seconds_since_start": seconds})
-            self.board.add(stage.name, metrics, self.progress.step)
+            self.run.append(TIMINGS_FILE, {**self._here(), "seconds_since_start": seconds})
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
@@ -234,9 +246,8 @@ class _Trainer:
 
     def _note(self, stage: Stage, metrics: Metrics) -> None:
         if metrics and self.parallel.is_first:
-            here = {"stage": self.progress.stage, "step": self.progress.step}
-            self.run.append(METRICS_FILE, {**here, "name": stage.name, **metrics})
-            self.board.add(stage.name, metrics, self.progress.step)
+            self.run.append(METRICS_FILE, {**self._here(), "name": stage.name, **metrics})
+            self.board.add(stage.name, metrics, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
         if self.parallel.is_sharded:
@@ -255,23 +266,28 @@ class _Trainer:
         values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
         optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
 
+    @cached_property
     def _tokens(self) -> TokenCache:
-        """Open the token cache; the first process makes it if need be."""
+        """The token cache; the first process makes it if need be."""
         kind, folder = self.learner.token_kind, self.config.tokens
-        if self.parallel.is_first:
-            open_tokens(self.dataset, kind, folder=folder, report=self._say)
+        if not self.parallel.is_first:
+            self.parallel.wait()
+            return TokenCache(self.dataset, kind, folder)
+        tokens = open_tokens(self.dataset, kind, folder=folder, report=self._say)
         self.parallel.wait()
-        return TokenCache(self.dataset, kind, folder)
+        return tokens
 
     def _steps_of_epochs(self, epochs: float) -> int:
         """Steps of so many passes over what is left to learn from when some is kept for validation."""
-        training, _ = self._split(self._tokens())
+        training, _ = self._examples
         return max(1, round(epochs * len(training) / min(self.config.batch, len(training))))
 
-    def _split(self, tokens: TokenCache):  # two `ExampleSource`
+    @cached_property
+    def _examples(self) -> tuple[ExampleSource, ExampleSource]:
+        """What to learn from, and what is held out."""
         config = self.config
         return split_examples(
-            tokens,
+            self._tokens,
             validation_share=config.validation_share,
             validation_episodes=config.validation_episodes,
         )
@@ -290,25 +306,31 @@ class _Trainer:
 
     def _cloning(self) -> Stage:
         self._report(f"reading {len(self.dataset)} demonstrations")
-        tokens, config = self._tokens(), self.config
+        tokens, config = self._tokens, self.config
         if isinstance(self.learner, PolicyLearner):
             check_words(tokens, self.learner.reader)
             if config.motion_share:
                 self.learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
             if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
                 freeze_crops(self.learner, tokens)
-        self.module = self.parallel.wrap(self.learner)
         if config.compile:
-            self.module.compile(dynamic=True)
-        return Cloning(self.learner, self.module, config, *self._split(tokens), self.parallel)
+            compile_layers(self.learner)
+        self.module = self.parallel.wrap(self.learner)
+        return Cloning(self.learner, self.module, config, *self._examples, self.parallel)
 
     def _say(self, done: int, total: int, note: str) -> None:
         self._report(f"{note or 'cutting out objects'}, {done} of {total}")
 
     def _report(self, note: str) -> None:
         if self.parallel.is_first:
-            before = sum(steps for steps, _ in self.stages[: self.progress.stage])
-            self.report(before + self.progress.step, self.num_steps, note)
+            self.report(self._done(), self.num_steps, note)
+
+    def _here(self) -> dict[str, int]:
+        return {"stage": self.progress.stage, "step": self.progress.step}
+
+    def _done(self) -> int:
+        """Steps that are done, counted through all stages."""
+        return sum(steps for steps, _ in self.stages[: self.progress.stage]) + self.progress.step
 
 
 def _optimizer(learner: Learner, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:

@@ -5,6 +5,7 @@ whole network in every process (DDP); sharded, each keeps a part of weights, gra
 """
 
 import contextlib
+import datetime
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from openvima.errors import ConfigError
 
 Sharding = Literal["ddp", "fsdp"]
 ENTRANCES = ("keys_values",)  # methods besides `forward` by which layers are called
+# How long processes wait for the first one, which makes the token cache and plays trials.
+PATIENCE = datetime.timedelta(days=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +120,21 @@ def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
     if num_ranks == 1:
         yield Parallel(0, 1, chosen, sharding)
         return
-    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=PATIENCE)
     try:
         yield Parallel(rank, num_ranks, chosen, sharding)
         dist.barrier()  # else gloo aborts where one process ends earlier than another
     finally:
         dist.destroy_process_group()
+
+
+def compile_layers(module: nn.Module) -> None:
+    """Compile the layers of all stacks with torch.compile; those that are alike are compiled once.
+
+    What lies between them is called once a step, and would take many times as long to compile.
+    """
+    for layer in _layers(module):
+        layer.compile(dynamic=True)
 
 
 def whole_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -165,12 +177,15 @@ def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
     mesh = init_device_mesh(device.type, (dist.get_world_size(),))
-    for part in module.modules():
-        if isinstance(part, nn.ModuleList):
-            for layer in part:
-                if any(True for _ in layer.parameters()):
-                    fully_shard(layer, mesh=mesh)
-                    for method in ENTRANCES:
-                        if hasattr(layer, method):
-                            register_fsdp_forward_method(layer, method)
+    for layer in _layers(module):
+        fully_shard(layer, mesh=mesh)
+        for method in ENTRANCES:
+            if hasattr(layer, method):
+                register_fsdp_forward_method(layer, method)
     return fully_shard(module, mesh=mesh)
+
+
+def _layers(module: nn.Module) -> list[nn.Module]:
+    """The members of all stacks that are more than a few matrices."""
+    stacks = [part for part in module.modules() if isinstance(part, nn.ModuleList)]
+    return [layer for stack in stacks for layer in stack if not isinstance(layer, nn.Linear | nn.Sequential)]

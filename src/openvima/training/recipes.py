@@ -1,10 +1,9 @@
 """Named settings: as the paper trains, for one workstation, and for a processor alone."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import yaml
 
@@ -99,11 +98,28 @@ def read_settings(file: Path) -> dict[str, Any]:
         values = values["training"]
     if not isinstance(values, dict):
         raise ConfigError(f"{file} must hold settings, one `name: value` a line.")
-    known = {field.name: field for field in fields(TrainingConfig)}
+    known = get_type_hints(TrainingConfig)
     problems = [
         unknown_name(f"setting in {file} called", name, known) for name in values if name not in known
     ]
     if problems:
         raise ConfigError(" ".join(problems))
-    paths = {"data", "out", "tokens"}
-    return {name: Path(value) if name in paths and value else value for name, value in values.items()}
+    return {
+        name: _converted(value, get_args(known[name]) or (known[name],)) for name, value in values.items()
+    }
+
+
+def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Put other settings over some; steps among them replace the epochs of a recipe."""
+    length = {"epochs": None} if "steps" in others else {}
+    return {**settings, **length, **others}
+
+
+def _converted(value: Any, kinds: tuple[Any, ...]) -> Any:  # Any: what YAML holds, and types
+    """Make paths and numbers of texts; YAML takes 1e-4, without a point, for a text."""
+    if not isinstance(value, str) or not {Path, float} & set(kinds):
+        return value
+    try:
+        return Path(value) if Path in kinds else float(value)
+    except ValueError:  # the settings will say what it must be
+        return value

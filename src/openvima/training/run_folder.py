@@ -142,8 +142,7 @@ class RunFolder:
         final = self.checkpoints / name
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
-        if progress.best_checkpoint:
-            write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
+        self._note_best(progress)
         for other in self.checkpoints.iterdir():
             is_used = other.name in (name, progress.best_checkpoint) or self._is_kept(other.name)
             if other.is_dir() and not is_used:
@@ -184,8 +183,9 @@ class RunFolder:
         with (self.path / file).open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(values) + "\n")
 
-    def forget_after(self, progress: Progress) -> None:
-        """Drop the metrics of steps that come after a checkpoint, since they are going to be repeated."""
+    def go_back_to(self, progress: Progress) -> None:
+        """Make the folder what it was at a checkpoint: without metrics of later steps, which come again."""
+        self._note_best(progress)  # the run may have been killed before it could
         file = self.path / METRICS_FILE
         if not file.is_file():
             return
@@ -198,6 +198,10 @@ class RunFolder:
             if (values["stage"], values["step"]) <= (progress.stage, progress.step):
                 kept.append(line + "\n")
         write_whole(file, "".join(kept))
+
+    def _note_best(self, progress: Progress) -> None:
+        if progress.best_checkpoint:
+            write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
 
     def _differences(self, settings: dict[str, Any]) -> list[str]:
         file = self.path / CONFIG_FILE

@@ -10,7 +10,7 @@ import numpy as np
 from openvima.data.batching import BatchOrder
 from openvima.data.tokens.cache import TokenCache
 from openvima.data.tokens.episode import pieces_of
-from openvima.errors import DatasetError
+from openvima.errors import ConfigError, DatasetError
 from openvima.policies.inputs import Reader
 from openvima.training.dataset import Example
 from openvima.training.learner import Collate
@@ -127,7 +127,16 @@ def check_words(cache: TokenCache, reader: Reader) -> None:
 def order_of(
     source: ExampleSource, *, batch: int, seed: int, bucket: int, rank: int, num_ranks: int
 ) -> BatchOrder:
-    """Return which demonstrations each step takes; a batch is never larger than there are."""
+    """Return which demonstrations each step takes; a batch is never larger than there are.
+
+    Raises:
+        ConfigError: The processes cannot share the demonstrations, or a batch of them, equally.
+    """
+    if len(source) < num_ranks:
+        raise ConfigError(
+            f"there are {len(source)} demonstrations to learn from and {num_ranks} processes; start fewer of "
+            "these, or generate more."
+        )
     batch = min(batch, len(source) // num_ranks * num_ranks)
     return BatchOrder(
         len(source),

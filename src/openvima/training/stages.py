@@ -8,10 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from torch import nn
-from torch.utils.data import DataLoader
 
 from openvima.data.tokens.cache import TokenCache
-from openvima.data.torch_dataset import BatchStream
+from openvima.data.torch_dataset import BatchStream, batches_of
 from openvima.errors import ConfigError
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
@@ -171,14 +170,7 @@ class Cloning:
         count = min(config.accumulate, ours) if self._parallel.is_sharded else None
         parts = Parts(self._learner.collator(), config.seed, largest, count)
         stream = BatchStream(self._training, self._order, first=step, transform=parts)
-        loader = DataLoader(
-            stream,
-            batch_size=None,
-            num_workers=min(config.loader_workers, _num_processors()),
-            collate_fn=_unchanged,
-            generator=torch.Generator(),  # else it draws from the one that dropout draws from
-        )
-        return iter(loader)
+        return iter(batches_of(stream, num_workers=min(config.loader_workers, _num_processors())))
 
     def _call(
         self, batch: Any, module: nn.Module
@@ -232,7 +224,3 @@ def _num_processors() -> int:
 def _add(sums: Metrics, values: dict[str, torch.Tensor], share: float) -> None:
     for name, value in values.items():
         sums[name] = sums.get(name, 0.0) + value.item() * share
-
-
-def _unchanged(batch: Any) -> Any:  # Any: see `BatchStream`; PyTorch's default would turn tuples into lists
-    return batch

@@ -309,6 +309,15 @@ def test_an_export_is_replaced_only_by_force(tmp_path: Path, export: Path) -> No
     assert json.loads((export / "meta/info.json").read_text())["fps"] == 2
 
 
+def test_force_replaces_nothing_but_exports(tmp_path: Path, export: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "letter.txt").write_text("dear")
+    with pytest.raises(DatasetError, match="holds other things than an export"):
+        export_lerobot(LerobotConfig(tmp_path / "demos", home, force=True))
+    assert (home / "letter.txt").read_text() == "dear"
+
+
 def test_a_damaged_shard_leaves_no_export(tmp_path: Path, export: Path) -> None:
     shard = next((tmp_path / "demos").glob("*.arrow"))
     content = bytearray(shard.read_bytes())

@@ -1,5 +1,6 @@
 """The token cache: the same tokens as cutting anew, made once, and never trusted when damaged or old."""
 
+import os
 import pickle
 import shutil
 from dataclasses import fields
@@ -147,3 +148,23 @@ def test_a_prompt_is_split_into_texts_and_images() -> None:
     assert pieces_of(text) == ("Put", 0, "into", 1, ", then", 0, "back.")
     assert pieces_of("{x}") == (0,)
     assert pieces_of("only words") == ("only words",)
+
+
+def test_tokens_are_not_made_of_damaged_demonstrations(copy: Path) -> None:
+    shard = copy / "rotate-train-00001.arrow"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(ShardError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
+        open_tokens(Dataset(copy))
+    with pytest.raises(DatasetError, match="lacks tokens"):
+        TokenCache(Dataset(copy))
+
+
+def test_makers_of_the_same_tokens_leave_each_other_alone(copy: Path) -> None:
+    folder = copy / "tokens" / "objects-v1"
+    folder.mkdir(parents=True)
+    writing = folder / f".rotate-train-00000.arrow.{os.getppid()}.tmp"
+    writing.touch()
+    open_tokens(Dataset(copy))
+    assert writing.exists()

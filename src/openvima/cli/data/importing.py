@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from openvima.cli.progress import progress_bar
+from openvima.cli.words import words_in
 
 
 def import_published(
@@ -41,14 +42,14 @@ def import_published(
     Returns:
         Exit status.
     """
+    from openvima.data.manifest import BROKEN_NAME
     from openvima.data.published import ImportConfig
     from openvima.data.published import import_published as convert
-    from openvima.data.published.importing import BROKEN_NAME
 
     config = ImportConfig(
         source=source,
         out=out,
-        tasks=tuple(name.strip() for name in tasks.split(",") if name.strip()),
+        tasks=words_in(tasks),
         part=part,
         episodes=episodes,
         compression=compression,
@@ -58,14 +59,11 @@ def import_published(
     with progress_bar("episodes") as report:
         folder = convert(config, report)
     if (folder / BROKEN_NAME).is_file():
-        entries = json.loads((folder / BROKEN_NAME).read_text(encoding="utf-8"))
+        first, *others = json.loads((folder / BROKEN_NAME).read_text(encoding="utf-8"))
         print(
-            f"{len(entries)} left out, see {folder / BROKEN_NAME}; first {_shown(entries[0])}",
+            f"{1 + len(others)} left out, see {folder / BROKEN_NAME}; "
+            f"first {first['member']}: {first['reason']}",
             file=sys.stderr,
         )
     print(folder)
     return 0
-
-
-def _shown(entry: dict[str, str]) -> str:
-    return f"{entry['member']}: {entry['reason']}"

@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 import tyro
 
 from openvima.cli.progress import progress_bar
+from openvima.cli.words import tasks_in
 
 
 def export_lerobot(
-    folder: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
     *,
     tasks: str = "all",
     fps: int = 1,
@@ -33,15 +34,17 @@ def export_lerobot(
             play, at half the resolution of colours.
         data_file_mb: Size in MB below which the Parquet files stay.
         video_file_mb: Size in MB below which the videos stay.
-        force: Replace what is at OUT.
+        force: Replace the export that is in OUT.
+
+    Returns:
+        Exit status.
     """
     from openvima.data.lerobot import LerobotConfig, export_lerobot
 
-    names = tuple(name.strip() for name in tasks.split(",") if name.strip())
     config = LerobotConfig(
         data=folder,
         out=out,
-        tasks=None if names == ("all",) else names,
+        tasks=tasks_in(tasks),
         fps=fps,
         pixels=pixels,
         data_file_mb=data_file_mb,

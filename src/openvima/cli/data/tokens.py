@@ -10,7 +10,7 @@ from openvima.cli.progress import progress_bar
 
 
 def tokens(
-    folder: Annotated[Path, tyro.conf.Positional],
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
     kind: Literal["objects", "frames"] = "objects",
     out: Path | None = None,
@@ -25,10 +25,13 @@ def tokens(
     Example: openvima data tokens demos --workers 2
 
     Args:
-        folder: Folder that `openvima generate` wrote.
+        folder: Folder of demonstrations.
         kind: objects for all presets that see objects, frames for gato, flamingo and gpt.
         out: Folder to keep it in; by default "tokens" in the folder of demonstrations.
         workers: Number of processes.
+
+    Returns:
+        Exit status.
     """
     from openvima.data.reader import Dataset
     from openvima.data.tokens.cache import open_tokens

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def verify(
-    folder: Annotated[Path, tyro.conf.Positional],
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
     replay: str = "1",
     repair: bool = False,
@@ -38,6 +38,9 @@ def verify(
         seed: Another one replays other episodes.
         assets: Folder of the original benchmark's assets, for data made with them.
         as_json: Print the result for machines.
+
+    Returns:
+        Exit status.
     """
     from openvima.data.verification import VerifyConfig
     from openvima.data.verification import repair as make_whole
@@ -86,13 +89,17 @@ def _deeds(done: "Repair") -> Iterator[str]:
 def _findings(found: "Verification") -> Iterator[str]:
     yield (
         f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
-        f"hashes, {found.num_replayed:,} played again"
+        f"hashes, {found.num_replayed:,} played again{_tokens(found)}"
     )
     yield from (f"note: {note}" for note in found.notes)
     yield _number_of_problems(found)
     for problem in found.problems:
         yield f"  {problem.file}: {problem.cause}"
     yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
+
+
+def _tokens(found: "Verification") -> str:
+    return f", {found.num_token_files:,} files of tokens compared" if found.num_token_files else ""
 
 
 def _number_of_problems(found: "Verification") -> str:

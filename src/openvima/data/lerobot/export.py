@@ -11,11 +11,12 @@ import pyarrow.parquet as pq
 from openvima import __version__
 from openvima.data.lerobot import layout
 from openvima.data.lerobot.features import FrameLayout
-from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat, import_av
+from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
-from openvima.data.reader import Dataset, Shard
+from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.files import whole_folder
+from openvima.films import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
 
@@ -36,7 +37,7 @@ class LerobotConfig:
             play, at half the resolution of colours.
         data_file_mb: Limit of the Parquet files.
         video_file_mb: Limit of the videos.
-        force: Replace what is at `out`.
+        force: Replace the export that is at `out`.
 
     Raises:
         ConfigError: A value is not allowed, or `out` holds `data`.
@@ -116,8 +117,8 @@ def survey(dataset: Dataset) -> FrameLayout:
         DatasetError: An episode has no steps, so no frames either.
     """
     num_images, has_joints = 0, True
-    for name in dataset.index.column("shard").unique().to_pylist():
-        table = Shard(dataset.path / name).table(["prompt_images", "joint_paths", "steps"])
+    for name in dataset.shard_names():
+        table = dataset.shard(name).table(["prompt_images", "joint_paths", "steps"])
         if not table["steps"].to_numpy().all():
             raise DatasetError(f"{dataset.path / name} holds an episode without steps; LeRobot takes none.")
         num_images = max(num_images, *_lengths(table["prompt_images"].combine_chunks()))
@@ -140,6 +141,8 @@ def _check_out(config: LerobotConfig) -> None:
     is_taken = any(out.iterdir()) if out.is_dir() else out.exists()
     if is_taken and not config.force:
         raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
+    if is_taken and not (out / layout.INFO_PATH).is_file():
+        raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
 
 
 def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from openvima.data.lerobot.layout import VIDEO_PATH, FileNumber
 from openvima.data.schema import IMAGE_SHAPE
-from openvima.errors import MissingExtraError
+from openvima.films import import_av, open_film
 
 PixelFormat = Literal["yuv444p", "yuv420p"]
 PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
@@ -116,9 +116,7 @@ class NumberedVideo:
         self._number = self._number.next() if self._number else FileNumber()
         self._num_frames = self._num_bytes = 0
         path = self._number.path(self._folder, VIDEO_PATH, video_key=self._key)
-        options = {"movflags": "+faststart", "fflags": "+bitexact"}
-        self._container = self._av.open(str(path), "w", format="mp4", options=options)
-        self._stream = self._container.add_stream("libx264", rate=self._fps)
+        self._container, self._stream = open_film(path, self._fps)
         self._stream.height, self._stream.width = IMAGE_SHAPE
         self._stream.pix_fmt = self._pixels
         # Without look-ahead a frame's bytes come at once, which the limit on files needs. The faster preset
@@ -136,17 +134,3 @@ class NumberedVideo:
             self._largest_frame = max(self._largest_frame, packet.size + _BYTES_PER_FRAME)
             self._num_bytes += packet.size + _BYTES_PER_FRAME
         self._container.mux(packets)
-
-
-def import_av() -> Any:  # Any: PyAV is optional and loaded only where it is needed
-    """Import PyAV.
-
-    Raises:
-        MissingExtraError: It is not installed.
-    """
-    try:
-        import av
-    except ImportError as error:
-        message = "films need PyAV; install it with: pip install 'openvima[report]'"
-        raise MissingExtraError(message) from error
-    return av

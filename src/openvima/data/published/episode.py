@@ -3,19 +3,16 @@
 import contextlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from openvima import __version__
 from openvima.data.published.layout import PICKLES, frame_number
 from openvima.data.published.names import checked_object
 from openvima.data.published.picks import picked_ids
 from openvima.data.published.unpickling import as_array, as_plain, kind_of, read_pickle
-from openvima.data.records import Demonstration
+from openvima.data.records import Demonstration, versions_of
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
 from openvima.errors import MemberError, PromptError
 from openvima.scene import (
@@ -30,9 +27,9 @@ from openvima.scene import (
 )
 from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from openvima.tasks import task_spec
+from openvima.tasks.seeding import MAX_SEED
 
 DOMAIN, LEVEL, ASSETS = "published", "train", "original"
-_MAX_SEED = 2**63 - 1
 _KINDS = ("object", "scene")
 
 Fields = dict[str, Any]  # Any: what a pickle holds
@@ -63,7 +60,7 @@ def demonstration_of(files: Mapping[str, bytes], *, task: str, folder: str) -> D
         end_effector = _end_effector(trajectory, observations, num_images)
         objects = _objects(trajectory)
         prompt = _prompt(trajectory)
-        seed = _whole_number(trajectory, "seed", _MAX_SEED)
+        seed = _whole_number(trajectory, "seed", MAX_SEED)
         _check_summary(trajectory, len(steps))
     return Demonstration(
         task=task,
@@ -90,12 +87,7 @@ def demonstration_of(files: Mapping[str, bytes], *, task: str, folder: str) -> D
 
 def package_versions() -> dict[str, str]:
     """Return the versions of all packages that decide the bytes of an imported episode."""
-    return dict(_versions())
-
-
-@lru_cache(maxsize=1)
-def _versions() -> dict[str, str]:
-    return {"openvima": __version__, **{name: version(name) for name in ("numpy", "pillow", "pyarrow")}}
+    return dict(versions_of("numpy", "pillow", "pyarrow"))
 
 
 @contextlib.contextmanager

@@ -25,14 +25,23 @@ class EpisodeFolders:
         self.path = path
         if not path.is_dir():
             raise DatasetError(f"there is no folder {path}.")
+        self._episodes: dict[str, str] | None = None
 
-    def episodes(self) -> dict[str, str]:
-        """Return the folders of all episodes, such as "vima_v6/rotate/000123", and their paths."""
+    def episodes(self) -> Mapping[str, str]:
+        """Return the folders of all episodes, such as "vima_v6/rotate/000123", and their paths.
+
+        The disk is searched once; what comes later is not seen.
+        """
+        if self._episodes is None:
+            self._episodes = self._found()
+        return self._episodes
+
+    def _found(self) -> dict[str, str]:
         found = {}
-        for folder in _task_folders(self.path, MAX_DEPTH):
+        for folder, names in _task_folders(self.path, MAX_DEPTH):
             # For a task's own folder the name of the task is not part of the relative path.
             shown = folder.relative_to(self.path).as_posix() if folder != self.path else folder.resolve().name
-            for name in _numbered(folder):
+            for name in names:
                 found[f"{shown}/{name}"] = str(folder / name)
         return found
 
@@ -77,10 +86,10 @@ def _files(episode: Path) -> list[str]:
     return sorted(filter(is_episode_file, names))
 
 
-def _task_folders(folder: Path, depth: int) -> Iterator[Path]:
-    """Folders that hold numbered ones, in the order of their names."""
-    if _numbered(folder):
-        yield folder
+def _task_folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
+    """Folders that hold numbered ones, in the order of their names, and the names of those."""
+    if names := _numbered(folder):
+        yield folder, names
     elif depth > 0:
         for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
             if entry.is_dir() and not entry.name.startswith("."):

@@ -1,6 +1,5 @@
 """Converting the published data set to shards, the same bytes whatever the number of workers."""
 
-import errno
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, finish_folder
+from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
 from openvima.data.published.reader import (
     Broken,
@@ -20,18 +19,16 @@ from openvima.data.published.reader import (
     read_place,
 )
 from openvima.data.reader import Shard
-from openvima.data.writer import ShardWriter
-from openvima.errors import ConfigError, DatasetError, StorageError
+from openvima.data.resuming import FULL_DISK, clear, is_finished, storage_error
+from openvima.data.writer import ShardWriter, remove_leftovers
+from openvima.errors import ConfigError, DatasetError
 from openvima.files import write_whole
-from openvima.processes import Counts, in_watched_processes
+from openvima.processes import MAX_WORKERS, Counts, in_watched_processes
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
-BROKEN_NAME = "broken.json"
 SHARD_SIZE = 1000  # episodes read; broken ones leave their shard smaller
-MAX_WORKERS = 1024
 _NUM_PROBES = 3  # episodes of each task
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Report = Callable[[int, int, str], None]
 
@@ -119,7 +116,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
     _probe(blocks)
     config.out.mkdir(parents=True, exist_ok=True)
     if config.force:
-        _clear(config.out)
+        clear(config.out)
     _check_folder(config.out, blocks)
     broken = {block.path: _broken_in(block) for block in blocks}
     missing = [block for block in blocks if broken[block.path] is None]
@@ -132,16 +129,12 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         ):
             broken[block.path] = found
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in FULL_DISK:
             raise
-        num_there = sum(block.path.is_file() for block in blocks)
-        raise StorageError(
-            f"cannot write to {config.out}: {error.strerror}. {num_there} of {len(blocks)} shards are whole "
-            "and were kept. Make room; the same command then goes on from there."
-        ) from error
+        raise storage_error(config.out, [block.path for block in blocks], error) from error
     finally:
-        _remove_leftovers(config.out)
-    if not all((config.out / name).is_file() for name in (INDEX_NAME, MANIFEST_NAME)):
+        remove_leftovers(config.out)
+    if not is_finished(config.out):
         _finish(config, data, blocks, [entry for block in blocks for entry in broken[block.path] or ()])
     return config.out
 
@@ -165,8 +158,8 @@ def plan(config: ImportConfig, data: PublishedData) -> list[Block]:
                 compat=True,
                 compression=config.compression,
             )
-            path = config.out / f"{task}-{LEVEL}-{number:05d}.arrow"
-            blocks.append(Block(path, info, data.path, places[start : start + config.shard_size]))
+            chunk = places[start : start + config.shard_size]
+            blocks.append(Block(config.out / info.file_name, info, data.path, chunk))
     return blocks
 
 
@@ -223,14 +216,14 @@ def _broken_in(block: Block) -> list[Broken] | None:
     """
     if not block.path.is_file():
         return None
-    present = Shard(block.path).table(["reason"]).column(0).to_pylist()
-    others = set(present) - {place.folder for place in block.places}
+    present = set(Shard(block.path).table(["reason"]).column(0).to_pylist())
+    others = present - {place.folder for place in block.places}
     if others:
         raise DatasetError(
             f"{block.path} holds episodes that were not asked for, such as {min(others)}. "
             "Give its settings, another folder, or --force to delete it."
         )
-    missing = [place for place in block.places if place.folder not in set(present)]
+    missing = [place for place in block.places if place.folder not in present]
     found = list(_read(block.source, missing))
     return found if all(isinstance(entry, Broken) for entry in found) else None
 
@@ -255,19 +248,20 @@ def _check_folder(folder: Path, blocks: Sequence[Block]) -> None:
 
 
 def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], broken: list[Broken]) -> None:
+    info = blocks[0].info  # but for task and number, the same of all
     settings = {
         "tasks": sorted({block.info.task for block in blocks}),
         "part": config.part,
-        "level": LEVEL,
-        "domain": DOMAIN,
+        "level": info.level,
+        "domain": info.domain,
         "episodes": config.episodes,
-        "shard_size": config.shard_size,
-        "compression": config.compression,
-        "assets": ASSETS,
-        "compat": True,
-        "difficulty": "easy",
+        "shard_size": info.shard_size,
+        "compression": info.compression,
+        "assets": info.assets,
+        "compat": info.compat,
+        "difficulty": info.difficulty,
         "source": {
-            "digest": blocks[0].info.versions["vima"],
+            "digest": info.versions["vima"],
             "episodes": sum(len(block.places) for block in blocks),
             "broken": len(broken),
             "unknown_folders": [entry.member for entry in data.broken_folders],
@@ -283,23 +277,9 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
         [block.path for block in blocks],
         command=COMMAND,
         config=settings,
-        versions=blocks[0].info.versions,
+        versions=info.versions,
         licence=LICENCE,
     )
-
-
-def _clear(folder: Path) -> None:
-    for path in [
-        *(folder / name for name in (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)),
-        *folder.glob("*.arrow"),
-    ]:
-        path.unlink(missing_ok=True)
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Delete what writers that were killed have left."""
-    for file in folder.glob(".*.tmp"):
-        file.unlink(missing_ok=True)
 
 
 def _watch(

@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME, TOKENS_FOLDER
+from openvima.errors import DatasetError
 
-from openvima.data.manifest import MANIFEST_NAME
-from openvima.data.reader import Dataset
-from openvima.errors import DatasetError, unknown_name
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, TOKENS_FOLDER)
 
 
 def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
@@ -39,23 +38,6 @@ def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
         raise DatasetError(f"{out} holds other things than data sets, so --force does not replace it.")
 
 
-def of_tasks(dataset: Dataset, tasks: Sequence[str] | None) -> np.ndarray:
-    """Return whether each episode is of one of some tasks, shape (N,), bool; None means all.
-
-    Raises:
-        DatasetError: The data set has no episode of a task.
-    """
-    present = np.array(dataset.index.column("task").to_pylist(), dtype=str)
-    if tasks is None:
-        return np.ones(len(present), bool)
-    for task in tasks:
-        if task not in dataset.manifest["tasks"]:
-            raise DatasetError(
-                unknown_name(f"task in {dataset.path} called", task, dataset.manifest["tasks"])
-            )
-    return np.isin(present, tasks)
-
-
 def provenance(manifest: Mapping[str, Any]) -> dict[str, Any]:  # Any: JSON
     """Return what identifies a source, wherever it lies: its content, and the settings that made it."""
     return {key: manifest[key] for key in ("content_hash", "command", "config", "versions")}
@@ -77,6 +59,9 @@ def _joined(words: Sequence[str | None], between: str) -> str:
 
 
 def _holds_data_sets_only(folder: Path) -> bool:
+    """Whether a folder is a data set, or holds some, and nothing besides."""
     if (folder / MANIFEST_NAME).is_file():
-        return True
-    return all((entry / MANIFEST_NAME).is_file() for entry in folder.iterdir())
+        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in folder.iterdir())
+    return all(
+        (entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in folder.iterdir()
+    )

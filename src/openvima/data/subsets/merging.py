@@ -12,11 +12,10 @@ import pyarrow as pa
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset
-from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, of_tasks, provenance
-from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shard
+from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, provenance
+from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shards
 from openvima.errors import DatasetError, unknown_name
 from openvima.files import whole_folder
-from openvima.processes import in_processes
 
 Duplicates = Literal["refuse", "skip"]
 Report = Callable[[int, int, str], None]
@@ -95,10 +94,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
     manifests = [dataset.manifest for dataset in datasets]
     with whole_folder(config.out) as folder:
         shards = _plan(parts, folder, config.compression)
-        total = sum(len(part.episodes) for part in parts)
-        count = None if report is None else (lambda done: report(done, total, ""))
-        for _ in in_processes(write_shard, shards, config.workers, report=count):
-            pass  # a shard's result is its file
+        write_shards(shards, config.workers, report)
         finish_folder(
             folder,
             [shard.path for shard in shards],
@@ -118,7 +114,7 @@ def _parts(datasets: Sequence[Dataset], tasks: Sequence[str] | None) -> list[_Pa
 
 def _parts_of(dataset: Dataset, tasks: Sequence[str] | None) -> list[_Part]:
     present = [task for task in dataset.manifest["tasks"] if tasks is None or task in tasks]
-    wanted = of_tasks(dataset, present)
+    wanted = np.isin(dataset.index.column("task").to_pylist(), present)
     names, shard_of = np.unique(dataset.index.column("shard").to_pylist(), return_inverse=True)
     seeds = dataset.index.column("seed").to_numpy()
     parts = []
@@ -195,7 +191,7 @@ def _plan(parts: Sequence[_Part], folder: Path, compression: str | None) -> list
     for part in parts:
         entry, info = part.dataset.manifest["shards"][part.name], part.info
         if len(part.episodes) == entry["episodes"] and compression in (None, info.compression):
-            path = names.path(info, names.next_number(info))
+            path, _ = names.numbered(info)
             shards.append(
                 CopiedShard(path, part.dataset.path / part.name, entry["sha256"], entry["episodes"])
             )
@@ -206,7 +202,9 @@ def _plan(parts: Sequence[_Part], folder: Path, compression: str | None) -> list
 
 
 def _check_tasks(datasets: Sequence[Dataset], tasks: Sequence[str]) -> None:
-    present = {task for dataset in datasets for task in dataset.manifest["tasks"]}
+    present = sorted({task for dataset in datasets for task in dataset.manifest["tasks"]})
+    if not tasks:
+        raise DatasetError(f"no task is named; the sources have {', '.join(present)}.")
     for task in tasks:
         if task not in present:
-            raise DatasetError(unknown_name("task in the sources called", task, sorted(present)))
+            raise DatasetError(unknown_name("task in the sources called", task, present))

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from openvima.data.manifest import finish_folder
-from openvima.data.reader import Dataset
+from openvima.data.reader import Dataset, of_tasks
 from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
-from openvima.data.subsets.folders import check_out, of_tasks, provenance
-from openvima.data.subsets.shards import NewShard, plan_shards, write_shard
+from openvima.data.subsets.folders import check_out, provenance
+from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
 from openvima.files import whole_folder
-from openvima.processes import in_processes
 
 Report = Callable[[int, int, str], None]
 
@@ -73,7 +72,9 @@ def sample(config: SubsetConfig, share: float, *, report: Report | None = None) 
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
-    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(dataset, config.tasks)
+    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(
+        dataset.index, config.tasks, dataset.path
+    )
     settings = {**config.settings(dataset), "share": share}
     with whole_folder(config.out) as folder:
         _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
@@ -100,7 +101,7 @@ def split(config: SubsetConfig, parts: Parts, *, report: Report | None = None) -
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
-    wanted = of_tasks(dataset, config.tasks)
+    wanted = of_tasks(dataset.index, config.tasks, dataset.path)
     chosen = {name: mask & wanted for name, mask in chosen_parts(dataset.index, parts, config.seed).items()}
     empty = [name for name, mask in chosen.items() if not mask.any()]
     if empty:
@@ -135,10 +136,7 @@ def _write(subsets: Sequence[_Subset], dataset: Dataset, config: SubsetConfig, r
         episodes = np.flatnonzero(subset.mask).tolist()
         plans.append(plan_shards(dataset, episodes, subset.folder, config.compression))
     shards = [shard for plan in plans for shard in plan]
-    total = sum(len(shard.episodes) for shard in shards)
-    count = None if report is None else (lambda done: report(done, total, ""))
-    for _ in in_processes(write_shard, shards, config.workers, report=count):
-        pass  # a shard's result is its file
+    write_shards(shards, config.workers, report)
     for subset, plan in zip(subsets, plans, strict=True):
         finish_folder(
             subset.folder,

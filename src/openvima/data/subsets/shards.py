@@ -1,18 +1,18 @@
 """Writing the shards of a data set that is made of others."""
 
-import hashlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import fingerprint
+from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset
 from openvima.data.writer import ShardWriter
 from openvima.errors import DatasetError, ShardError
-
-LARGEST_SHARD = 1000  # episodes, as where data are generated
+from openvima.processes import in_processes
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,11 @@ class NewShard:
     source: Path
     checksum: str
     episodes: tuple[int, ...]
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of rows."""
+        return len(self.episodes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +77,25 @@ def write_shard(shard: NewShard | CopiedShard, count: Callable[[int], None]) -> 
             count(number)
 
 
+def write_shards(
+    shards: Sequence[NewShard | CopiedShard], num_workers: int, report: Callable[[int, int, str], None] | None
+) -> None:
+    """Write shards in several processes.
+
+    Args:
+        shards: What to write.
+        num_workers: Number of processes.
+        report: Called with episodes done, episodes in all, and a note.
+
+    Raises:
+        ShardError: What is read is damaged.
+    """
+    total = sum(shard.num_episodes for shard in shards)
+    count = None if report is None else (lambda done: report(done, total, ""))
+    for _ in in_processes(write_shard, shards, num_workers, report=count):
+        pass  # a shard's result is its file
+
+
 def plan_shards(
     dataset: Dataset, episodes: Sequence[int], folder: Path, compression: str | None
 ) -> list[NewShard]:
@@ -83,12 +107,16 @@ def plan_shards(
         folder: Where the shards shall lie.
         compression: Codec; None keeps that of each source shard.
     """
-    groups: dict[tuple[str, str, bytes], tuple[ShardInfo, list[int]]] = {}
-    for episode_index, info in zip(episodes, _infos(dataset, episodes), strict=True):
-        common = replace(
-            info, number=0, shard_size=0, first_seed=0, compression=compression or info.compression
-        )
-        key = (info.task, info.level, common.to_metadata()[b"openvima"])
+    commons: dict[str, tuple[tuple[str | bytes, ...], ShardInfo]] = {}  # of each source shard
+    groups: dict[tuple[str | bytes, ...], tuple[ShardInfo, list[int]]] = {}
+    for episode_index in episodes:
+        name, _ = dataset.locate(episode_index)
+        if name not in commons:
+            info = dataset.shard(name).info
+            codec = compression or info.compression
+            common = replace(info, number=0, shard_size=0, first_seed=0, compression=codec)
+            commons[name] = (info.task, info.level, *common.to_metadata().values()), common
+        key, common = commons[name]
         groups.setdefault(key, (common, []))[1].append(episode_index)
     names = ShardNames(folder)
     return [
@@ -105,41 +133,26 @@ class ShardNames:
         self._folder = folder
         self._numbers: dict[tuple[str, str], int] = {}
 
-    def next_number(self, info: ShardInfo) -> int:
-        """Count one more shard of a task and level, and return its number."""
+    def numbered(self, info: ShardInfo) -> tuple[Path, ShardInfo]:
+        """Give a shard the next number of its task and level, and its place."""
         number = self._numbers.get((info.task, info.level), 0)
         self._numbers[info.task, info.level] = number + 1
-        return number
-
-    def path(self, info: ShardInfo, number: int) -> Path:
-        """Return where a shard goes."""
-        return self._folder / f"{info.task}-{info.level}-{number:05d}.arrow"
+        info = replace(info, number=number)
+        return self._folder / info.file_name, info
 
     def new_shard(self, info: ShardInfo, dataset: Dataset, episodes: Sequence[int]) -> NewShard:
         """Plan the next shard of a task and level."""
-        info = replace(info, number=self.next_number(info))
-        return NewShard(
-            self.path(info, info.number), info, dataset.path, dataset.manifest["checksum"], tuple(episodes)
-        )
-
-
-def _infos(dataset: Dataset, episodes: Sequence[int]) -> Iterator[ShardInfo]:
-    infos: dict[str, ShardInfo] = {}
-    for episode_index in episodes:
-        name, _ = dataset.locate(episode_index)
-        if name not in infos:
-            infos[name] = dataset.shard(name).info
-        yield infos[name]
+        path, info = self.numbered(info)
+        return NewShard(path, info, dataset.path, dataset.manifest["checksum"], tuple(episodes))
 
 
 def _copy(shard: CopiedShard) -> None:
     shutil.copyfile(shard.original, shard.path)
-    with open(shard.path, "rb") as file:
-        if hashlib.file_digest(file, "sha256").hexdigest() != shard.sha256:
-            raise ShardError(
-                f"{shard.original} is damaged: its checksum is not that of the manifest. "
-                f"`openvima data verify {shard.original.parent}` says more."
-            )
+    if fingerprint(shard.path)["sha256"] != shard.sha256:
+        raise ShardError(
+            f"{shard.original} is damaged: its checksum is not that of the manifest. "
+            f"`openvima data verify {shard.original.parent}` says more."
+        )
 
 
 @lru_cache(maxsize=2)

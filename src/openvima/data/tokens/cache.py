@@ -1,5 +1,6 @@
 """The token cache of a data set: a derived folder, made when it is first needed and safe to delete."""
 
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +9,14 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.manifest import joint_hash
+from openvima.data.checksums import Frame, spans_of
+from openvima.data.manifest import TOKENS_FOLDER, joint_hash
 from openvima.data.reader import Dataset, Shard
 from openvima.data.tokens.episode import KINDS, TokenEpisode, TokenKind, tokens_of
 from openvima.data.tokens.token_file import TOKENS_VERSION, TokenFile, write_tokens
-from openvima.data.writer import remove_leftovers
 from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.files import remove_abandoned
 from openvima.processes import in_processes
-
-CACHE_FOLDER = "tokens"
 
 Report = Callable[[int, int, str], None]
 
@@ -44,13 +44,14 @@ class TokenCache(Sequence[TokenEpisode]):
     def __init__(self, dataset: Dataset, kind: TokenKind = "objects", folder: Path | None = None) -> None:
         self.dataset, self.kind, self._root = dataset, kind, folder
         self.folder = _cache_folder(dataset, kind, folder)
-        missing = [source.name for source in sources(dataset) if not _is_made(self.folder, source, kind)]
+        found = {source.name: _made(self.folder, source, kind) for source in sources(dataset)}
+        missing = [name for name, file in found.items() if file is None]
         if missing:
             raise DatasetError(
                 f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
-                f"`openvima data tokens {dataset.path} --kind {kind}` makes them."
+                f"`openvima data tokens {shlex.quote(str(dataset.path))} --kind {kind}` makes them."
             )
-        self._files: dict[str, TokenFile] = {}
+        self._files = {name: file for name, file in found.items() if file is not None}
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -63,7 +64,7 @@ class TokenCache(Sequence[TokenEpisode]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         name, row = self.dataset.locate(index)
-        return self._file(name)[row]
+        return self._files[name][row]
 
     def __iter__(self) -> Iterator[TokenEpisode]:
         return (self[index] for index in range(len(self)))
@@ -81,39 +82,37 @@ class TokenCache(Sequence[TokenEpisode]):
 
     def texts(self) -> set[str]:
         """Return the different prompts, with their placeholders."""
-        return {text for name in self.dataset.shard_names() for text in self._file(name).texts()}
+        return {text for file in self._files.values() for text in file.texts()}
 
     def _gathered(self, column: Callable[[TokenFile], np.ndarray], width: int) -> np.ndarray:
         """Read a column of numbers of all files, and put it into the order of the episodes."""
-        of_file = {name: column(self._file(name)) for name in self.dataset.shard_names()}
+        of_file = {name: column(file) for name, file in self._files.items()}
         places = [self.dataset.locate(index) for index in range(len(self))]
         return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, width)
 
-    def _file(self, name: str) -> TokenFile:
-        if name not in self._files:
-            self._files[name] = TokenFile(self.folder / name)
-        return self._files[name]
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Source:
     """One shard of demonstrations.
 
     Args:
         name: Of the shard, and of its file of tokens.
         content_hash: Of its episodes together.
+        index: Its part of the index.
     """
 
     name: str
     content_hash: str
+    index: pa.Table
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Work:
     shard: Path
+    frame: Frame
+    source: Source
     path: Path
     kind: TokenKind
-    source: str
 
 
 def open_tokens(
@@ -139,9 +138,15 @@ def open_tokens(
     """
     target = _cache_folder(dataset, kind, folder)
     work = [
-        _Work(dataset.path / source.name, target / source.name, kind, source.content_hash)
+        _Work(
+            dataset.path / source.name,
+            Frame.from_entry(dataset.manifest["shards"][source.name]),
+            source,
+            target / source.name,
+            kind,
+        )
         for source in sources(dataset)
-        if not _is_made(target, source, kind)
+        if _made(target, source, kind) is None
     ]
     if work:
         try:
@@ -150,59 +155,53 @@ def open_tokens(
             raise DatasetError(
                 f"cannot keep tokens in {target}: {error.strerror}. Name another folder."
             ) from None
-        remove_leftovers(target)
-        sizes = {item.shard.name: len(Shard(item.shard)) for item in work}
-        total = sum(sizes.values())
-        work.sort(key=lambda item: -sizes[item.shard.name])
+        remove_abandoned(target)
+        total = sum(item.source.index.num_rows for item in work)
+        work.sort(key=lambda item: -item.source.index.num_rows)
 
         def say(done: int) -> None:
             if report is not None:
                 report(done, total, "")
 
-        try:
-            for _ in in_processes(_write, work, workers, report=say):
-                pass  # the result of a job is its file
-        finally:
-            remove_leftovers(target)
+        for _ in in_processes(_write, work, workers, report=say):
+            pass  # the result of a job is its file
     return TokenCache(dataset, kind, folder)
 
 
 def sources(dataset: Dataset) -> list[Source]:
-    """List the shards of a data set, each with the hash of all its episodes."""
+    """List the shards that hold episodes of a data set, each with all that it holds."""
     whole = dataset if dataset.tasks is None else Dataset(dataset.path)
     shards = whole.index.column("shard").combine_chunks().dictionary_encode()
-    hashes = whole.index.column("content_hash").combine_chunks()
-    starts = np.flatnonzero(
-        np.diff(shards.indices.to_numpy(), prepend=-1)
-    )  # episodes of a shard follow each other
+    # Episodes of a shard follow each other.
+    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
     wanted, found = set(dataset.shard_names()), []
     for start, end in zip(starts, [*starts[1:], whole.index.num_rows], strict=True):
         name = shards[start].as_py()
         if name in wanted:
-            found.append(Source(name, joint_hash(pa.chunked_array([hashes.slice(start, end - start)]))))
+            part = whole.index.slice(start, end - start)
+            found.append(Source(name, joint_hash(part.column("content_hash")), part))
     return found
 
 
 def _cache_folder(dataset: Dataset, kind: TokenKind, folder: Path | None) -> Path:
     if kind not in KINDS:
         raise DatasetError(unknown_name("kind of tokens", kind, KINDS))
-    return (folder or dataset.path / CACHE_FOLDER) / f"{kind}-v{TOKENS_VERSION}"
+    return (folder or dataset.path / TOKENS_FOLDER) / f"{kind}-v{TOKENS_VERSION}"
 
 
-def _is_made(folder: Path, source: Source, kind: TokenKind) -> bool:
-    path = folder / source.name
-    if not path.is_file():
-        return False
+def _made(folder: Path, source: Source, kind: TokenKind) -> TokenFile | None:
+    """Open the tokens of a shard; None if they are missing, damaged, or of another version or content."""
     try:
-        file = TokenFile(path)
-    except ShardError:  # damaged, or of another version: made anew
-        return False
-    return file.source == source.content_hash and file.kind == kind
+        file = TokenFile(folder / source.name)
+    except ShardError:
+        return None
+    return file if file.source == source.content_hash and file.kind == kind else None
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
-    shard, episodes = Shard(work.shard), []
-    for row in range(len(shard)):
+    shard, episodes = Shard(work.shard, work.frame), []
+    for row, span in enumerate(spans_of(work.source.index)):
+        shard.check(row, span)
         episodes.append(tokens_of(shard[row], work.kind))
         count(row + 1)
-    write_tokens(work.path, episodes, work.kind, work.source)
+    write_tokens(work.path, episodes, work.kind, work.source.content_hash)

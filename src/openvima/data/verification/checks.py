@@ -3,8 +3,14 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ShardSummary, compose, joint_hash
-from openvima.data.planning import FAILED_FOLDER
+from openvima.data.manifest import (
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    ShardSummary,
+    compose,
+    joint_hash,
+)
 from openvima.data.verification.findings import Problem, Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
@@ -44,8 +50,8 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
     results = dict(_checked(tasks, config, report))
     found = [results[task.path.name] for task in tasks]
     replayed = replay(inventory, results, config, report)
-    own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems]
-    own += check_tokens(folder, _joint_hashes(found), config.workers, report)
+    tokens = check_tokens(folder, _joint_hashes(found), config.workers, report)
+    own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems, *tokens.problems]
     place = "" if folder == root else f"{folder.relative_to(root)}/"
     problems = [Problem(place + problem.file, problem.cause, problem.remedy) for problem in own]
     problems += [problem for findings in found for problem in findings.problems]
@@ -56,6 +62,7 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
         num_shards=len(tasks),
         num_episodes=sum(findings.num_episodes for findings in found),
         num_replayed=replayed.num_episodes,
+        num_token_files=tokens.num_files,
         damaged=tuple(place + task.path.name for task in tasks if results[task.path.name].is_damaged),
     )
 

@@ -14,9 +14,9 @@ from openvima.scene import (
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
 )
+from openvima.tasks.oracle import TIED_TO_TABLE
 
 PUBLISHED = "published"  # domain of demonstrations that were not made here
-TIED_TO_TABLE = -1
 _UNIT_TOLERANCE = 1e-3  # float32 quaternions of published data are off by up to 1e-7
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError
+from openvima.processes import check_workers
 
 Report = Callable[[int, int, str], None]
 
-MAX_WORKERS = 1024
 _SHOWN_ROWS = 8  # of those that a problem concerns
 
 
@@ -35,8 +35,7 @@ class VerifyConfig:
     def __post_init__(self) -> None:
         if self.replay is not None and self.replay < 0:
             raise ConfigError(f"replay is {self.replay}; it must be 0 or more, or all.")
-        if not 1 <= self.workers <= MAX_WORKERS:
-            raise ConfigError(f"workers is {self.workers}; it must lie within 1 … {MAX_WORKERS}.")
+        check_workers(self.workers)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -68,6 +67,7 @@ class Verification:
         num_shards: Shards that were looked at.
         num_episodes: Episodes that were decoded and compared with their content hashes.
         num_replayed: Episodes that were played again.
+        num_token_files: Files of tokens that were compared with what is cut out of the demonstrations now.
         damaged: Names of shards whose bytes are not those that were written, or that are missing.
     """
 
@@ -77,6 +77,7 @@ class Verification:
     num_shards: int = 0
     num_episodes: int = 0
     num_replayed: int = 0
+    num_token_files: int = 0
     damaged: tuple[str, ...] = ()
 
     @property
@@ -93,6 +94,7 @@ class Verification:
             num_shards=self.num_shards + other.num_shards,
             num_episodes=self.num_episodes + other.num_episodes,
             num_replayed=self.num_replayed + other.num_replayed,
+            num_token_files=self.num_token_files + other.num_token_files,
             damaged=self.damaged + other.damaged,
         )
 
@@ -104,6 +106,7 @@ class Verification:
             "shards": self.num_shards,
             "episodes": self.num_episodes,
             "replayed": self.num_replayed,
+            "token_files": self.num_token_files,
             "problems": [asdict(problem) for problem in self.problems],
             "notes": list(self.notes),
         }

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, ORIGIN_TYPES, parse_index, parse_manifest
-from openvima.data.planning import COMMAND, FAILED_FOLDER
+from openvima.data.manifest import (
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    ORIGIN_TYPES,
+    parse_index,
+    parse_manifest,
+)
+from openvima.data.planning import COMMAND
 from openvima.data.reader import remedy, why_no_data_set
 from openvima.data.verification.findings import Problem
 from openvima.errors import DatasetError
@@ -44,7 +51,8 @@ class Inventory:
     @property
     def holds_failed(self) -> bool:
         """Whether it is the part of a data set that holds the episodes which were not solved."""
-        return self.folder.name == FAILED_FOLDER and (self.folder.parent / MANIFEST_NAME).is_file()
+        folder = self.folder.resolve()  # which has a name and a parent, even if "." was given
+        return folder.name == FAILED_FOLDER and (folder.parent / MANIFEST_NAME).is_file()
 
     @property
     def remedy(self) -> str:

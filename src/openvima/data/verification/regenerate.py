@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from openvima.data.generation import finish
-from openvima.data.manifest import fingerprint
-from openvima.data.planning import FAILED_FOLDER, Block, GenerateConfig, plan
+from openvima.data.manifest import FAILED_FOLDER, fingerprint
+from openvima.data.planning import Block, GenerateConfig, plan
 from openvima.data.reader import Shard
 from openvima.data.records import package_versions
 from openvima.data.resuming import is_done

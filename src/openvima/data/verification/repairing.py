@@ -8,10 +8,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from openvima.data.manifest import finish_folder
-from openvima.data.planning import COMMAND, FAILED_FOLDER, GenerateConfig
+from openvima.data.checksums import spans_of
+from openvima.data.manifest import FAILED_FOLDER, TOKENS_FOLDER, finish_folder
+from openvima.data.planning import COMMAND, GenerateConfig
 from openvima.data.reader import Shard
-from openvima.data.tokens.cache import CACHE_FOLDER
 from openvima.data.verification.checks import DEFAULT, verify
 from openvima.data.verification.findings import Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
@@ -23,7 +23,6 @@ from openvima.data.verification.regenerate import (
     settings_in_shards,
 )
 from openvima.data.verification.salvage import Salvaged, salvage
-from openvima.data.verification.shards import spans_of
 from openvima.errors import DatasetError, OpenVimaError
 
 
@@ -87,7 +86,7 @@ def repair(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
 
 
 def _delete_tokens(found: Verification) -> tuple[str, ...]:
-    names = sorted({p.file for p in found.problems if p.file.startswith(f"{CACHE_FOLDER}/")})
+    names = sorted({p.file for p in found.problems if p.file.startswith(f"{TOKENS_FOLDER}/")})
     for name in names:
         (found.folder / name).unlink(missing_ok=True)
     return tuple(names)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.checksums import Span, mapped
+from openvima.data.checksums import MAGIC_BYTES, Span, mapped
 from openvima.data.decoding import decode
 from openvima.data.encoding import ShardInfo
 from openvima.data.reader import ODD_ERRORS, Shard
@@ -19,7 +19,6 @@ from openvima.errors import OpenVimaError, ShardError
 
 _MARK = 0xFFFFFFFF  # begins every message of an Arrow file, at a multiple of 8
 _WORD_BYTES = 4
-_MAGIC_BYTES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,7 @@ def _info(path: Path, content: memoryview) -> ShardInfo | None:
     except ShardError:
         pass
     try:
-        schema = pa.ipc.read_schema(pa.BufferReader(content[_MAGIC_BYTES:]))
+        schema = pa.ipc.read_schema(pa.BufferReader(content[MAGIC_BYTES:]))
         return ShardInfo.from_metadata(schema.metadata)
     except ODD_ERRORS:
         return None

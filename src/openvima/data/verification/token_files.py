@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from openvima.data.manifest import TOKENS_FOLDER
 from openvima.data.reader import Shard
-from openvima.data.tokens.cache import CACHE_FOLDER
 from openvima.data.tokens.episode import TokenEpisode, tokens_of
 from openvima.data.tokens.token_file import TokenFile
 from openvima.data.verification.findings import Problem, Report, by_cause
@@ -32,9 +32,22 @@ class TokenTask:
     shown_as: str
 
 
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """What came of comparing tokens.
+
+    Args:
+        num_files: How many were compared; those that are out of date were not.
+        problems: What is wrong with files of tokens.
+    """
+
+    num_files: int
+    problems: tuple[Problem, ...]
+
+
 def check_tokens(
     folder: Path, content_hashes: dict[str, str], num_workers: int, report: Report | None = None
-) -> list[Problem]:
+) -> Compared:
     """Compare the token cache of a data set with the demonstrations, episode by episode.
 
     Args:
@@ -43,7 +56,7 @@ def check_tokens(
         num_workers: Number of processes.
         report: Called with episodes done, episodes in all, and what is being done.
     """
-    files = sorted((folder / CACHE_FOLDER).glob("*/*.arrow"))
+    files = sorted((folder / TOKENS_FOLDER).glob("*/*.arrow"))
     tasks = [
         TokenTask(path, folder / path.name, content_hashes[path.name], str(path.relative_to(folder)))
         for path in files
@@ -52,13 +65,15 @@ def check_tokens(
     total = sum(len(Shard(task.shard)) for task in tasks)
     watch = None if report is None else (lambda done: report(done, total, "comparing tokens"))
     remedy = "Delete it; `openvima data tokens` makes it anew."
-    problems = []
+    num_files, problems = 0, []
     for task, causes in in_processes(check_token_file, tasks, num_workers, report=watch):
-        problems += [Problem(task.shown_as, cause, remedy) for cause in causes]
-    return problems
+        if causes is not None:
+            num_files += 1
+            problems += [Problem(task.shown_as, cause, remedy) for cause in causes]
+    return Compared(num_files, tuple(problems))
 
 
-def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[str]:
+def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[str] | None:
     """Compare a file of tokens with its shard.
 
     Args:
@@ -66,14 +81,14 @@ def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[
         count: Called with the number of episodes compared so far.
 
     Returns:
-        What is wrong; nothing where the file is out of date, for then it is made anew before it is used.
+        What is wrong; None where the file is out of date, for then it is made anew before it is used.
     """
     try:
         tokens = TokenFile(task.path)
     except ShardError as error:
         return [str(error).removeprefix(f"{task.path} ").split(". ")[0]]
     if tokens.source != task.content_hash:
-        return []
+        return None
     shard = Shard(task.shard)
     if len(tokens) != len(shard):
         return [f"it has {len(tokens)} of {len(shard)} episodes"]

@@ -1,7 +1,9 @@
 """Section of the report on what a score is made of: the same policy with something taken from it."""
 
+from collections.abc import Mapping
+
 from openvima.evaluation.comparison import CONTROL_MARK, Comparison, can_be_compared, compare_pairs
-from openvima.evaluation.report.markup import DOT, folded, section
+from openvima.evaluation.report.markup import folded, policy_head, section
 from openvima.evaluation.report.tables import mean_cell, rate_cell
 from openvima.evaluation.report.wording import (
     LEVEL_NAMES,
@@ -12,7 +14,7 @@ from openvima.evaluation.report.wording import (
     prose,
     series_colours,
 )
-from openvima.evaluation.results import Results
+from openvima.evaluation.results import LevelMean, Results
 
 _BOUNDS = ("oracle", "random")  # kinds of policies between which a score lies
 
@@ -27,13 +29,14 @@ def control_section(results: Results) -> str:
         f"<dt>{prose(control_name(control))}</dt><dd>{prose(control_meaning(control))}</dd>"
         for control in controls
     )
+    means = results.means()
     return section(
         "controls",
         "What the score is made of",
         "The same policy on the same episodes with something taken from it. What it still solves does not "
         "need that. Below each score stand its interval and the change in points; ≈ marks what is inside the "
         "noise.",
-        "".join(_policy(results, policy) for policy in policies)
+        "".join(_policy(results, means, policy) for policy in policies)
         + f'<div class="card"><dl class="levels">{meanings}</dl></div>',
     )
 
@@ -42,7 +45,7 @@ def _controls(results: Results, policy: str) -> list[str]:
     return list(dict.fromkeys(row.control for row in results.rows if row.policy == policy and row.control))
 
 
-def _policy(results: Results, policy: str) -> str:
+def _policy(results: Results, means: Mapping[tuple[str, str, str], LevelMean], policy: str) -> str:
     controls = _controls(results, policy)
     comparisons = _against_plain(results, policy, controls)
     bounds = [
@@ -55,11 +58,10 @@ def _policy(results: Results, policy: str) -> str:
     head = "".join(
         f'<th scope="col">{prose(control_name(control))}</th>'
         if control
-        else f'<th scope="col" style="--series:var({colours[name]})">{DOT}{prose(name)}</th>'
+        else policy_head(name, colours[name])
         for name, control in columns
     )
     head = f'<thead><tr><th scope="col">level</th>{head}</tr></thead>'
-    means = {(mean.policy, mean.control, mean.level): mean for mean in results.level_means()}
     rows, details = "", ""
     for level in results.levels():
         cells = "".join(

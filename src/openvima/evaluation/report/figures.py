@@ -82,12 +82,12 @@ def curve_chart(
     """
     variables = [f"--series-{index + 1}" for index in range(len(curves))]
     figure, axes = _panel(2.5, margins_in=(0.5, 0.45, 0.1, 0.3))
-    for (name, points), variable in zip(curves.items(), variables, strict=True):
+    for (label, points), variable in zip(curves.items(), variables, strict=True):
         steps = [step for step, _ in points]
         values = [100 * value if percent else value for _, value in points]
         marker = "o" if len(points) < 30 else ""
         axes.plot(
-            steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=name
+            steps, values, marker=marker, color=_series(variable), linewidth=1.8, markersize=3.5, label=label
         )
     if percent:
         axes.set_ylim(-2, 102)

@@ -1,8 +1,10 @@
 """The report as one HTML file that needs nothing else: no network, no scripts, no other files."""
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from openvima.evaluation.clips import Clip
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
@@ -14,6 +16,7 @@ from openvima.evaluation.report.elsewhere import published_section
 from openvima.evaluation.report.tables import failure_table, rate_table
 from openvima.evaluation.report.wording import headline, prose
 from openvima.evaluation.results import Results
+from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.files import write_whole
 
 _OPTIONS = {  # settings that a command names where they are not these
@@ -24,6 +27,7 @@ _OPTIONS = {  # settings that a command names where they are not these
     "device": "cpu",
     "precision": "",
 }
+_PLACES = {"run": "RUN", "remote": "ws://HOST:PORT"}
 
 
 def write_report(
@@ -76,22 +80,30 @@ def write_report(
 
 
 def default_command(results: Results) -> str:
-    """Put the command together from the settings; run folders appear under their names only."""
+    """Put the command together from the settings; of run folders and servers only the names are known."""
     config = results.config
-    policies = [
-        f"{name}=RUN" if results.policies.get(name, {}).get("kind") == "run" else name
-        for name in results.policy_names()
-    ]
+    policies = [_policy_word(name, results.policies.get(name, {})) for name in results.policy_names()]
     words = [
         f"openvima evaluate --policy {','.join(policies)} --tasks {','.join(config.get('tasks', ['all']))}",
         f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)}",
         f"--seed {config.get('seed', 0)}",
-        *[f"--{name} {config[name]}" for name, usual in _OPTIONS.items() if config.get(name, usual) != usual],
+        *[
+            f"--{name} {shlex.quote(str(config[name]))}"
+            for name, usual in _OPTIONS.items()
+            if config.get(name, usual) != usual
+        ],
         *(["--compat"] if config.get("compat") else []),
         *([f"--controls {','.join(config['controls'])}"] if config.get("controls") else []),
         "--out DIR",
     ]
     return " ".join(words)
+
+
+def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
+    """Name a policy for `--policy`; where weights lie is not in the results, so that is left to fill in."""
+    kind = what.get("kind")
+    source = what.get("preset") or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
+    return name if name == source else f"{name}={source}"
 
 
 def _page(results: Results, body: str, notes: Sequence[str]) -> str:

@@ -27,11 +27,12 @@ def heading(results: Results, notes: Sequence[str] = ()) -> str:
     """The page's head: the finding, what was measured, and what to beware of."""
     levels, tasks = results.levels(), results.tasks()
     episodes = sorted({row.episodes for row in results.rows})
-    each = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
+    each = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
     measured = (
         f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
-        f"{counted(len(tasks), 'task')}, {counted(len(levels), 'level')}, {each} episodes each; "
-        f"{sum(row.episodes for row in results.rows):,} episodes in all, on seeds that training never uses."
+        f"{counted(len(tasks), 'task')}, {counted(len(levels), 'level')}, {each} each; "
+        f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
+        "never uses."
     )
     return (
         '<header><div><div class="eyebrow">openvima evaluation report</div>'

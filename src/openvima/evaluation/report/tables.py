@@ -1,6 +1,7 @@
 """Tables of the report: success by task, and why episodes were not solved."""
 
 from collections import Counter
+from collections.abc import Mapping
 
 from openvima.evaluation.report.markup import breakable, policy_head, section
 from openvima.evaluation.report.published import BESIDE, published_tasks
@@ -22,14 +23,14 @@ _MOST_CAUSES = 8  # that are shown of a policy
 
 def rate_table(results: Results) -> str:
     """Success of every policy on every task, by level, with 95 % intervals; published numbers beside."""
-    policies, colours = results.policy_names(), series_colours(results)
+    policies, colours, means = results.policy_names(), series_colours(results), results.means()
     is_published = any(
         task in published_tasks(level) for level in results.levels() for task in results.tasks(level)
     )
     head = "".join(policy_head(policy, colours[policy]) for policy in policies)
     if is_published:
         head += f'<th scope="col" class="elsewhere">{" ".join(BESIDE)}<small>published elsewhere</small></th>'
-    bodies = "".join(_level_rows(results, level, is_published) for level in results.levels())
+    bodies = "".join(_level_rows(results, means, level, is_published) for level in results.levels())
     note = (
         '<p class="note">The last column was not measured here: <a href="#published">about it</a>.</p>'
         if is_published
@@ -82,7 +83,9 @@ def mean_cell(mean: LevelMean | None, num_tasks: int) -> str:
     )
 
 
-def _level_rows(results: Results, level: str, is_published: bool) -> str:
+def _level_rows(
+    results: Results, means: Mapping[tuple[str, str, str], LevelMean], level: str, is_published: bool
+) -> str:
     policies, tasks = results.policy_names(), results.tasks(level)
     rows = [
         f'<tr class="level"><th scope="rowgroup">{prose(level)}</th>'
@@ -94,8 +97,7 @@ def _level_rows(results: Results, level: str, is_published: bool) -> str:
         if is_published:
             cells += _elsewhere_cell(elsewhere.get(task))
         rows.append(f'<tr><th scope="row">{prose(breakable(task))}</th>{cells}</tr>')
-    means = {mean.policy: mean for mean in results.level_means() if (mean.level, mean.control) == (level, "")}
-    cells = "".join(mean_cell(means.get(policy), len(tasks)) for policy in policies)
+    cells = "".join(mean_cell(means.get((policy, "", level)), len(tasks)) for policy in policies)
     if is_published:
         known = [elsewhere[task] for task in tasks if task in elsewhere]
         cells += _elsewhere_cell(sum(known) / len(tasks) if len(known) == len(tasks) else None)

@@ -137,7 +137,8 @@ def listed(names: list[str]) -> str:
 
 def headline(results: Results) -> str:
     """The finding in one line: what the trained policy, or else the first one, reaches on its first level."""
-    means = [mean for mean in results.level_means() if not mean.control] or results.level_means()
+    played = results.level_means()
+    means = [mean for mean in played if not mean.control] or played
     trained = [m for m in means if results.policies.get(m.policy, {}).get("kind") in ("run", "remote")]
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
@@ -146,10 +147,10 @@ def headline(results: Results) -> str:
 
 def findings(results: Results) -> str:
     """All level means as one sentence a policy."""
+    means = [mean for mean in results.level_means() if not mean.control]
     sentences = []
     for policy in results.policy_names():
-        means = [m for m in results.level_means() if (m.policy, m.control) == (policy, "")]
-        rates = [f"{per_cent(mean.mean)} on {mean.level}" for mean in means]
+        rates = [f"{per_cent(mean.mean)} on {mean.level}" for mean in means if mean.policy == policy]
         sentences.append(f"{policy}: {', '.join(rates)}")
     return "; ".join(sentences) + "."
 

@@ -49,6 +49,7 @@ class Linear(nn.Linear):
     def _has_few_rows(self, x: torch.Tensor) -> bool:
         return (
             _CAN_PACK
+            and not torch.compiler.is_compiling()  # the compiler packs by itself
             and torch.is_inference_mode_enabled()
             and self.in_features < x.numel() <= _MAX_ROWS * self.in_features
             and self.weight.numel() >= _MIN_WEIGHTS

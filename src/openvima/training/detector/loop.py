@@ -95,7 +95,7 @@ class _Trainer:
         self.optimizer = _optimizer(learner, config)
         if self.progress.step:
             self._load_optimizer()
-        run.forget_after(self.progress)
+        run.go_back_to(self.progress)
         run.append(SESSIONS_FILE, {"step": self.progress.step, **provenance(source.dataset)})
 
     def train(self) -> None:

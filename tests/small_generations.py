@@ -11,8 +11,3 @@ TASKS = ("rotate", "sweep_without_exceeding")
 def config(out: Path, **changes: object) -> GenerateConfig:
     """Three episodes of two tasks, in shards of two."""
     return replace(GenerateConfig(out=out, tasks=TASKS, episodes=3, shard_size=2), **changes)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """All files in a folder and below, by path."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
