@@ -250,6 +250,11 @@ def test_switches_change_nothing_else_and_can_be_undone() -> None:
     assert replace(both, trunk=preset("midas-nano").trunk) == preset("midas-nano")
 
 
+@pytest.mark.parametrize("name", ["nano", "vima-nano"])
+def test_switching_off_what_is_not_on_changes_nothing(name) -> None:
+    assert with_autoregression(preset(name), False) == preset(name)
+
+
 def test_vectors_without_spread_are_refused() -> None:
     with pytest.raises(ConfigError, match="token_std is 0; it must be above 0"):
         AutoregressiveConfig(token_std=0)

@@ -22,10 +22,18 @@ def midas(size: Size) -> PolicyConfig:
 
 
 def with_autoregression(sizes: PolicyConfig, wanted: bool = True) -> PolicyConfig:
-    """Return the same network with each component of an action as a token of its own, or with plain bins."""
-    width = sizes.head.hidden_width
-    head = AutoregressiveConfig(width, token_std=sizes.trunk.initial_std) if wanted else BinsConfig(width)
-    return replace(sizes, head=head)
+    """Return the same network with each component of an action as a token of its own, or with plain bins.
+
+    A head without such tokens stays as it is if they are not wanted.
+    """
+    head = sizes.head
+    if wanted:
+        return replace(sizes, head=AutoregressiveConfig(head.hidden_width, token_std=sizes.trunk.initial_std))
+    return (
+        replace(sizes, head=BinsConfig(head.hidden_width))
+        if isinstance(head, AutoregressiveConfig)
+        else sizes
+    )
 
 
 def with_visual_residual(sizes: PolicyConfig, wanted: bool = True) -> PolicyConfig:
