@@ -72,7 +72,7 @@ def sight(env: TabletopEnv, control: str) -> Sight:
     Args:
         env: The environment; it is left as it is.
         control: One of `CONTROLS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
-            `openvima.evaluation.boxes`.
+            `openvima.detection.hooks`.
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.

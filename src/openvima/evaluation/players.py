@@ -5,9 +5,9 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Protocol
 
+from openvima.detection.hooks import plugged_finder
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
-from openvima.evaluation.boxes import load_finder
 from openvima.evaluation.controls import Sight, sight
 from openvima.evaluation.protocol import Batch
 from openvima.evaluation.sources import ORACLE, RANDOM
@@ -140,7 +140,7 @@ def _load_policy(
 
         options["dtype"] = getattr(torch, precision)
     if boxes:
-        options["finder"] = load_finder(boxes)
+        options["finder"] = plugged_finder(boxes)
     return load_policy(source, **options)
 
 

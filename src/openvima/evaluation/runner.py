@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from openvima.catalog.packs import load_assets
+from openvima.detection.hooks import finder_maker
 from openvima.errors import ConfigError
-from openvima.evaluation.boxes import finder_maker
 from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.finish import chosen_episodes, finish, require_extra
 from openvima.evaluation.players import load_player, one_thread

@@ -2,7 +2,8 @@
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,9 +17,24 @@ from openvima.data.tokens.episode import KINDS, TokenEpisode, TokenKind, tokens_
 from openvima.data.tokens.token_file import TOKENS_VERSION, TokenFile, write_tokens
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.files import remove_abandoned
+from openvima.perception.objects import ObjectFinder
 from openvima.processes import in_processes
 
 Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes:
+    """Where boxes come from, if not from the segmentation.
+
+    Args:
+        name: Stands for all that decides what is found; it becomes part of the name of a folder. Whatever
+            bears the same name is taken to find the same.
+        make: Makes what finds the objects. It is sent to other processes, where it is called once.
+    """
+
+    name: str
+    make: Callable[[], ObjectFinder] = field(compare=False)
 
 
 class TokenCache(Sequence[TokenEpisode]):
@@ -28,8 +44,9 @@ class TokenCache(Sequence[TokenEpisode]):
 
     Args:
         dataset: The demonstrations, perhaps of some tasks only.
-        kind: "objects" for crops of the segmented objects, "frames" for whole frames at half the size.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
         folder: Where the files are; None means `tokens/` in the folder of the demonstrations.
+        boxes: Name of what found the objects, as in `Boxes`; empty for the segmentation.
 
     Raises:
         DatasetError: There is no such kind, or files are missing or older than the demonstrations;
@@ -41,15 +58,18 @@ class TokenCache(Sequence[TokenEpisode]):
         (14, 3, 32, 32)
     """
 
-    def __init__(self, dataset: Dataset, kind: TokenKind = "objects", folder: Path | None = None) -> None:
-        self.dataset, self.kind, self._root = dataset, kind, folder
-        self.folder = _cache_folder(dataset, kind, folder)
-        found = {source.name: _made(self.folder, source, kind) for source in sources(dataset)}
+    def __init__(
+        self, dataset: Dataset, kind: TokenKind = "objects", folder: Path | None = None, boxes: str = ""
+    ) -> None:
+        self.dataset, self.kind, self.boxes, self._root = dataset, kind, boxes, folder
+        self.folder = _cache_folder(dataset, kind, folder, boxes)
+        found = {source.name: _made(self.folder, source, kind, boxes) for source in sources(dataset)}
         missing = [name for name, file in found.items() if file is None]
         if missing:
+            option = "--boxes DETECTOR" if boxes else f"--kind {kind}"
             raise DatasetError(
                 f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
-                f"`openvima data tokens {shlex.quote(str(dataset.path))} --kind {kind}` makes them."
+                f"`openvima data tokens {shlex.quote(str(dataset.path))} {option}` makes them."
             )
         self._files = {name: file for name, file in found.items() if file is not None}
 
@@ -70,7 +90,7 @@ class TokenCache(Sequence[TokenEpisode]):
         return (self[index] for index in range(len(self)))
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
-        return TokenCache, (self.dataset, self.kind, self._root)
+        return TokenCache, (self.dataset, self.kind, self._root, self.boxes)
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
@@ -113,6 +133,7 @@ class _Work:
     source: Source
     path: Path
     kind: TokenKind
+    boxes: Boxes | None
 
 
 def open_tokens(
@@ -120,6 +141,7 @@ def open_tokens(
     kind: TokenKind = "objects",
     *,
     folder: Path | None = None,
+    boxes: Boxes | None = None,
     workers: int = 1,
     report: Report | None = None,
 ) -> TokenCache:
@@ -127,16 +149,18 @@ def open_tokens(
 
     Args:
         dataset: The demonstrations, perhaps of some tasks only.
-        kind: "objects" for crops of the segmented objects, "frames" for whole frames at half the size.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
         folder: Where to keep them; None means `tokens/` in the folder of the demonstrations.
+        boxes: What finds the objects; None takes the segmentation. Each detector has a folder of its own.
         workers: Number of processes.
         report: Called with episodes done, episodes in all, and a note.
 
     Raises:
-        DatasetError: There is no such kind, or the folder cannot be written to.
+        DatasetError: There is no such kind, it has no use for boxes, or the folder cannot be written to.
         ShardError: A shard is damaged.
     """
-    target = _cache_folder(dataset, kind, folder)
+    name = boxes.name if boxes else ""
+    target = _cache_folder(dataset, kind, folder, name)
     work = [
         _Work(
             dataset.path / source.name,
@@ -144,9 +168,10 @@ def open_tokens(
             source,
             target / source.name,
             kind,
+            boxes,
         )
         for source in sources(dataset)
-        if _made(target, source, kind) is None
+        if _made(target, source, kind, name) is None
     ]
     if work:
         try:
@@ -165,7 +190,7 @@ def open_tokens(
 
         for _ in in_processes(_write, work, workers, report=say):
             pass  # the result of a job is its file
-    return TokenCache(dataset, kind, folder)
+    return TokenCache(dataset, kind, folder, name)
 
 
 def sources(dataset: Dataset) -> list[Source]:
@@ -183,25 +208,38 @@ def sources(dataset: Dataset) -> list[Source]:
     return found
 
 
-def _cache_folder(dataset: Dataset, kind: TokenKind, folder: Path | None) -> Path:
+def _cache_folder(dataset: Dataset, kind: TokenKind, folder: Path | None, boxes: str) -> Path:
     if kind not in KINDS:
         raise DatasetError(unknown_name("kind of tokens", kind, KINDS))
-    return (folder or dataset.path / TOKENS_FOLDER) / f"{kind}-v{TOKENS_VERSION}"
+    if boxes and kind == "frames":
+        raise DatasetError(f"boxes are those of {boxes}, but whole frames have none; leave them out.")
+    parts = (kind, f"v{TOKENS_VERSION}", *((boxes,) if boxes else ()))
+    return (folder or dataset.path / TOKENS_FOLDER) / "-".join(parts)
 
 
-def _made(folder: Path, source: Source, kind: TokenKind) -> TokenFile | None:
+def _made(folder: Path, source: Source, kind: TokenKind, boxes: str) -> TokenFile | None:
     """Open the tokens of a shard; None if they are missing, damaged, or of another version or content."""
     try:
         file = TokenFile(folder / source.name)
     except ShardError:
         return None
-    return file if file.source == source.content_hash and file.kind == kind else None
+    asked = (source.content_hash, kind, boxes)
+    return file if (file.source, file.kind, file.boxes) == asked else None
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
     shard, episodes = Shard(work.shard, work.frame), []
+    finder = _finder(work.boxes) if work.boxes else None
     for row, span in enumerate(spans_of(work.source.index)):
         shard.check(row, span)
-        episodes.append(tokens_of(shard[row], work.kind))
+        episodes.append(tokens_of(shard[row], work.kind, finder))
         count(row + 1)
-    write_tokens(work.path, episodes, work.kind, work.source.content_hash)
+    write_tokens(
+        work.path, episodes, work.kind, work.source.content_hash, work.boxes.name if work.boxes else ""
+    )
+
+
+@lru_cache(maxsize=1)
+def _finder(boxes: Boxes) -> ObjectFinder:
+    """Make a finder once in this process, for all shards."""
+    return boxes.make()

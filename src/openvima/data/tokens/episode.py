@@ -1,7 +1,7 @@
 """One demonstration as tokens: what a policy sees of it, and what it is to do."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, get_args
 
@@ -11,7 +11,15 @@ from openvima.data.records import Demonstration
 from openvima.data.schema import VIEWS
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.kernels import CROP_SIZE
-from openvima.perception.objects import ObjectViews, crop_box, observe, observe_prompt_image, whole_frames
+from openvima.perception.objects import (
+    GROUND_TRUTH,
+    ObjectFinder,
+    ObjectViews,
+    crop_box,
+    observe,
+    whole_frames,
+)
+from openvima.perception.overlap import slots_of_ids
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, Action, PromptImage
 
 TokenKind = Literal["objects", "frames"]
@@ -34,6 +42,10 @@ _SMALL_BOX = 16  # pixels, of a false detection where a view shows nothing to ta
 class TokenEpisode:
     """One demonstration of T steps, ready for a policy.
 
+    Ids are those of the segmentation. Where a detector found the objects, which knows none, an id is the
+    place of the object in its moment or image, from 0; objects to pick and to place at are named by it, too,
+    and are -1 where they were not found.
+
     Args:
         task: Name of the task.
         seed: Its episode's number.
@@ -45,8 +57,8 @@ class TokenEpisode:
             (P, 11), int16.
         steps: One row a step: number of objects in view, ids of the objects to pick and to place at, numbers
             and boxes of two false detections; shape (T, 13), int16.
-        objects: One row an object in view, step after step, from left to right: id, numbers of its two
-            images, boxes, grasp points; shape (O, 15), int16.
+        objects: One row an object in view, step after step, in the order of the finder (from left to right):
+            id, numbers of its two images, boxes, grasp points; shape (O, 15), int16.
         final: One row an object in view after the last step, like those of the prompt; shape (F, 11), int16.
         actions: What the oracle did, shape (T, 12), float32: positions in metres and quaternions.
         images: All crops or halved frames, shape (K, 3, height, width), uint8; number n is `images[n - 1]`.
@@ -70,21 +82,23 @@ class TokenEpisode:
         return len(self.steps)
 
 
-def tokens_of(demo: Demonstration, kind: TokenKind) -> TokenEpisode:
+def tokens_of(demo: Demonstration, kind: TokenKind, finder: ObjectFinder | None = None) -> TokenEpisode:
     """Cut out what policies see of a demonstration.
 
     Args:
         demo: The demonstration.
-        kind: "objects" for crops of the segmented objects, "frames" for whole frames at half the size.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
+        finder: Finds the objects, in the images of the prompt, too; None takes the segmentation.
 
     Raises:
         PolicyError: A view is missing, or objects have impossible ids.
     """
     stack = ImageStack(IMAGE_SIZES[kind])
-    seen = [_see_prompt_image(demo.prompt.images[name], kind) for name in image_names(demo.prompt.text)]
+    images = [demo.prompt.images[name] for name in image_names(demo.prompt.text)]
+    seen = [_see_prompt_image(image, kind, finder) for image in images]
     prompt = ObjectViews.concatenated(seen)
     observations = [demo.observation(t) for t in range(demo.num_steps)]
-    views = [_see(observation, kind) for observation in observations]
+    views = [_see(observation, kind, finder) for observation in observations]
     everything = ObjectViews.concatenated(views)
     prompt_rows = _rows(prompt, stack)
     object_rows = np.concatenate(
@@ -93,11 +107,13 @@ def tokens_of(demo: Demonstration, kind: TokenKind) -> TokenEpisode:
     steps = np.zeros((demo.num_steps, STEP_WIDTH), np.int16)
     steps[:, COUNT] = [len(objects) for objects in views]
     steps[:, PICK], steps[:, PLACE] = demo.pick_ids, demo.place_ids
+    if finder is not None:
+        _name_by_slots(steps, observations, views)
     if kind == "objects":
         # By the content alone, so that the cache does not depend on who makes it and in what order.
         rng = np.random.default_rng([demo.seed, *demo.task.encode()])
         _draw_spurious(steps, observations, views, stack, rng)
-    final_rows = _rows(_see(demo.observation(demo.num_steps), kind), stack)
+    final_rows = _rows(_see(demo.observation(demo.num_steps), kind, finder), stack)
     return TokenEpisode(
         task=demo.task,
         seed=demo.seed,
@@ -131,12 +147,31 @@ def pieces_of(text: str) -> tuple[str | int, ...]:
     return tuple(piece for piece in pieces if piece != "")
 
 
-def _see_prompt_image(image: PromptImage, kind: TokenKind) -> ObjectViews:
-    return whole_frames(image.rgb) if kind == "frames" else observe_prompt_image(image)
+def _see_prompt_image(image: PromptImage, kind: TokenKind, finder: ObjectFinder | None) -> ObjectViews:
+    if kind == "frames":
+        return whole_frames(image.rgb)
+    return _numbered(finder.in_prompt_image(image)) if finder else GROUND_TRUTH.in_prompt_image(image)
 
 
-def _see(observation: dict, kind: TokenKind) -> ObjectViews:
-    return whole_frames(observation["rgb"]) if kind == "frames" else observe(observation)
+def _see(observation: dict, kind: TokenKind, finder: ObjectFinder | None) -> ObjectViews:
+    if kind == "frames":
+        return whole_frames(observation["rgb"])
+    return (
+        _numbered(finder.in_observation(observation)) if finder else GROUND_TRUTH.in_observation(observation)
+    )
+
+
+def _numbered(found: ObjectViews) -> ObjectViews:
+    """Number what was found in its own order, which so is that of the ids, too."""
+    return replace(found, ids=np.arange(len(found)))
+
+
+def _name_by_slots(steps: np.ndarray, observations: list[dict], views: list[ObjectViews]) -> None:
+    """Name the objects to pick and to place at by their place among those found, -1 where they are not."""
+    for step, observation, found in zip(steps, observations, views, strict=True):
+        slots = slots_of_ids(found, observe(observation))
+        for column in (PICK, PLACE):
+            step[column] = slots.get(int(step[column]), -1)
 
 
 def _rows(objects: ObjectViews, stack: ImageStack) -> np.ndarray:

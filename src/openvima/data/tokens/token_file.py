@@ -63,7 +63,9 @@ COLUMNS = pa.schema(
 _TABLES = ("prompt_counts", "prompt", "steps", "objects", "final", "actions")
 
 
-def write_tokens(path: Path, episodes: Sequence[TokenEpisode], kind: TokenKind, source: str) -> None:
+def write_tokens(
+    path: Path, episodes: Sequence[TokenEpisode], kind: TokenKind, source: str, boxes: str = ""
+) -> None:
     """Write one file.
 
     Args:
@@ -71,6 +73,7 @@ def write_tokens(path: Path, episodes: Sequence[TokenEpisode], kind: TokenKind, 
         episodes: What to write.
         kind: What their images show.
         source: Content hash of the demonstrations that they were made of.
+        boxes: Name of what found the objects; empty for the segmentation.
     """
     codec = pa.Codec(IMAGE_CODEC)
     columns = {
@@ -87,7 +90,7 @@ def write_tokens(path: Path, episodes: Sequence[TokenEpisode], kind: TokenKind, 
         else pa.array(columns[field.name], field.type)
         for field in COLUMNS
     ]
-    about = {"version": TOKENS_VERSION, "kind": kind, "source": source}
+    about = {"version": TOKENS_VERSION, "kind": kind, "source": source, **({"boxes": boxes} if boxes else {})}
     schema = COLUMNS.with_metadata({_KEY: json.dumps(about, sort_keys=True).encode()})
     with whole_file(path) as file, pa.ipc.new_file(file, schema) as writer:
         writer.write_batch(pa.record_batch(arrays, schema=schema))
@@ -110,6 +113,7 @@ class TokenFile:
             about = json.loads((reader.schema.metadata or {})[_KEY])
             self.kind: TokenKind = about["kind"]
             self.source: str = about["source"]
+            self.boxes: str = about.get("boxes", "")
             fits = about["version"] == TOKENS_VERSION and self.kind in KINDS and reader.schema.equals(COLUMNS)
             batch = reader.get_batch(0) if fits else None
             if batch is not None:
