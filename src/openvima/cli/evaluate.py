@@ -89,13 +89,13 @@ def main(
     from openvima.env import Setup
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.controls import IN_CONTEXT
-    from openvima.evaluation.in_context import HELD_OUT_TASKS
+    from openvima.evaluation.in_context import held_out_tasks
 
     if in_context:
         controls = f"{controls},{IN_CONTEXT}"
     config = EvaluationConfig(
         policies=words_in(policy),
-        tasks=HELD_OUT_TASKS if in_context and tasks == "all" else words_in(tasks),
+        tasks=held_out_tasks(words_in(levels)) if in_context and tasks == "all" else words_in(tasks),
         levels=words_in(levels),
         episodes=episodes,
         seed=seed,

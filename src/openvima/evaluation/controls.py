@@ -76,7 +76,6 @@ def sight(env: TabletopEnv, control: str) -> Sight:
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.
-        OracleError: The oracle finds no action to show.
     """
     if control == IN_CONTEXT:
         return Sight(demonstrated(env))
