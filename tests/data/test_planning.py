@@ -87,6 +87,11 @@ def test_a_record_that_lacks_a_setting_is_named(tmp_path: Path) -> None:
         GenerateConfig.from_record(tmp_path, record)
 
 
+def test_a_level_that_does_not_exist_is_told(tmp_path: Path) -> None:
+    with pytest.raises(LevelError, match="no level 'L9'"):
+        GenerateConfig(tmp_path, level="L9").resolved_tasks()
+
+
 def test_settings_are_checked_together(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"episodes is 0.*workers is 0"):
         config(tmp_path, episodes=0, workers=0)

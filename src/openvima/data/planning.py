@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import LEVELS
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
 from openvima.env.setup import DEFAULT_SETUP, Setup
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.processes import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -116,8 +117,10 @@ class GenerateConfig:
 
         Raises:
             UnknownTaskError: There is no such task.
-            LevelError: A task is not defined at the level.
+            LevelError: There is no such level, or a task is not defined at it.
         """
+        if self.level not in LEVELS:
+            raise LevelError(unknown_name("level", self.level, LEVELS))
         if self.tasks == ("all",):
             return tuple(sorted(task for task in list_tasks() if self.level in task_spec(task).levels))
         for task in self.tasks:

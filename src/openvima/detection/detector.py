@@ -11,6 +11,7 @@ from openvima.detection.backbone import ConvNorm
 from openvima.detection.network import MaskRCNN, Objects
 from openvima.errors import ShapeError
 from openvima.policies.detection import Detections
+from openvima.policies.devices import usable_device
 
 
 class FrameDetector:
@@ -21,10 +22,13 @@ class FrameDetector:
     Args:
         network: The network; it is copied, with its batch normalisation folded into the convolutions.
         device: Where to compute, such as "cpu" or "cuda".
+
+    Raises:
+        PolicyError: The device cannot be used here.
     """
 
     def __init__(self, network: MaskRCNN, *, device: torch.device | str = "cpu") -> None:
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         # Channels last takes a quarter of the time on a processor.
         network = folded(network).to(self.device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -115,14 +115,10 @@ def one_thread(batch: Batch) -> Iterator[None]:
     from openvima.policies.base import require_torch
 
     require_torch(f"policy {batch.policy!r}")
-    import torch
+    from openvima.policies.devices import torch_threads
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with torch_threads(1):
         yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @lru_cache(maxsize=1)

@@ -13,6 +13,7 @@ from openvima.errors import PolicyError
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectFinder
 from openvima.policies.base import Policy, prompt_number
+from openvima.policies.devices import usable_device
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
 from openvima.policies.inputs import (
     EpisodeReader,
@@ -114,7 +115,7 @@ class NetworkPolicy(Policy):
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
         self.reader = Reader.of(network.config.images, tokenizer, finder)
-        self.device = _usable_device(device)
+        self.device = usable_device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
         self._temperature = temperature
@@ -276,18 +277,6 @@ class NetworkPolicy(Policy):
         by_key = {**known, **dict(zip((keys[number] for number in new), encoded, strict=True))}
         features = torch.stack([by_key[key] for key in keys])
         return features, dict(zip(keys, features, strict=True))
-
-
-def _usable_device(device: torch.device | str) -> torch.device:
-    try:
-        found = torch.device(device)
-        torch.empty(1, device=found)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise PolicyError(
-            f"device {str(device)!r} cannot be used here; allowed: cpu, and cuda on a machine with a GPU for "
-            "which torch is installed."
-        ) from error
-    return found
 
 
 def _noting(choose: Choose, margins: list[torch.Tensor]) -> Choose:

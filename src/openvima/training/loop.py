@@ -3,8 +3,7 @@
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +17,7 @@ from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.data.tokens.cache import TokenCache, open_tokens
 from openvima.errors import ConfigError
+from openvima.policies.devices import torch_threads
 from openvima.training.board import Board
 from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
@@ -93,7 +93,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     config = resolved(config)
     load_assets(config.assets)  # what is wrong is found before there is a run folder
     dataset = Dataset(config.data)
-    with _threads(config.threads), joined(config.device, config.sharding) as parallel:
+    with torch_threads(config.threads), joined(config.device, config.sharding) as parallel:
         learner = build_learner(config)
         run = RunFolder(
             config.out,
@@ -348,16 +348,6 @@ def _settings(config: TrainingConfig, dataset: Dataset, learner: Learner) -> dic
     values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
     demonstrations = {"episodes": len(dataset), "index": index}
     return {"training": values, "demonstrations": demonstrations, "policy": learner.description()}
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _mean(window: list[Metrics]) -> Metrics:

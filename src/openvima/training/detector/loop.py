@@ -4,7 +4,6 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from openvima.detection.detectron2 import load_detectron2
 from openvima.detection.frames import Frame, FrameSource, held_out_frames
 from openvima.detection.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
+from openvima.policies.devices import torch_threads, usable_device
 from openvima.training.detector.config import DetectorTrainingConfig
 from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes
@@ -62,7 +62,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             f"validation; a batch of {config.batch} frames needs {config.batch // 2} and 1. Generate more, "
             "lower batch, or raise validation_share."
         )
-    with _threads(config.threads):
+    with torch_threads(config.threads):
         learner = DetectorLearner(_begin(config), sampled=config.sampled)
         run = RunFolder(config.out, _settings(config, learner), force=config.force)
         source = FrameSource(dataset, training, prompt_share=config.prompt_share)
@@ -214,21 +214,7 @@ def _settings(config: DetectorTrainingConfig, learner: DetectorLearner) -> dict[
 def _device(name: str) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise ConfigError(f"device is {name!r}, which cannot be used: {reason}. Take auto or cpu.") from error
-
-
-@contextmanager
-def _threads(count: int):  # a context manager's generator
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    return usable_device(name)
 
 
 def _numbers(losses: dict[str, torch.Tensor]) -> Metrics:

@@ -1,0 +1,36 @@
+"""Where networks compute, and with how many threads."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from openvima.errors import PolicyError
+
+
+def usable_device(device: torch.device | str) -> torch.device:
+    """Return a device after trying it.
+
+    Raises:
+        PolicyError: There is no such device here.
+    """
+    try:
+        found = torch.device(device)
+        torch.empty(1, device=found)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise PolicyError(
+            f"device {str(device)!r} cannot be used here; allowed: cpu, and cuda on a machine with a GPU for "
+            "which torch is installed."
+        ) from error
+    return found
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Compute with so many threads: other numbers sum in another order, which changes the last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
