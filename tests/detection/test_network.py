@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 torch = pytest.importorskip("torch")
 from openvima.detection.config import resnet50, small  # noqa: E402
 from openvima.detection.detector import FrameDetector, detections_of, folded  # noqa: E402
-from openvima.detection.network import MaskRCNN, Objects  # noqa: E402
+from openvima.detection.network import MaskRCNN, Objects, prepared_size  # noqa: E402
 from openvima.errors import ShapeError  # noqa: E402
 from openvima.policies.detection import DetectedObjects  # noqa: E402
 
@@ -109,6 +110,38 @@ def test_enlarged_images_give_boxes_in_pixels_of_the_image(tiny):
     assert found.boxes[:, 2].max() > 48
 
 
+@pytest.mark.parametrize(("height", "width"), [(128, 256), (480, 640), (1080, 1920), (333, 500), (801, 800)])
+def test_images_are_enlarged_to_the_size_that_detectron2_gives_them(height, width):
+    # Its rule in its own words: first the shorter side, then the longer one, then halves upwards.
+    low, high = 800.0, 800.0 * max(height, width) / min(height, width)
+    shrink = min(1.0, 1333 / high)
+    short, long = int(low * shrink + 0.5), int(high * shrink + 0.5)
+    assert prepared_size(resnet50(), height, width) == ((short, long) if height < width else (long, short))
+
+
+def test_a_frame_is_enlarged_to_667_by_1333_pixels():
+    assert prepared_size(resnet50(), 128, 256) == (667, 1333)
+    assert prepared_size(small(), 128, 256) == (128, 256)
+
+
+@pytest.mark.parametrize("short_side", [30, 100])
+def test_images_are_resized_as_pillow_does(tiny, short_side):
+    network = made(replace(tiny, short_side=short_side, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
+    prepared, scale, (height, width) = network._prepare(images(1))
+    picture = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
+    expected = np.asarray(picture.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
+    assert np.abs(prepared[0, :, :height, :width].numpy() - expected).max() <= 1  # it counts in integers
+    assert scale.tolist() == pytest.approx([width / 96, height / 64] * 2)
+
+
+def test_edges_grow_in_each_direction_by_as_much_as_the_image(tiny):
+    # 64 × 96 pixels become 10 × 15 in both, but 65 × 96 do not grow evenly.
+    network = made(replace(tiny, short_side=10))
+    _, scale, size = network._prepare(images(1, 65, 96))
+    assert size == (10, 15)
+    assert scale.tolist() == pytest.approx([15 / 96, 10 / 65] * 2)
+
+
 def test_folding_batch_normalisation_changes_nothing(tiny):
     network = made(replace(tiny, score=0.0)).train()
     network.losses(images(4), [Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))] * 4,
@@ -122,6 +155,15 @@ def test_folding_batch_normalisation_changes_nothing(tiny):
 def test_the_better_of_two_kinds_counts(tiny):
     (found,) = made(replace(tiny, num_classes=3, score=0.0))(images(1))
     assert len(found.boxes)
+
+
+def test_masks_are_those_of_the_kind_that_counts(tiny):
+    network = made(replace(tiny, num_classes=3, score=0.0))
+    with torch.no_grad():
+        network.box_head.kinds.bias.copy_(torch.tensor([0.0, 20.0, 0.0, 0.0]))
+        network.mask_head.masks.bias.copy_(torch.tensor([20.0, -20.0, 20.0]))  # all of the box, or nothing
+    (found,) = network(images(1))
+    assert len(found.masks) and not found.masks.any()
 
 
 def test_where_nothing_is_proposed_nothing_is_found(tiny, monkeypatch):

@@ -1,5 +1,6 @@
 """Mask R-CNN: from images to objects with boxes, masks and scores, and the losses to train it with."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,8 +81,8 @@ class MaskRCNN(nn.Module):
         found = []
         for number, boxes in enumerate(proposals):
             own = [level[number : number + 1] for level in levels]
-            boxes, scores = self._best(own, boxes, size)
-            shares = self._masks(own, boxes)
+            boxes, scores, kinds = self._best(own, boxes, size)
+            shares = self._masks(own, boxes, kinds)
             boxes = clip(boxes / scale, height=height, width=width)
             masks = paste_masks(shares, boxes, height=height, width=width)
             found.append(Objects(boxes, masks, scores))
@@ -126,26 +127,26 @@ class MaskRCNN(nn.Module):
         losses["mask"] = mask_loss(logits, proposals=positive / scale, masks=masks)
         return losses
 
-    def _prepare(self, images: torch.Tensor) -> tuple[torch.Tensor, float, tuple[int, int]]:
-        """Normalised and padded images; how far they were enlarged; their size without the padding."""
+    def _prepare(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, tuple[int, int]]:
+        """Normalised and padded images; growth of the edges of boxes, (4,); the size without the padding."""
         config = self.config
         pixels = images.to(self.pixel_mean.dtype)
         if config.colours == "bgr":
             pixels = pixels.flip(1)
-        height, width = pixels.shape[2:]
-        scale = 1.0
-        if config.short_side is not None:
-            scale = min(config.short_side / min(height, width), config.long_side / max(height, width))
-            height, width = round(height * scale), round(width * scale)
-            pixels = F.interpolate(pixels, (height, width), mode="bilinear", align_corners=False)
+        before = pixels.shape[2:]
+        height, width = prepared_size(config, *before)
+        if (height, width) != before:
+            # As Pillow does: large images are averaged, and colours stay whole numbers.
+            pixels = F.interpolate(pixels, (height, width), mode="bilinear", antialias=True).round()
+        scale = pixels.new_tensor([width / before[1], height / before[0]]).repeat(2)
         pixels = (pixels - self.pixel_mean) / self.pixel_std
         divisor = self.backbone.divisor
         return F.pad(pixels, (0, -width % divisor, 0, -height % divisor)), scale, (height, width)
 
     def _best(
         self, levels: Sequence[torch.Tensor], proposals: torch.Tensor, size: tuple[int, int]
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Boxes and scores of the objects of one image; of each proposal only its likeliest kind counts."""
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Boxes, scores, kinds of the objects of one image; only the likeliest kind of a proposal counts."""
         config = self.config
         numbers = torch.zeros(len(proposals), dtype=torch.int64, device=proposals.device)
         kinds, deltas = self.box_head(self._cut(levels, proposals, numbers, config.box_size))
@@ -155,12 +156,16 @@ class MaskRCNN(nn.Module):
         boxes = clip(boxes, height=size[0], width=size[1])
         rows, boxes = _solid(rows, boxes)
         kept = suppress(boxes, scores[rows], config.overlap)[: config.most]
-        return boxes[kept], scores[rows[kept]]
+        rows = rows[kept]
+        return boxes[kept], scores[rows], best[rows]
 
-    def _masks(self, levels: Sequence[torch.Tensor], boxes: torch.Tensor) -> torch.Tensor:
+    def _masks(
+        self, levels: Sequence[torch.Tensor], boxes: torch.Tensor, kinds: torch.Tensor
+    ) -> torch.Tensor:
         """How surely the cells inside the boxes of one image show the object, (N, 2 · size, 2 · size)."""
         numbers = torch.zeros(len(boxes), dtype=torch.int64, device=boxes.device)
-        return self.mask_head(self._cut(levels, boxes, numbers, self.config.mask_size)).sigmoid().amax(dim=1)
+        logits = self.mask_head(self._cut(levels, boxes, numbers, self.config.mask_size))
+        return logits[torch.arange(len(boxes), device=boxes.device), kinds].sigmoid()
 
     def _cut(
         self, levels: Sequence[torch.Tensor], boxes: torch.Tensor, images: torch.Tensor, size: int
@@ -176,6 +181,14 @@ class MaskRCNN(nn.Module):
             canonical_size=config.canonical_size,
             canonical_level=config.canonical_level,
         )
+
+
+def prepared_size(config: DetectorConfig, height: int, width: int) -> tuple[int, int]:
+    """Return height and width at which a network looks at an image, in pixels; halves are rounded up."""
+    if config.short_side is None:
+        return height, width
+    scale = min(config.short_side / min(height, width), config.long_side / max(height, width))
+    return math.floor(height * scale + 0.5), math.floor(width * scale + 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
