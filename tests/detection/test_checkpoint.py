@@ -1,6 +1,8 @@
 """Checkpoints of detectors, and files of Detectron2."""
 
 import re
+import sys
+import types
 from dataclasses import replace
 
 import pytest
@@ -142,6 +144,71 @@ def test_a_file_of_detectron2_is_read_and_finds_something(foreign, tmp_path):
     network.config = replace(network.config, short_side=64, proposals=4, candidates=8, score=0.0)
     (found,) = network(torch.randint(0, 256, (1, 3, 64, 96), dtype=torch.uint8))
     assert len(found.boxes) and found.masks.shape[1:] == (64, 96)
+
+
+@pytest.fixture
+def settings(monkeypatch):
+    """A function that makes settings of the class that Detectron2's have, which is missing afterwards."""
+    module = types.ModuleType("detectron2.config.config")
+    module.CfgNode = type("CfgNode", (dict,), {"__module__": module.__name__})  # type: ignore[attr-defined]
+    for name in ("detectron2", "detectron2.config"):
+        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+    def nested(values):
+        node = module.CfgNode({k: nested(v) if isinstance(v, dict) else v for k, v in values.items()})
+        node.__dict__["__immutable__"] = False
+        return node
+
+    return nested
+
+
+def saved(foreign, settings, file, values):
+    torch.save({"model": foreign, "cfg": settings(values)}, file)
+    for name in ("detectron2.config.config", "detectron2.config", "detectron2"):
+        del sys.modules[name]
+    return file
+
+
+def test_settings_in_the_file_say_how_images_are_prepared(foreign, settings, tmp_path):
+    bare = {name: tensor for name, tensor in foreign.items() if not name.startswith("pixel")}
+    values = {
+        "INPUT": {"FORMAT": "RGB", "MIN_SIZE_TEST": 0},
+        "MODEL": {
+            "PIXEL_MEAN": [1.0, 2.0, 3.0],
+            "ANCHOR_GENERATOR": {"SIZES": [[8], [16], [32], [64], [128]], "OFFSET": 0.0},
+            "RPN": {"POST_NMS_TOPK_TEST": 500, "BBOX_REG_WEIGHTS": (1.0, 1.0, 1.0, 1.0)},
+            "RESNETS": {"STRIDE_IN_1X1": False},
+            "ROI_HEADS": {"SCORE_THRESH_TEST": 0.5},
+        },
+    }
+    config = load_detectron2(saved(bare, settings, tmp_path / "with.pth", values)).config
+    assert config == replace(
+        resnet50(),
+        backbone=replace(resnet50().backbone, stride_first=False),
+        num_classes=2,
+        colours="rgb",
+        short_side=None,
+        pixel_mean=(1.0, 2.0, 3.0),
+        anchor_sizes=(8.0, 16.0, 32.0, 64.0, 128.0),
+        proposals=500,
+        score=0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"MODEL": {"ANCHOR_GENERATOR": {"OFFSET": 0.5}}}, "OFFSET is 0.5; only 0.0 is computed"),
+        ({"MODEL": {"ANCHOR_GENERATOR": {"SIZES": [[32, 64, 128, 256, 512]]}}}, "one of each level"),
+        ({"MODEL": {"ROI_BOX_HEAD": {"POOLER_TYPE": "ROIAlign"}}}, "only 'ROIAlignV2'"),
+        ({"INPUT": {"FORMAT": "YUV"}}, "order of colours 'yuv'"),
+        ({"MODEL": {"RPN": {"POST_NMS_TOPK_TEST": "many"}}}, "make no sense"),
+    ],
+)
+def test_settings_of_another_computation_are_refused(foreign, settings, tmp_path, values, message):
+    with pytest.raises(CheckpointError, match=message):
+        load_detectron2(saved(foreign, settings, tmp_path / "other.pth", values))
 
 
 def test_what_is_no_such_file_is_refused(tiny, tmp_path):
