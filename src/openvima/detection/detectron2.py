@@ -1,8 +1,8 @@
 """Reading weights of Detectron2's Mask R-CNN with ResNet-50 and feature pyramid, such as VIMA's detector.
 
 Only tensors and plain values are read; nothing in the file is executed. Where the file holds Detectron2's
-settings under "cfg", as that of VIMA does, they say how images are prepared and what is kept; what they do not
-say, or a file without them, is taken as Detectron2 has it by default: blue first, enlarged to 800 pixels.
+settings under "cfg", as users load VIMA's, they say how images are prepared and what is kept. What they leave
+open is taken as Detectron2 has it by default: blue first, enlarged to 800 pixels.
 """
 
 import re
