@@ -151,11 +151,19 @@ def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
     assert all(torch.equal(tensor, weights[name]) for name, tensor in last_weights(Path(after)).items())
 
 
-def test_what_has_matched_looks_need_not_do_so_again(settings, tmp_path) -> None:
+@pytest.mark.parametrize("tune_crops", [False, True])
+def test_what_has_matched_looks_need_not_do_so_again(tune_crops, settings, tmp_path) -> None:
+    """The crop encoder is taken over, and stays as it is unless it is to be tuned."""
     first = train(TrainingConfig(**{**settings, "steps": 1}))
-    again = {**settings, "pretraining_steps": None, "steps": 1, "out": tmp_path / "on", "init": str(first)}
-    train(TrainingConfig(**again))
-    assert [path.name for path in (tmp_path / "on" / "checkpoints").glob("*-0*")] == ["2-cloning-000001"]
+    again = {**settings, "pretraining_steps": None, "warmup_steps": 0, "steps": 2, "out": tmp_path / "on"}
+    train(TrainingConfig(**again, init=str(first), tune_crops=tune_crops))
+    names = sorted(path.name for path in (tmp_path / "on" / "checkpoints").glob("*-0*"))
+    assert names == ["2-cloning-000002"]
+    before, after = last_weights(first), last_weights(tmp_path / "on")
+    kept = {name for name in before if torch.equal(before[name], after[name])}
+    crops = {name for name in before if name.startswith("images.crop_encoder")}
+    assert crops and "trunk.positions.weight" not in kept
+    assert crops <= kept if not tune_crops else not crops <= kept
 
 
 def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:

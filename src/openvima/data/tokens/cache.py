@@ -96,6 +96,10 @@ class TokenCache(Sequence[TokenEpisode]):
         """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
         return self._gathered(TokenFile.lengths, 2)
 
+    def widths(self) -> np.ndarray:
+        """Return how many objects the fullest prompt image and the fullest view show, shape (N, 2)."""
+        return self._gathered(TokenFile.widths, 2)
+
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""
         return self._gathered(TokenFile.image_counts, 1)[:, 0]

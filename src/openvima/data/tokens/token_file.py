@@ -14,6 +14,7 @@ import pyarrow as pa
 from openvima.data.reader import ODD_ERRORS
 from openvima.data.tokens.episode import (
     ACTION_PARTS,
+    COUNT,
     IMAGE_SIZES,
     KINDS,
     OBJECT_WIDTH,
@@ -174,6 +175,11 @@ class TokenFile:
         """Return the steps of each episode and the objects in view in all of them, shape (rows, 2), int64."""
         return np.stack([self._tables["steps"].lengths(), self._tables["objects"].lengths()], axis=1)
 
+    def widths(self) -> np.ndarray:
+        """Return how many objects the fullest prompt image and the fullest view show, shape (rows, 2)."""
+        views = np.maximum(self._tables["steps"].largest(COUNT), self._tables["final"].lengths())
+        return np.stack([self._tables["prompt_counts"].largest(0), views], axis=1)
+
 
 class _Table:
     """A column of tables with the same width, as one array and where each table begins."""
@@ -188,6 +194,13 @@ class _Table:
 
     def lengths(self) -> np.ndarray:
         return np.diff(self._starts).astype(np.int64)
+
+    def largest(self, column: int) -> np.ndarray:
+        """Return the largest number of a column in each table, 0 in an empty one."""
+        result = np.zeros(len(self._starts) - 1, np.int64)
+        rows = self._rows[self._starts[0] : self._starts[-1], column]
+        np.maximum.at(result, np.repeat(np.arange(len(result)), self.lengths()), rows)
+        return result
 
 
 def _ragged(tables: Sequence[np.ndarray], dtype: Any) -> pa.ListArray:  # Any: pyarrow's types are dynamic
