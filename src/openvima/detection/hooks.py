@@ -88,33 +88,36 @@ def plugged_boxes(hook: str) -> Boxes:
     return Boxes(f"{name}-{digest}", partial(plugged_finder, hook))
 
 
-def plugged_tokens(
+def detected_tokens(
     dataset: Dataset,
-    hook: str,
+    boxes: Boxes,
     *,
     folder: Path | None = None,
     workers: int = 1,
     report: Report | None = None,
 ) -> TokenCache:
-    """Open the tokens of objects that a detector finds; make what is missing.
+    """Open the tokens of the objects that a detector finds; make what is missing.
 
     A detector computes on one thread here, so that the files are the same for any number of workers.
 
     Args:
         dataset: The demonstrations.
-        hook: One of the forms above.
+        boxes: The detector, as from `plugged_boxes`.
         folder: As in `open_tokens`.
         workers: As in `open_tokens`.
         report: As in `open_tokens`.
 
     Raises:
-        ConfigError: There is no such function, or it gives something else.
-        CheckpointError: There is no trained detector, or it is damaged.
+        ConfigError: The detector gives something else than it should.
         DatasetError: The folder cannot be written to.
     """
-    boxes = plugged_boxes(hook)
+
+    def say(done: int, total: int, note: str) -> None:
+        if report is not None:
+            report(done, total, "detecting objects")
+
     with _one_thread():
-        return open_tokens(dataset, folder=folder, boxes=boxes, workers=workers, report=report)
+        return open_tokens(dataset, folder=folder, boxes=boxes, workers=workers, report=say)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
-from openvima.training.config import MATCHING_STEPS, TrainingConfig
+from openvima.training.config import DETECTED_SHARE, MATCHING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.run_folder import flattened
 from openvima.training.schedule import step_seed
@@ -30,6 +30,13 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     Raises:
         ConfigError: They do not.
     """
+    if config.detected_share and config.boxes is None:
+        raise ConfigError(
+            f"detected_share is {config.detected_share:g}, but no detector is given; name one with boxes, "
+            "such as 'detector'."
+        )
+    if config.boxes is not None and config.detected_share is None:
+        config = replace(config, detected_share=DETECTED_SHARE)
     if ":" in config.preset:
         unknown = [name for name in _OF_PRESETS if getattr(config, name)]
         if unknown:

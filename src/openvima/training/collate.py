@@ -164,8 +164,10 @@ class Collator:
         slots = tuple(max((int(image[:, v].sum()) for image in shown), default=0) for v in (FRONT, TOP))
         places = self._places(episode.text, counts, slots)
         rows = np.concatenate([_compacted(image, max(slots)) for image in images] or [episode.prompt[:0]])
-        shows = np.where(places.is_word, True, rows[places.entries, NUMBERS.start + places.parts] > 0)
-        return _Prompt(places, rows, shows)
+        counts_as_place, shown = places.is_word.copy(), rows[:, NUMBERS] > 0
+        is_image = ~places.is_word  # there may be none: a detector need not find anything
+        counts_as_place[is_image] = shown[places.entries[is_image], places.parts[is_image]]
+        return _Prompt(places, rows, counts_as_place)
 
     def _places(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Places":
         """Lay out a text whose images show so many objects; few texts differ, so they are remembered."""

@@ -9,6 +9,7 @@ from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
 
 MATCHING_STEPS = 400  # of presets with an appearance embedding
+DETECTED_SHARE = 0.5  # where there are boxes of a detector
 # What values of a type may be, and how that is called.
 _TYPES = {
     int: (Integral, "a whole number"),
@@ -31,6 +32,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "clip_norm": (1e-6, None),
     "spurious_probability": (0, 1),
     "motion_share": (0, 1),
+    "detected_share": (0, 1),
     "pretraining_steps": (0, None),
     "pretraining_scenes": (1, None),
     "pretraining_batch": (2, None),
@@ -78,9 +80,16 @@ class TrainingConfig:
         motion_share: Share of demonstrations that are read as "Follow this motion: frame … frame" instead of
             with the prompt of their task: 1 for inverse dynamics pretraining, part of them for use in
             context. The checkpoint is chosen by tasks, unless it is 1.
+        boxes: Detector whose boxes part of the demonstrations are shown with, images of prompts included:
+            "detector" for the one that comes with the package, "detector=folder" for another trained one, or
+            "module:function" or "file.py:function", which makes an `ObjectFinder`.
+        detected_share: Share of demonstrations that are shown with these boxes instead of the true ones,
+            drawn anew in each batch; None is half of them where `boxes` are given. The checkpoint is chosen
+            by true boxes, unless it is 1.
         pretraining_steps: Steps in which the crop encoder learns to match prompt and scene; 0 leaves it out,
             and the image encoder then learns while cloning. None is as the preset wants: 400 with an
-            appearance embedding (nano, nano-bins), 0 without one or with `init`.
+            appearance embedding (nano, nano-bins), 0 without one or with `init`; from there such an encoder
+            is taken over, and stays as it is unless `tune_crops` is set.
         pretraining_scenes: Scenes drawn for that.
         pretraining_batch: Pairs of one object a step.
         pretraining_learning_rate: Highest learning rate of that.
@@ -129,6 +138,8 @@ class TrainingConfig:
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
     motion_share: float = 0.0
+    boxes: str | None = None
+    detected_share: float | None = None
     pretraining_steps: int | None = None
     pretraining_scenes: int = 2500
     pretraining_batch: int = 128

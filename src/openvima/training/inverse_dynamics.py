@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.tokens.episode import COUNT, ID, PROMPT_WIDTH, TokenEpisode
+from openvima.data.tokens.episode import COUNT, ID, NUMBERS, PROMPT_WIDTH, TokenEpisode
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 
 MOTION_TEXT = "Follow this motion: {frames}."
@@ -28,16 +28,17 @@ def as_motion(episode: TokenEpisode) -> TokenEpisode:
 
     Args:
         episode: The demonstration. Its objects may be in any order; in a prompt image they stand in that of
-            their ids, as the scenes in the prompts of tasks have it.
+            their ids, as the scenes in the prompts of tasks have it. One that no view shows, as it stands
+            for a moment in which a detector found nothing, is left out.
     """
-    counts = episode.steps[:, COUNT]
     rows = np.concatenate([episode.objects[:, :PROMPT_WIDTH], episode.final])
-    counts = np.append(counts, len(episode.final)).astype(np.int32)
-    frame = np.repeat(np.arange(len(counts)), counts)
+    frame = np.repeat(np.arange(episode.num_steps + 1), [*episode.steps[:, COUNT], len(episode.final)])
+    shown = rows[:, NUMBERS].any(axis=1)
+    rows, frame = rows[shown], frame[shown]
     return replace(
         episode,
-        text=motion_text(len(counts)),
-        prompt_counts=counts,
+        text=motion_text(episode.num_steps + 1),
+        prompt_counts=np.bincount(frame, minlength=episode.num_steps + 1).astype(np.int32),
         prompt=rows[np.lexsort((rows[:, ID], frame))],
     )
 

@@ -15,7 +15,8 @@ from torch import nn
 from openvima.catalog.packs import load_assets
 from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
-from openvima.data.tokens.cache import TokenCache, open_tokens
+from openvima.data.tokens.cache import Boxes, TokenCache, open_tokens
+from openvima.detection.hooks import detected_tokens, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.training.board import Board
@@ -40,7 +41,7 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.source import ExampleSource, check_words, split_examples
+from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
 from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops
 
 Report = Callable[[int, int, str], None]
@@ -83,27 +84,34 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         The run folder; `load_policy` takes it.
 
     Raises:
-        ConfigError: The folder holds a run with other settings, or preset and settings contradict each other.
+        ConfigError: The folder holds a run with other settings, preset and settings contradict each other, or
+            there is no such detector.
         DatasetError: There are no demonstrations.
-        CheckpointError: The last checkpoint is damaged, or T5 is not where the settings say, or of other
-            sizes.
+        CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
+            or of other sizes.
         PromptError: A prompt has a word that the policy's vocabulary lacks.
         MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
     config = resolved(config)
     load_assets(config.assets)  # what is wrong is found before there is a run folder
     dataset = Dataset(config.data)
+    boxes = plugged_boxes(config.boxes) if config.boxes is not None else None
     with torch_threads(config.threads), joined(config.device, config.sharding) as parallel:
         learner = build_learner(config)
+        if boxes and learner.token_kind == "frames":
+            raise ConfigError(
+                f"boxes is {config.boxes!r}, but preset {config.preset!r} sees whole frames; leave boxes out, "
+                "or take a preset that sees objects."
+            )
         run = RunFolder(
             config.out,
-            _settings(config, dataset, learner),
+            _settings(config, dataset, learner, boxes),
             force=config.force,
             keep_every=config.keep_every,
             is_first=parallel.is_first,
         )
         parallel.wait()
-        trainer = _Trainer(config, dataset, learner, run, parallel, report or _ignore, rollout)
+        trainer = _Trainer(config, dataset, boxes, learner, run, parallel, report or _ignore, rollout)
         try:
             trainer.train()
         finally:
@@ -118,6 +126,7 @@ class _Trainer:
         self,
         config: TrainingConfig,
         dataset: Dataset,
+        boxes: Boxes | None,
         learner: Learner,
         run: RunFolder,
         parallel: Parallel,
@@ -125,7 +134,7 @@ class _Trainer:
         rollout: Rollout | None,
     ) -> None:
         self.config, self.dataset, self.learner, self.run = config, dataset, learner, run
-        self.parallel, self.report, self.rollout = parallel, report, rollout
+        self.boxes, self.parallel, self.report, self.rollout = boxes, parallel, report, rollout
         self.started = time.monotonic()
         self._last = (0, self.started)  # step and time of the last line of metrics
         self.progress = run.resume(learner)
@@ -267,15 +276,24 @@ class _Trainer:
         optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
 
     @cached_property
-    def _tokens(self) -> TokenCache:
-        """The token cache; the first process makes it if need be."""
-        kind, folder = self.learner.token_kind, self.config.tokens
+    def _tokens(self) -> list[TokenCache]:
+        """The token caches: of true boxes, of those of a detector, or first the one and then the other.
+
+        The first process makes them if need be.
+        """
+        share, folder = self.config.detected_share or 0.0, self.config.tokens
+        caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
-            return TokenCache(self.dataset, kind, folder)
-        tokens = open_tokens(self.dataset, kind, folder=folder, report=self._say)
-        self.parallel.wait()
-        return tokens
+        if share < 1:
+            kind = self.learner.token_kind
+            caches.append(open_tokens(self.dataset, kind, folder=folder, report=self._say))
+        if share > 0:
+            assert self.boxes is not None  # `resolved` has seen to it
+            caches.append(detected_tokens(self.dataset, self.boxes, folder=folder, report=self._say))
+        if self.parallel.is_first:
+            self.parallel.wait()
+        return caches
 
     def _steps_of_epochs(self, epochs: float) -> int:
         """Steps of so many passes over what is left to learn from when some is kept for validation."""
@@ -287,7 +305,7 @@ class _Trainer:
         """What to learn from, and what is held out."""
         config = self.config
         return split_examples(
-            self._tokens,
+            self._tokens[0],
             validation_share=config.validation_share,
             validation_episodes=config.validation_episodes,
         )
@@ -308,7 +326,7 @@ class _Trainer:
         self._report(f"reading {len(self.dataset)} demonstrations")
         tokens, config = self._tokens, self.config
         if isinstance(self.learner, PolicyLearner):
-            check_words(tokens, self.learner.reader)
+            check_words(tokens[0], self.learner.reader)
             if config.motion_share:
                 self.learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
             if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
@@ -316,7 +334,9 @@ class _Trainer:
         if config.compile:
             compile_layers(self.learner)
         self.module = self.parallel.wrap(self.learner)
-        return Cloning(self.learner, self.module, config, *self._examples, self.parallel)
+        training, validation = self._examples
+        detected = with_boxes_of(tokens[1], training) if len(tokens) > 1 else None
+        return Cloning(self.learner, self.module, config, training, validation, self.parallel, detected)
 
     def _say(self, done: int, total: int, note: str) -> None:
         self._report(f"{note or 'cutting out objects'}, {done} of {total}")
@@ -342,11 +362,13 @@ def _optimizer(learner: Learner, stage: Stage, config: TrainingConfig) -> torch.
     return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True)
 
 
-def _settings(config: TrainingConfig, dataset: Dataset, learner: Learner) -> dict[str, Any]:  # Any: YAML
+def _settings(
+    config: TrainingConfig, dataset: Dataset, learner: Learner, boxes: Boxes | None
+) -> dict[str, Any]:  # Any: YAML
     """Everything that decides the weights: settings, network sizes, and which demonstrations there are."""
     index = hashlib.blake2b((config.data / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
     values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
-    demonstrations = {"episodes": len(dataset), "index": index}
+    demonstrations = {"episodes": len(dataset), "index": index, **({"boxes": boxes.name} if boxes else {})}
     return {"training": values, "demonstrations": demonstrations, "policy": learner.description()}
 
 

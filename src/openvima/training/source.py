@@ -36,7 +36,10 @@ class ExampleSource(Sequence[Example]):
         return len(self.rows)
 
     def __getitem__(self, index: int) -> Example:  # type: ignore[override]  # nobody slices
-        row = int(self.rows[index])
+        return self.example(int(self.rows[index]))
+
+    def example(self, row: int) -> Example:
+        """Return a demonstration by its number among all."""
         return Example(self.cache[row], int(self.bases[row]), row)
 
     def num_steps(self, indices: np.ndarray) -> int:
@@ -53,20 +56,31 @@ class Parts:
         seed: Of the run; every example has a generator of its own for every batch.
         largest: Demonstrations of a part.
         count: Make exactly so many parts, whatever the lengths; None makes as many as are useful.
+        detected: The same demonstrations with the boxes of a detector; see `with_boxes_of`.
+        detected_share: How many are shown with these instead.
     """
 
     collate: Collate
     seed: int
     largest: int
     count: int | None = None
+    detected: ExampleSource | None = None
+    detected_share: float = 0.0
 
     def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
         """Return the batches of one step, each with its number of steps in demonstrations."""
         parts = []
         for part in self._divided(examples):
             rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
-            parts.append((self.collate(part, rngs), sum(e.tokens.num_steps for e in part)))
+            shown = [self._shown(example, rng) for example, rng in zip(part, rngs, strict=True)]
+            parts.append((self.collate(shown, rngs), sum(e.tokens.num_steps for e in part)))
         return parts
+
+    def _shown(self, example: Example, rng: np.random.Generator) -> Example:
+        """Draw whose boxes an example is shown with; it has equally many steps with either."""
+        if self.detected is None or rng.random() >= self.detected_share:
+            return example
+        return self.detected.example(example.row)
 
     def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
         if self.count is not None:
@@ -110,6 +124,19 @@ def split_examples(
     kept = np.sort(kept[np.argsort(lots[kept], kind="stable")[:validation_episodes]])
     first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
     return first, second
+
+
+def with_boxes_of(detected: TokenCache, source: ExampleSource) -> ExampleSource:
+    """Return the demonstrations of a source with the boxes of a detector.
+
+    Args:
+        detected: What the detector found in the demonstrations of the source's cache. Its images come after
+            all of that one's.
+        source: Which demonstrations.
+    """
+    counts = detected.image_counts()
+    bases = np.cumsum(counts) - counts + source.cache.image_counts().sum()
+    return ExampleSource(detected, source.rows, bases, detected.lengths()[source.rows])
 
 
 def check_words(cache: TokenCache, reader: Reader) -> None:

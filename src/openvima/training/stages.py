@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -92,6 +92,7 @@ class Cloning:
         training: Demonstrations to learn from.
         validation: Demonstrations that choose the best checkpoint.
         parallel: The processes of the run.
+        detected: Those to learn from, with the boxes of a detector, if they are to be mixed in.
     """
 
     name = "2-cloning"
@@ -104,11 +105,12 @@ class Cloning:
         training: ExampleSource,
         validation: ExampleSource,
         parallel: Parallel,
+        detected: ExampleSource | None = None,
     ) -> None:
         self.learning_rate = config.learning_rate
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
-        self._training, self._validation = training, validation
+        self._training, self._validation, self._detected = training, validation, detected
         self._validated = module if parallel.is_sharded else learner
         self._order = order_of(
             training,
@@ -168,7 +170,8 @@ class Cloning:
         largest = -(-ours // config.accumulate)
         # Sharded weights are gathered at every pass, so all processes must make equally many.
         count = min(config.accumulate, ours) if self._parallel.is_sharded else None
-        parts = Parts(self._learner.collator(), config.seed, largest, count)
+        share = config.detected_share or 0.0
+        parts = Parts(self._learner.collator(), config.seed, largest, count, self._detected, share)
         stream = BatchStream(self._training, self._order, first=step, transform=parts)
         return iter(batches_of(stream, num_workers=min(config.loader_workers, _num_processors())))
 
@@ -187,11 +190,16 @@ class Cloning:
         return loss, metrics
 
 
-def freeze_crops(learner: PolicyLearner, cache: TokenCache) -> None:
-    """Leave the crop encoder as it is; where there are not too many images, encode each once and for all."""
+def freeze_crops(learner: PolicyLearner, caches: Sequence[TokenCache]) -> None:
+    """Leave the crop encoder as it is; where there are not too many images, encode each once and for all.
+
+    Args:
+        learner: Whose encoder.
+        caches: All that is learnt from; their images are numbered one cache after the other.
+    """
     for parameter in crop_parameters(learner.network):
         parameter.requires_grad_(False)
-    count = int(cache.image_counts().sum())
+    count = sum(int(cache.image_counts().sum()) for cache in caches)
     if count > MAX_FEATURES:
         return
     device = next(learner.parameters()).device
@@ -199,11 +207,12 @@ def freeze_crops(learner: PolicyLearner, cache: TokenCache) -> None:
     parts = [np.zeros((1, 3, height, width), np.uint8)]  # number 0 is black
     features = []
     with torch.no_grad():
-        for start in range(0, len(cache), CHUNK):
-            parts += [episode.images for episode in cache[start : start + CHUNK]]
-            images = torch.from_numpy(np.concatenate(parts)).to(device)
-            features.append(learner.network.encode_images(images))
-            parts = []
+        for cache in caches:
+            for start in range(0, len(cache), CHUNK):
+                parts += [episode.images for episode in cache[start : start + CHUNK]]
+                images = torch.from_numpy(np.concatenate(parts)).to(device)
+                features.append(learner.network.encode_images(images))
+                parts = []
     learner.features = torch.cat(features)
 
 
