@@ -24,6 +24,7 @@ from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
 from openvima.training.inverse_dynamics import MOTION_TEXT
 from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.lengths import check_lengths
 from openvima.training.parallel import (
     Parallel,
     compile_layers,
@@ -42,7 +43,7 @@ from openvima.training.run_folder import (
 )
 from openvima.training.schedule import learning_rate_at, step_seed
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
-from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops
+from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops, keeps_crops
 
 Report = Callable[[int, int, str], None]
 # A trial in the simulator: checkpoint folder to metrics. It is handed in, since training needs no simulation.
@@ -329,7 +330,11 @@ class _Trainer:
             check_words(tokens[0], self.learner.reader)
             if config.motion_share:
                 self.learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
-            if config.pretraining_steps and not config.tune_crops:  # else the encoder must be trained here
+            for cache in tokens:
+                check_lengths(
+                    cache, self.learner.network, self.learner.reader, motion_share=config.motion_share
+                )
+            if keeps_crops(self.learner.network, config):
                 freeze_crops(self.learner, tokens)
         if config.compile:
             compile_layers(self.learner)

@@ -190,6 +190,13 @@ class Cloning:
         return loss, metrics
 
 
+def keeps_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
+    """Whether the crop encoder stays as it is: it has matched looks, here or where the weights come from."""
+    images = network.images
+    matches = isinstance(images, ObjectEncoder) and images.config.appearance_width > 0
+    return matches and bool(config.pretraining_steps or config.init) and not config.tune_crops
+
+
 def freeze_crops(learner: PolicyLearner, caches: Sequence[TokenCache]) -> None:
     """Leave the crop encoder as it is; where there are not too many images, encode each once and for all.
 
