@@ -5,6 +5,7 @@ from pathlib import Path
 
 from openvima.detection.config import DETECTORS
 from openvima.errors import ConfigError, unknown_name
+from openvima.training.checks import problems_of
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {
@@ -13,7 +14,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "learning_rate": (0, 1),
     "warmup_steps": (0, None),
     "weight_decay": (0, None),
-    "clip_norm": (0, None),
+    "clip_norm": (1e-6, None),
     "sampled": (1, None),
     "prompt_share": (0, 1),
     "seed": (0, 2**63 - 1),
@@ -74,15 +75,10 @@ class DetectorTrainingConfig:
     force: bool = False
 
     def __post_init__(self) -> None:
-        problems = []
-        if self.preset not in DETECTORS:
+        problems = list(problems_of(self, _BOUNDS))
+        if isinstance(self.preset, str) and self.preset not in DETECTORS:
             problems.append(unknown_name("detector", self.preset, DETECTORS))
-        if self.batch % 2:
+        if isinstance(self.batch, int) and self.batch % 2:
             problems.append(f"batch is {self.batch}; it must be even, as frames come in pairs of views.")
-        for name, (low, high) in _BOUNDS.items():
-            value = getattr(self, name)
-            if not (low <= value and (high is None or value <= high)):
-                allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"
-                problems.append(f"{name} is {value:g}; it must be {allowed}.")
         if problems:
             raise ConfigError(" ".join(problems))
