@@ -1,6 +1,7 @@
 """The verb `detector`, and `--boxes detector` of evaluate and demo."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from openvima.detection import config as sizes  # noqa: E402
 from openvima.detection.checkpoint import load_network, save_network  # noqa: E402
 from openvima.detection.config import BackboneConfig, DetectorConfig  # noqa: E402
 from openvima.detection.network import MaskRCNN  # noqa: E402
+from openvima.policies.devices import torch_threads  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +61,38 @@ def test_frames_of_a_level_are_played_where_no_folder_is_given(detector, capsys)
     assert main(["detector", "evaluate", str(detector), "--level", "L4", "--frames", "2"]) == 0
     table = capsys.readouterr().out
     assert "AP50" in table and "boxes" in table and "masks" in table
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--data", "DATA", "--held-out", "0"], "no demonstration to look at"),
+        (["--data", "DATA", "--held-out", "1.5"], "held-out is 1.5"),
+        (["--data", "DATA", "--level", "L3"], "leave one of them out"),
+        (["--data", "nowhere"], "there is no folder nowhere"),
+        (["--held-out", "0.1", "--frames", "0"], r"frames is 0; .* no data are given"),
+        (["--level", "L9"], "no level 'L9'"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--prompt-share", "7"], "prompt-share is 7"),
+        (["--device", "abacus"], "device 'abacus' cannot be used here"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_told_in_one_line(detector, data, capsys, words, message):
+    words = [str(data) if word == "DATA" else word for word in words]
+    assert main(["detector", "evaluate", str(detector), *words]) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert re.search(message, told)
+
+
+def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
+    def scored(threads: int) -> str:
+        with torch_threads(threads):
+            words = [str(detector), "--data", str(data), "--frames", "4", "--json"]
+            assert main(["detector", "evaluate", *words]) == 0
+            assert torch.get_num_threads() == threads
+        return capsys.readouterr().out
+
+    assert scored(1) == scored(2)
 
 
 def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):

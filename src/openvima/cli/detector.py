@@ -46,9 +46,9 @@ def evaluate(
     detector: Folder = None,
     *,
     data: Path | None = None,
-    level: str = LEVEL,
+    level: str | None = None,
     frames: int = 400,
-    held_out: float = 0.0,
+    held_out: float | None = None,
     prompt_share: float = 0.25,
     seed: int = 0,
     device: str = "cpu",
@@ -61,10 +61,11 @@ def evaluate(
     Args:
         detector: Run folder or checkpoint folder; by default the detector that comes with the package.
         data: Folder of demonstrations; without it the oracle plays episodes of all tasks of the level.
-        level: train, L1, L2, L3 or L4; where no --data is given.
-        frames: Images to look at.
+        level: train, L1, L2, L3 or L4, instead of --data; by default L3, whose objects and textures training
+            never shows.
+        frames: Images to look at, rounded up to pairs of views.
         held_out: Of --data, look at the demonstrations alone that a training with this validation share
-            keeps aside; 0 looks at all.
+            keeps aside, such as 0.02; by default at all.
         prompt_share: Share of the images that show a prompt instead of the table.
         seed: Decides which images; also the first seed to play.
         device: Where to compute: cpu or cuda.
@@ -79,7 +80,11 @@ def evaluate(
 
     require_pycocotools()  # before what takes a while
     loaded = load_detector(detector, device=device)
-    with _frames(data, level, frames, held_out, prompt_share, seed) as source, progress_bar("looking") as bar:
+    with (
+        _one_thread(),
+        _frames(data, level, frames, held_out, prompt_share, seed) as source,
+        progress_bar("looking") as bar,
+    ):
         shown = _counted(held_out_frames(source, frames, seed=seed), frames, bar)
         score = score_detector(lambda rgb: loaded.detect(rgb, ""), shown)
     if as_json:
@@ -94,7 +99,7 @@ def show(
     *,
     out: Path = Path("detections.png"),
     data: Path | None = None,
-    level: str = LEVEL,
+    level: str | None = None,
     frames: int = 12,
     prompt_share: float = 0.25,
     score: float = 0.5,
@@ -108,8 +113,9 @@ def show(
         detector: Run folder or checkpoint folder; by default the detector that comes with the package.
         out: PNG file to write.
         data: Folder of demonstrations; without it the oracle plays episodes of all tasks of the level.
-        level: train, L1, L2, L3 or L4; where no --data is given.
-        frames: Images to look at.
+        level: train, L1, L2, L3 or L4, instead of --data; by default L3, whose objects and textures training
+            never shows.
+        frames: Images to look at, rounded up to pairs of views.
         prompt_share: Share of the images that show a prompt instead of the table.
         score: What is less sure is left out.
         seed: Decides which images; also the first seed to play.
@@ -125,9 +131,10 @@ def show(
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out is {str(out)!r}; a picture is a PNG file, give a name that ends in .png.")
     loaded = load_detector(detector)
-    with _frames(data, level, frames, 0.0, prompt_share, seed) as source:
-        shown = list(held_out_frames(source, frames, seed=seed))
-    save_sheet([draw_detections(frame, loaded.detect(frame.rgb, ""), score=score) for frame in shown], out)
+    with _one_thread(), _frames(data, level, frames, None, prompt_share, seed) as source:
+        shown = held_out_frames(source, frames, seed=seed)
+        pictures = [draw_detections(frame, loaded.detect(frame.rgb, ""), score=score) for frame in shown]
+    save_sheet(pictures, out)
     print(out)
     return 0
 
@@ -166,25 +173,54 @@ def convert(
 
 @contextmanager
 def _frames(
-    data: Path | None, level: str, frames: int, held_out: float, prompt_share: float, seed: int
+    data: Path | None,
+    level: str | None,
+    frames: int,
+    held_out: float | None,
+    prompt_share: float,
+    seed: int,
 ) -> "Iterator[FrameSource]":
     """Frames of a folder, or of demonstrations that are played for the purpose and deleted afterwards."""
     from openvima.data import Dataset
     from openvima.detection.frames import FrameSource
     from openvima.errors import ConfigError
 
+    problems = []
     if frames < 1:
-        raise ConfigError(f"frames is {frames}; it must be at least 1.")
+        problems.append(f"frames is {frames}; it must be at least 1.")
+    for name, share in (("held-out", held_out), ("prompt-share", prompt_share)):
+        if share is not None and not 0 <= share <= 1:
+            problems.append(f"{name} is {share:g}; it must be between 0 and 1.")
+    if data is not None and level is not None:
+        problems.append(f"both data and level are given ({data} and {level}); leave one of them out.")
+    if data is None and held_out is not None:
+        problems.append(f"held-out is {held_out:g}, but no data are given; name the training's with --data.")
+    if seed < 0:
+        problems.append(f"seed is {seed}; it must not be negative.")
+    if problems:
+        raise ConfigError(" ".join(problems))
     if data is not None:
         from openvima.training.detector.split import split_episodes
 
         dataset = Dataset(data)
-        episodes = split_episodes(dataset, held_out)[1] if held_out else None
+        episodes = None if held_out is None else split_episodes(dataset, held_out)[1]
         yield FrameSource(dataset, episodes, prompt_share=prompt_share)
         return
     with tempfile.TemporaryDirectory() as folder:
-        _play(Path(folder, "played"), level, frames, seed)
+        _play(Path(folder, "played"), level or LEVEL, frames, seed)
         yield FrameSource(Dataset(Path(folder, "played")), prompt_share=prompt_share)
+
+
+@contextmanager
+def _one_thread() -> "Iterator[None]":
+    """Find the same objects on every machine."""
+    from openvima.policies.base import require_torch
+
+    require_torch("a detector")
+    from openvima.policies.devices import torch_threads
+
+    with torch_threads(1):
+        yield
 
 
 def _play(folder: Path, level: str, frames: int, seed: int) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from openvima.data.reader import Dataset
 from openvima.data.schema import VIEWS
+from openvima.errors import DatasetError
 from openvima.perception.objects import MIN_PIXELS
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 
@@ -101,7 +102,14 @@ def held_out_frames(source: FrameSource, count: int, *, seed: int) -> Iterator[F
         source: Where they come from.
         count: How many; rounded up to pairs of views.
         seed: Decides which.
+
+    Raises:
+        DatasetError: There is no episode.
     """
+    if not len(source):
+        raise DatasetError(
+            "there is no demonstration to look at; give more of them, or keep a larger share aside."
+        )
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(source))
     for place in range((count + 1) // 2):
