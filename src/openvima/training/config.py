@@ -1,22 +1,15 @@
 """Everything that decides a training run, as a frozen record that checks itself."""
 
 from dataclasses import dataclass
-from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
+from openvima.training.checks import problems_of
 
 MATCHING_STEPS = 400  # of presets with an appearance embedding
 DETECTED_SHARE = 0.5  # where there are boxes of a detector
-# What values of a type may be, and how that is called.
-_TYPES = {
-    int: (Integral, "a whole number"),
-    float: (Real, "a number"),
-    bool: (bool, "true or false"),
-    str: (str, "text"),
-}
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {
@@ -171,34 +164,6 @@ class TrainingConfig:
         if isinstance(self.preset, str) and self.preset not in PRESETS and ":" not in self.preset:
             hint = "`openvima policies` lists all."
             problems.append(unknown_name("preset", self.preset, PRESETS, hint))
-        for name, hint in get_type_hints(type(self)).items():
-            if problem := _problem(name, getattr(self, name), get_args(hint) or (hint,)):
-                problems.append(problem)
+        problems += problems_of(self, _BOUNDS)
         if problems:
             raise ConfigError(" ".join(problems))
-
-
-def _problem(name: str, value: Any, kinds: tuple[Any, ...]) -> str | None:  # Any: words, or types
-    """Say why a setting cannot be so, if it cannot.
-
-    Args:
-        name: Of the setting.
-        value: Given for it, perhaps by a file, so that it may be anything.
-        kinds: The words from which to choose, or the types that it may have.
-    """
-    if isinstance(kinds[0], str):
-        return None if value in kinds else unknown_name(name, value, kinds)
-    if kinds[0] not in _TYPES or (value is None and type(None) in kinds):
-        return None
-    kind, called = _TYPES[kinds[0]]
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        return f"{name} is {value!r}; it must be {called}."
-    return _out_of_range(name, value) if name in _BOUNDS else None
-
-
-def _out_of_range(name: str, value: Any) -> str | None:  # Any: a number
-    low, high = _BOUNDS[name]
-    if low <= value and (high is None or value <= high):
-        return None
-    allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"
-    return f"{name} is {value:g}; it must be {allowed}."
