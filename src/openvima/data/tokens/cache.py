@@ -192,8 +192,11 @@ def open_tokens(
             if report is not None:
                 report(done, total, "")
 
-        for _ in in_processes(_write, work, workers, report=say):
-            pass  # the result of a job is its file
+        try:
+            for _ in in_processes(_write, work, workers, report=say):
+                pass  # the result of a job is its file
+        finally:
+            _finder.cache_clear()  # where it was made here
     return TokenCache(dataset, kind, folder, name)
 
 
