@@ -64,22 +64,14 @@ def test_of_three_boxes_in_a_chain_the_middle_one_goes():
     assert suppress(boxes, torch.tensor([0.8, 0.9, 0.7]), 0.3).tolist() == [1]
 
 
-def test_boxes_of_other_groups_do_not_compete():
-    boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 10]])
-    scores, groups = torch.tensor([0.5, 0.6]), torch.tensor([0, 1])
-    assert suppress(boxes, scores, 0.5).tolist() == [1]
-    assert suppress(boxes, scores, 0.5, groups).tolist() == [1, 0]
-
-
 @pytest.mark.parametrize("limit", [0.0, 0.1, 0.3, 0.5, 0.7])
 @pytest.mark.parametrize("seed", range(5))
 def test_suppression_agrees_with_the_slow_twin(limit, seed):
     rng = np.random.default_rng(seed)
     boxes = random_boxes(80, seed)
     scores = rng.integers(0, 20, 80) / 20  # with ties
-    groups = rng.integers(0, 2, 80)
-    kept = suppress(boxes, torch.from_numpy(scores), limit, torch.from_numpy(groups))
-    assert kept.tolist() == slow.suppress(boxes.tolist(), scores.tolist(), limit, groups.tolist())
+    kept = suppress(boxes, torch.from_numpy(scores), limit)
+    assert kept.tolist() == slow.suppress(boxes.tolist(), scores.tolist(), limit, [0] * 80)
 
 
 def test_nothing_is_left_of_nothing():

@@ -68,9 +68,7 @@ def decode_boxes(deltas: torch.Tensor, references: torch.Tensor, weights: Weight
     return torch.cat([centres - halves, centres + halves], dim=-1)
 
 
-def suppress(
-    boxes: torch.Tensor, scores: torch.Tensor, overlap: float, groups: torch.Tensor | None = None
-) -> torch.Tensor:
+def suppress(boxes: torch.Tensor, scores: torch.Tensor, overlap: float) -> torch.Tensor:
     """Leave out boxes that overlap a better one which is itself kept.
 
     The better of two equal scores is the one that comes first. All pairs are compared at once: starting from
@@ -82,7 +80,6 @@ def suppress(
         boxes: Shape (N, 4).
         scores: Shape (N,).
         overlap: Largest intersection over union of two boxes that are kept.
-        groups: Boxes of different groups do not compete, shape (N,), integers.
 
     Returns:
         Indices of the boxes that are kept, the best first, shape (K,), int64.
@@ -90,9 +87,6 @@ def suppress(
     order = scores.argsort(descending=True, stable=True)
     boxes = boxes[order]
     beats = (overlaps(boxes, boxes) > overlap).triu(diagonal=1)  # row beats column
-    if groups is not None:
-        groups = groups[order]
-        beats &= groups[:, None] == groups
     kept = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     while True:
         now = ~beats[kept].any(dim=0)

@@ -59,20 +59,20 @@ class ProposalNetwork(nn.Module):
 
     def _propose(self, scored: "ScoredAnchors", image: int, *, height: int, width: int) -> torch.Tensor:
         config = self.config
-        boxes, scores, groups = [], [], []
-        levels = zip(scored.anchors, scored.scores, scored.deltas, strict=True)
-        for number, (anchors, level_scores, deltas) in enumerate(levels):
-            best, rows = level_scores[image].topk(min(config.candidates, len(anchors)))
-            boxes.append(decode_boxes(deltas[image, rows], anchors[rows], WEIGHTS))
-            scores.append(best)
-            groups.append(torch.full_like(rows, number))
-        box, score, group = (
-            clip(torch.cat(boxes), height=height, width=width),
-            *map(torch.cat, (scores, groups)),
-        )
-        solid = ((box[:, 2:] > box[:, :2]).all(dim=1)).nonzero()[:, 0]
-        kept = suppress(box[solid], score[solid], config.proposal_overlap, group[solid])
-        return box[solid[kept[: config.proposals]]]
+        kept_boxes, kept_scores = [], []
+        for anchors, scores, deltas in zip(scored.anchors, scored.scores, scored.deltas, strict=True):
+            best, rows = scores[image].topk(min(config.candidates, len(anchors)))
+            boxes = clip(
+                decode_boxes(deltas[image, rows], anchors[rows], WEIGHTS), height=height, width=width
+            )
+            solid = (boxes[:, 2:] > boxes[:, :2]).all(dim=1)
+            boxes, best = boxes[solid], best[solid]
+            # Levels one by one: comparing the boxes of all at once takes twice as long.
+            kept = suppress(boxes, best, config.proposal_overlap)
+            kept_boxes.append(boxes[kept])
+            kept_scores.append(best[kept])
+        order = torch.cat(kept_scores).argsort(descending=True, stable=True)
+        return torch.cat(kept_boxes)[order[: config.proposals]]
 
     def losses(
         self, scored: "ScoredAnchors", objects: Sequence[torch.Tensor], generator: torch.Generator

@@ -37,10 +37,10 @@ def roi_align(
     """
     boxes = boxes / stride - 0.5
     lows, extents = boxes[:, :2], boxes[:, 2:] - boxes[:, :2]
-    if samples:
-        counts = torch.full((len(boxes), 2), samples, device=boxes.device)
-    else:
-        counts = (extents / size).ceil().clamp(min=1).long()
+    if samples and len(boxes):
+        x, y = (_points(lows[:, axis], extents[:, axis], size, samples) for axis in (0, 1))
+        return _read(features, x, y, images)
+    counts = (extents / size).ceil().clamp(min=1).long()
     result = features.new_zeros(len(boxes), features.shape[1], size, size)
     for columns, rows in counts.unique(dim=0).tolist():  # boxes with equally many points at once
         chosen = ((counts[:, 0] == columns) & (counts[:, 1] == rows)).nonzero()[:, 0]
