@@ -1,0 +1,165 @@
+"""How fast the detector finds objects and learns, on one core.
+
+    python benchmarks/detector.py [--quick] [--detector FOLDER] [--preset NAME] [--rounds R] [--json FILE]
+
+Frames are those of episodes that the oracle plays, one moment of each. Detecting is timed for both frames of
+a moment: by the network alone, and as for a policy, with boxes paired between the views and crops cut out.
+What the mask head costs depends on how many objects are found, so a trained detector is needed for that: that
+of the package, or another. Without one the weights are random, and as many objects are let through as the
+frames show. A training step holds augmentation, losses, gradients and the optimizer, not the reading of
+shards. Times are processor times of this process; ways take turns, and medians are reported.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+
+from openvima.data.records import rollout_oracle
+from openvima.detection import PACKAGED, detector_config, load_detector
+from openvima.detection.augment import augmented
+from openvima.detection.detector import FrameDetector
+from openvima.detection.frames import Frame, frame_of
+from openvima.detection.network import MaskRCNN
+from openvima.env import TabletopEnv
+from openvima.policies.detection import DetectedObjects
+from openvima.render.camera import VIEWS
+from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
+from openvima.tasks import list_tasks, task_spec
+from openvima.training.detector import DetectorTrainingConfig
+from openvima.training.detector.learner import DetectorLearner, FrameBatch
+from sim import circumstances
+
+FIRST_SEED = 3_000_000
+QUICK_TASKS = ("rotate", "visual_manipulation")
+DEFAULTS = DetectorTrainingConfig(data=Path(), out=Path())  # of training
+
+
+def moments(tasks: Sequence[str], episodes: int) -> list[dict[str, Any]]:
+    """Return one observation of each episode, with its `ee`."""
+    found = []
+    for task in tasks:
+        env = TabletopEnv(task, level=task_spec(task).levels[0])
+        for number in range(episodes):
+            demo = rollout_oracle(env, FIRST_SEED + number)
+            found.append(demo.observation(number % demo.num_steps))
+    return found
+
+
+def frames_of(observation: dict[str, Any]) -> list[Frame]:
+    """Return both frames of an observation, with the objects that they show."""
+    ids = range(FIRST_OBJECT_ID[("suction", "spatula")[observation["ee"]]], BACKGROUND_ID)
+    return [frame_of(observation["rgb"][view], observation["segm"][view], ids) for view in VIEWS]
+
+
+def detector_to_measure(folder: Path | None, preset: str, objects: int) -> tuple[FrameDetector, str]:
+    """Return a detector, and whose weights it has."""
+    if folder is not None or (preset == "small" and PACKAGED.is_dir()):
+        return load_detector(folder), "the package's" if folder is None else str(folder)
+    torch.manual_seed(0)
+    network = MaskRCNN(replace(detector_config(preset), score=0.0, most=objects))
+    return FrameDetector(network.eval()), f"random weights of {preset}"
+
+
+def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
+    """Return a function that does one step of training on some of the frames."""
+    torch.manual_seed(0)
+    network = MaskRCNN(detector_config(preset))
+    learner = DetectorLearner(network, sampled=DEFAULTS.sampled).train()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+    optimizer = torch.optim.AdamW(learner.parameters(), lr=DEFAULTS.learning_rate)
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    chosen = [frames[number % len(frames)] for number in range(DEFAULTS.batch)]
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        loss, _ = learner(FrameBatch.of([augmented(frame, rng) for frame in chosen], generator))
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(learner.parameters(), DEFAULTS.clip_norm)
+        optimizer.step()
+
+    return step
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Processor time of one call."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Time everything in turns, after a first round that warms up."""
+    tasks = QUICK_TASKS if options.quick else list_tasks()
+    observations = moments(tasks, 1 if options.quick else 2)
+    frames = [frame for observation in observations for frame in frames_of(observation)]
+    shown = statistics.mean(len(frame.boxes) for frame in frames)
+    detector, whose = detector_to_measure(options.detector, options.preset, round(shown))
+    finder, step = DetectedObjects(detector), training_step(options.preset, frames)
+    times: dict[str, list[float]] = {"detect": [], "find": [], "train": []}
+    for number in range(options.rounds + 1):
+        detect, find = [], []
+        for observation in observations:
+            pair = [observation["rgb"][view] for view in VIEWS]
+            detect.append(seconds(lambda pair=pair: [detector.detect(rgb, "") for rgb in pair]))
+            find.append(seconds(lambda observation=observation: finder.in_observation(observation)))
+        train = seconds(step)
+        if number:
+            times["detect"] += detect
+            times["find"] += find
+            times["train"].append(train)
+    found = [len(detector.detect(frame.rgb, "").boxes) for frame in frames]
+    return {
+        "detector": whose,
+        "pairs": len(observations),
+        "objects_a_frame": round(shown, 2),
+        "found_a_frame": round(statistics.mean(found), 2),
+        "detect_ms_a_pair": summary(times["detect"], 1e3),
+        "find_objects_ms_a_pair": summary(times["find"], 1e3),
+        f"training_s_a_step_of_{DEFAULTS.batch}_frames": summary(times["train"], 1.0),
+    }
+
+
+def summary(values: Sequence[float], scale: float) -> dict[str, float]:
+    """Return median, 10th and 90th percentile."""
+    low, middle, high = (round(float(q) * scale, 2) for q in np.percentile(values, (10, 50, 90)))
+    return {"median": middle, "p10": low, "p90": high}
+
+
+def main() -> None:
+    """Measure, print, and write the numbers as JSON if asked."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--quick", action="store_true", help="two moments and one round, to try it out")
+    parser.add_argument("--detector", type=Path, help="trained detector; by default the package's")
+    parser.add_argument("--preset", default="small", choices=("small", "resnet50"), help="what is trained")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds, after a first that warms up")
+    parser.add_argument("--json", type=Path, help="file to write")
+    options = parser.parse_args()
+    if options.quick:
+        options.rounds = 1
+    torch.set_num_threads(1)
+    where = circumstances() | {"torch": torch.__version__, "threads": 1, "rounds": options.rounds}
+    print(", ".join(f"{name}: {value}" for name, value in where.items()))
+    results = measure(options)
+    for name, value in results.items():
+        shown = value
+        if isinstance(value, dict):
+            shown = f"{value['median']:.2f}   (80 % of them {value['p10']:.2f} to {value['p90']:.2f})"
+        print(f"{name.replace('_', ' '):<36}{shown}")
+    if options.json:
+        options.json.write_text(json.dumps(results | where, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
