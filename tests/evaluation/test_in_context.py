@@ -32,6 +32,7 @@ def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
         for view in ("front", "top"):
             np.testing.assert_array_equal(image.rgb[view], demo.rgb[view][t])
             np.testing.assert_array_equal(image.segm[view], demo.segm[view][t])
+        assert image.objects == tuple(sorted(demo.objects, key=lambda record: record.object_id))
     np.testing.assert_array_equal(prompt.images["frame_0"].rgb["top"], observation["rgb"]["top"])
     words = [piece for piece in prompt.sequence() if isinstance(piece, str)]
     assert words[0] == "Follow this motion:"
