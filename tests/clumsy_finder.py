@@ -28,7 +28,7 @@ class Clumsy:
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
         """Find the objects of a prompt's image."""
-        return self._seen(observe_prompt_image(image), image.rgb["front"])
+        return self._seen(observe_prompt_image(image).left_to_right(), image.rgb["front"])
 
     def _seen(self, true: ObjectViews, rgb: np.ndarray) -> ObjectViews:
         if int(rgb.sum()) % 5 == 0:

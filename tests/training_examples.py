@@ -3,10 +3,12 @@
 from collections.abc import Iterable
 
 import numpy as np
+import pytest
 
 from openvima.data import Demonstration
 from openvima.data.tokens.episode import tokens_of
 from openvima.policies.inputs import Reader
+from openvima.training import TrainingConfig, train
 from openvima.training.dataset import Example, stack_images, token_kind
 from openvima.training.source import ExampleSource
 
@@ -27,3 +29,29 @@ def source_of(demos: Iterable[Demonstration], reader: Reader) -> ExampleSource:
 def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]:
     """A generator for each example."""
     return [np.random.default_rng([seed, number]) for number in range(len(examples))]
+
+
+class Killed(BaseException):
+    """Stands for a kill signal."""
+
+
+def train_until(config: TrainingConfig, step: int) -> None:
+    """Train and be killed when so many steps have been begun; nothing is tidied up."""
+    from openvima.training import loop
+
+    begun = 0
+
+    class Trainer(loop._Trainer):
+        def _step(self, *arguments):
+            nonlocal begun
+            begun += 1
+            if begun > step:
+                raise Killed
+            return super()._step(*arguments)
+
+    original, loop._Trainer = loop._Trainer, Trainer
+    try:
+        with pytest.raises(Killed):
+            train(config)
+    finally:
+        loop._Trainer = original

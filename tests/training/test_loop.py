@@ -13,32 +13,7 @@ from openvima.errors import AssetError, CheckpointError, ConfigError, DatasetErr
 from openvima.policies import load_policy  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.run_folder import RunFolder  # noqa: E402
-
-
-class Killed(BaseException):
-    """Stands for a kill signal."""
-
-
-def train_until(config: TrainingConfig, step: int) -> None:
-    """Train and be killed when so many steps have been begun; nothing is tidied up."""
-    from openvima.training import loop
-
-    begun = 0
-
-    class Trainer(loop._Trainer):
-        def _step(self, *arguments):
-            nonlocal begun
-            begun += 1
-            if begun > step:
-                raise Killed
-            return super()._step(*arguments)
-
-    original, loop._Trainer = loop._Trainer, Trainer
-    try:
-        with pytest.raises(Killed):
-            train(config)
-    finally:
-        loop._Trainer = original
+from training_examples import train_until  # noqa: E402
 
 
 def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:

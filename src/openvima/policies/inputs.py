@@ -183,7 +183,8 @@ class Reader:
         images = [self._see_prompt_image(piece) for piece in sequence if isinstance(piece, PromptImage)]
         slots = _widest(images)
         if self.layout == "views":
-            images = [image.padded(max(slots)) for image in images]
+            # What comes after the fullest view's objects is hidden in both.
+            images = [image.select(np.arange(len(image)) < max(slots)).padded(max(slots)) for image in images]
         count, unread = 0, iter(images)
         for piece in sequence:
             if isinstance(piece, str):

@@ -1,0 +1,264 @@
+"""Training on boxes of a detector: what acting shows, in the share asked for, and exactly resumed."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from clumsy_finder import HOOK, Clumsy  # noqa: E402
+from openvima.data import Dataset  # noqa: E402
+from openvima.data.tokens.cache import open_tokens  # noqa: E402
+from openvima.data.tokens.episode import tokens_of  # noqa: E402
+from openvima.detection.hooks import PluggedFinder, detected_tokens, plugged_boxes  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.perception.image_stack import ImageStack  # noqa: E402
+from openvima.perception.objects import ObjectViews  # noqa: E402
+from openvima.policies import load_policy  # noqa: E402
+from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
+from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.dataset import Example  # noqa: E402
+from openvima.training.inverse_dynamics import motion_prompt  # noqa: E402
+from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.source import ExampleSource, Parts, split_examples, with_boxes_of  # noqa: E402
+from training_examples import train_until  # noqa: E402
+
+
+class Guesses:
+    """A detector that knows nothing: boxes anywhere, by the pixels of the image alone."""
+
+    def detect(self, rgb: np.ndarray, view: str) -> Detections:
+        """Draw a few boxes."""
+        rng = np.random.default_rng(int(rgb.sum()))
+        first = rng.integers((0, 0), (200, 90), (rng.integers(1, 9), 2))
+        last = first + rng.integers(1, 38, first.shape)
+        return Detections(np.concatenate([first, last], axis=1), scores=rng.random(len(first)))
+
+
+FINDERS = {"clumsy": PluggedFinder(Clumsy()), "guesses": PluggedFinder(DetectedObjects(Guesses()))}
+
+
+def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
+    """Compare a batch with what a policy reads step by step."""
+    stack = ImageStack(reader.image_size)
+    stack.add(np.zeros((3, *reader.image_size), np.uint8))
+
+    def add(objects: ObjectViews) -> np.ndarray:
+        numbers = np.zeros(objects.masks.shape, np.int64)
+        if objects.masks.any():
+            numbers[objects.masks] = stack.add(objects.crops[objects.masks])
+        return numbers
+
+    read = [reader.read_prompt(prompt) for prompt in prompts]
+    histories = []
+    for demo in demos:
+        episode = reader.begin_episode()
+        histories.append([episode.read_step(demo.observation(t)) for t in range(demo.num_steps)])
+    expected_prompts = batch_prompts(read, [add(prompt.objects) for prompt in read])
+    numbers = [[add(step.objects) for step in history] for history in histories]
+    expected_history = batch_histories(histories, numbers)
+    images = torch.from_numpy(stack.stacked())
+    for ours, theirs in ((batch.prompts, expected_prompts), (batch.history, expected_history)):
+        for field in fields(ours):
+            got, asked = getattr(ours, field.name), getattr(theirs, field.name)
+            if field.name.startswith("crops"):  # the numbers differ, what they name does not
+                got, asked = batch.images[got], images[asked]
+            assert got.dtype == asked.dtype, field.name
+            assert torch.equal(got, asked), field.name
+
+
+@pytest.mark.parametrize("name", FINDERS)
+@pytest.mark.parametrize("layout", ["objects", "views"])
+def test_training_shows_what_a_policy_with_that_detector_sees(
+    layout, name, demonstrations_of_several_steps, data
+) -> None:
+    finder, demos = (
+        FINDERS[name],
+        [*demonstrations_of_several_steps, *(Dataset(data)[row] for row in range(6))],
+    )
+    reader = Reader(layout, finder=finder)
+    examples = [Example(tokens_of(demo, "objects", finder)) for demo in demos]
+    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(examples)
+    assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
+    # Motions, too: their frames show what was found before and after.
+    motions = PolicyCollate(Reader(layout), 0.0, with_images=True, motion_share=1.0)(examples)
+    shown = [
+        motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
+        for demo in demos
+    ]
+    assert_as_when_acting(motions, demos, reader, shown)
+
+
+def test_the_clumsy_finder_finds_nothing_now_and_then(demonstrations_of_several_steps) -> None:
+    """So that the comparison above holds that case."""
+    seen = [
+        len(Clumsy().in_observation(demo.observation(t)))
+        for demo in demonstrations_of_several_steps
+        for t in range(demo.num_steps)
+    ]
+    assert 0 in seen
+    assert max(seen) > 1
+
+
+@pytest.mark.parametrize("layout", ["objects", "views"])
+def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrations_of_several_steps) -> None:
+    blind = PluggedFinder(Clumsy())
+    demo = demonstrations_of_several_steps[0]
+    prompt = replace(
+        demo.prompt,
+        images={
+            name: replace(image, rgb={view: rgb * 0 for view, rgb in image.rgb.items()})
+            for name, image in demo.prompt.images.items()
+        },
+    )
+    demo = replace(demo, prompt=prompt)
+    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)([Example(tokens_of(demo, "objects", blind))])
+    assert batch.prompts.crops_VS.shape == (2, 0)
+    assert_as_when_acting(batch, [demo], Reader(layout, finder=blind), [prompt])
+
+
+@pytest.fixture(scope="module")
+def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
+    """Demonstrations with true boxes, and with those of the clumsy finder."""
+    dataset = Dataset(data)
+    true, _ = split_examples(open_tokens(dataset), validation_share=0.2, validation_episodes=9)
+    return true, with_boxes_of(detected_tokens(dataset, plugged_boxes(HOOK)), true)
+
+
+def detected_rows(sources, share: float, number: int, rows: slice = slice(None)) -> tuple[list, list]:
+    """Which demonstrations of a batch are shown with detected boxes, and the next draw of each generator."""
+    true, detected = sources
+    first_detected = int(true.cache.image_counts().sum())
+    found, draws = [], []
+
+    def collate(part, rngs):
+        for example, rng in zip(part, rngs, strict=True):
+            draws.append((example.row, rng.random()))
+            if example.base >= first_detected:
+                found.append(example.row)
+
+    examples = [true[index] for index in range(len(true))][rows]
+    Parts(collate, 3, 5, detected=detected, detected_share=share)(examples, number)
+    return sorted(found), sorted(draws)
+
+
+def test_each_demonstration_is_drawn_for_itself(sources) -> None:
+    true, _ = sources
+    rows = true.rows.tolist()
+    assert detected_rows(sources, 0.0, 1)[0] == []
+    assert detected_rows(sources, 1.0, 1)[0] == rows
+    drawn = [detected_rows(sources, 0.5, number)[0] for number in range(40)]
+    assert drawn == [detected_rows(sources, 0.5, number)[0] for number in range(40)]
+    assert len({tuple(found) for found in drawn}) > 30  # anew in each batch
+    share = np.mean([len(found) / len(rows) for found in drawn])
+    assert abs(share - 0.5) < 4 * 0.5 / np.sqrt(40 * len(rows))
+    (whole, draws), (part, part_draws) = (
+        detected_rows(sources, 0.5, 7, rows) for rows in (slice(None), slice(3, 9))
+    )
+    assert part == [row for row in whole if row in rows[3:9]]  # whoever shares the batch
+    assert set(part_draws) <= set(draws)
+
+
+def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
+    true, detected = sources
+    images = np.concatenate([tokens.images for source in sources for tokens in source.cache])
+    for source in sources:
+        for row in true.rows.tolist():
+            example = source.example(row)
+            assert example.row == row
+            np.testing.assert_array_equal(
+                images[example.base : example.base + len(example.tokens.images)], example.tokens.images
+            )
+    assert [e.tokens.seed for e in detected] == [e.tokens.seed for e in true]
+
+
+def weights_of(run: Path) -> dict:
+    folder = run / "checkpoints" / "2-cloning-000006"
+    return {**load_file(folder / "model.safetensors"), **load_file(folder / "optimizer.safetensors")}
+
+
+def assert_equal_runs(ours: Path, theirs: Path) -> None:
+    a, b = weights_of(ours), weights_of(theirs)
+    assert a.keys() == b.keys()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert (ours / "metrics.jsonl").read_bytes() == (theirs / "metrics.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},  # images encoded once
+        {"tune_crops": True, "loader_workers": 2},
+        {"motion_share": 0.5, "accumulate": 2},
+    ],
+)
+def test_a_mixed_run_that_was_killed_ends_as_if_nothing_had_happened(settings, tmp_path, change) -> None:
+    settings |= {"boxes": HOOK, **change}
+    whole = train(TrainingConfig(**{**settings, "out": tmp_path / "whole"}))
+    torn = TrainingConfig(**{**settings, "out": tmp_path / "torn"})
+    train_until(torn, 8)
+    assert_equal_runs(whole, train(torn))
+    load_policy(str(whole))
+
+
+def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, data, tmp_path) -> None:
+    short = {**settings, "pretraining_steps": 0, "steps": 2, "tokens": tmp_path / "tokens"}
+    detected = train(TrainingConfig(**{**short, "boxes": HOOK, "detected_share": 1.0}))
+    (folder,) = (tmp_path / "tokens").iterdir()
+    assert folder.name == f"objects-v2-{plugged_boxes(HOOK).name}"
+    plain = train(TrainingConfig(**{**short, "out": tmp_path / "plain"}))
+    assert len(list((tmp_path / "tokens").iterdir())) == 2
+    none = train(TrainingConfig(**{**short, "out": tmp_path / "none", "boxes": HOOK, "detected_share": 0.0}))
+    mixed = train(TrainingConfig(**{**short, "out": tmp_path / "mixed", "boxes": HOOK}))
+    metrics = [(run / "metrics.jsonl").read_text() for run in (plain, none, mixed, detected)]
+    assert metrics[0] == metrics[1]
+    assert len(set(metrics)) == 3
+    written = yaml.safe_load((mixed / "config.yaml").read_text())
+    assert written["training"]["detected_share"] == 0.5
+    assert written["demonstrations"]["boxes"] == plugged_boxes(HOOK).name
+
+
+def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None:
+    """The same weights get the same score whether or not some learnt from detected boxes."""
+    still = {**settings, "pretraining_steps": 0, "steps": 1, "learning_rate": 0.0, "weight_decay": 0.0}
+    lines = {}
+    for name, share in (("true", 0.0), ("mixed", 0.5), ("detected", 1.0)):
+        boxes = {"boxes": HOOK, "detected_share": share, "out": tmp_path / name}
+        run = train(TrainingConfig(**{**still, **boxes}))
+        lines[name] = (run / "metrics.jsonl").read_text().splitlines()[1]
+        assert "validation_loss" in lines[name]
+    assert lines["true"] == lines["mixed"] != lines["detected"]
+
+
+def test_another_detector_is_another_run(settings, tmp_path) -> None:
+    file = tmp_path / "finders.py"
+    file.write_text("from clumsy_finder import make\n")
+    config = TrainingConfig(**{**settings, "pretraining_steps": 0, "steps": 2, "boxes": f"{file}:make"})
+    train(config)
+    train(config)
+    file.write_text("from clumsy_finder import make  # changed\n")
+    with pytest.raises(ConfigError, match=r"demonstrations\.boxes is 'make-\w+' there"):
+        train(config)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"detected_share": 0.5}, "detected_share is 0.5, but no detector is given"),
+        ({"boxes": HOOK, "detected_share": 1.5}, "between 0 and 1"),
+        ({"boxes": HOOK, "preset": "gato-nano"}, "preset 'gato-nano' sees whole frames; leave boxes out"),
+        ({"boxes": "nobody"}, "boxes is 'nobody'; give detector"),
+        ({"boxes": "builtins:nobody"}, "has no function 'nobody'"),
+    ],
+)
+def test_boxes_that_cannot_be_leave_no_run_folder(settings, change, message) -> None:
+    fits = {"pretraining_steps": 0} if "preset" in change else {}
+    with pytest.raises(ConfigError, match=message):
+        train(TrainingConfig(**{**settings, **fits, **change}))
+    assert not settings["out"].exists()
