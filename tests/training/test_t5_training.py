@@ -11,9 +11,11 @@ pytest.importorskip("transformers")
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.building import build_learner  # noqa: E402
 from published_policies import small_vima, write_tokenizer  # noqa: E402
 
 
@@ -123,3 +125,23 @@ def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> 
     with pytest.raises(CheckpointError, match=r"wi\.weight is \(16, 32\) instead of \(24, 32\)"):
         train(TrainingConfig(**t5_settings))
     assert not t5_settings["out"].exists()
+
+
+def test_weights_to_begin_with_bring_their_tokenizer(t5_settings, t5, tmp_path) -> None:
+    first = train(TrainingConfig(**t5_settings))
+    t5.rename(t5.with_name("elsewhere"))
+    again = {**t5_settings, "t5": None, "init": str(first), "out": tmp_path / "again"}
+    learner = build_learner(TrainingConfig(**again))
+    weights = load_checkpoint(checkpoints(first)[-1]).state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in learner.network.state_dict().items())
+    assert checkpoints(train(TrainingConfig(**again)))
+
+
+def test_weights_without_a_tokenizer_need_to_know_where_it_is(t5_settings, t5, tmp_path) -> None:
+    network = build_network(small_t5_vima(), seed=3)
+    save_checkpoint(network, tmp_path / "bare")
+    begun = {**t5_settings, "init": str(tmp_path / "bare")}
+    with pytest.raises(ConfigError, match="no tokenizer of T5 is stored; set t5, too"):
+        train(TrainingConfig(**{**begun, "t5": None}))
+    learner = build_learner(TrainingConfig(**begun))
+    assert torch.equal(learner.network.prompt.words.weight, network.prompt.words.weight)  # not those of t5

@@ -80,7 +80,7 @@ def build_learner(config: TrainingConfig) -> Learner:
 
     Raises:
         CheckpointError: T5 or the weights to begin with are not where the settings say.
-        ConfigError: The weights to begin with are those of a network of other sizes.
+        ConfigError: The weights to begin with are those of a network of other sizes, or lack a tokenizer.
         MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
     """
     if ":" in config.preset:
@@ -96,7 +96,13 @@ def build_learner(config: TrainingConfig) -> Learner:
         stored = _begin_with(network, config.init)
     elif config.t5:
         load_t5(network, config.t5)
-    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, config.t5 or stored))
+    where = config.t5 or stored
+    if sizes.prompt.tokenizer == "t5" and where is None:
+        raise ConfigError(
+            f"init is {config.init}, with which no tokenizer of T5 is stored; set t5, too, to the folder "
+            "that holds it, or to 't5-base'. Its weights are then not read."
+        )
+    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, where))
     return PolicyLearner(
         network,
         reader,
