@@ -1,12 +1,17 @@
 """Detectors named in a word: how they are found, named and made into tokens."""
 
+import pickle
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from openvima.detection.hooks import plugged_finder
+from openvima.data import Dataset
+from openvima.data.tokens.episode import tokens_of
+from openvima.detection.hooks import detected_tokens, plugged_boxes, plugged_finder
 from openvima.env import TabletopEnv
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
@@ -71,3 +76,60 @@ def test_a_trained_detector_is_found_by_its_folder(tmp_path):
         plugged_finder(f"detector={tmp_path / 'none'}")
     with pytest.raises(CheckpointError, match="no checkpoint"):
         plugged_finder(f"detector={tmp_path}")
+
+
+def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothing(file):
+    finder = plugged_finder(f"{file}:Blind")
+    env = TabletopEnv("rotate", level="L1")
+    observation, _ = env.reset(seed=0)
+    found = finder.in_observation(observation)
+    assert len(found) == 1
+    assert not found.masks.any()
+    assert len(finder.in_prompt_image(next(iter(env.prompt.images.values())))) == 0
+
+
+def test_the_name_of_a_function_follows_from_its_file(file, tmp_path):
+    names = {plugged_boxes(f"{file}:{function}").name for function in ("truth", "truth", "Blind")}
+    assert sorted(name.partition("-")[0] for name in names) == ["Blind", "truth"]
+    elsewhere = shutil.copy(file, tmp_path / "copy.py")
+    assert plugged_boxes(f"{elsewhere}:truth").name in names
+    Path(elsewhere).write_text(FINDERS + "\n")
+    assert plugged_boxes(f"{elsewhere}:truth").name not in names
+
+
+def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tiny, data):
+    torch = pytest.importorskip("torch")
+    from openvima.detection.checkpoint import save_network
+    from openvima.detection.network import MaskRCNN
+
+    names = []
+    for number, config in enumerate((tiny, tiny, replace(tiny, overlap=0.4))):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(min(number, 1))
+            save_network(MaskRCNN(config), tmp_path / str(number))
+        names.append(plugged_boxes(f"detector={tmp_path / str(number)}").name)
+    shutil.copytree(tmp_path / "0", tmp_path / "moved")
+    names.append(plugged_boxes(f"detector={tmp_path / 'moved'}").name)
+    assert names[3] == names[0]
+    assert len(set(names)) == 3
+    assert all(name.startswith("detector-") for name in names)
+
+
+def test_tokens_of_a_detector_are_those_of_its_finder_on_one_thread(tmp_path, tiny, data):
+    torch = pytest.importorskip("torch")
+    from openvima.detection.checkpoint import save_network
+    from openvima.detection.network import MaskRCNN
+
+    save_network(MaskRCNN(replace(tiny, candidates=4, proposals=3)), tmp_path / "detector")
+    boxes = plugged_boxes(f"detector={tmp_path / 'detector'}")
+    assert pickle.loads(pickle.dumps(boxes)) == boxes
+    dataset, threads = Dataset(data, tasks=["rotate"]), torch.get_num_threads()
+    notes = []
+    cache = detected_tokens(
+        dataset, boxes, folder=tmp_path / "tokens", report=lambda done, total, note: notes.append(note)
+    )
+    assert torch.get_num_threads() == threads
+    assert set(notes) == {"detecting objects"}
+    finder = plugged_finder(f"detector={tmp_path / 'detector'}")
+    demo, tokens = dataset[0], cache[0]
+    assert tokens.objects.tolist() == tokens_of(demo, "objects", finder).objects.tolist()

@@ -11,6 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from clumsy_finder import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
@@ -100,6 +101,7 @@ def assert_alike(ours: Path, theirs: Path) -> None:
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
 def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
+    bins |= {"boxes": HOOK}
     one = train(TrainingConfig(**{**bins, "out": tmp_path / "one"}))
     parts = {"accumulate": 8}  # more than demonstrations of a process
     two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two", "sharding": sharding})

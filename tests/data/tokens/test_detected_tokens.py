@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clumsy_finder import Clumsy
+from clumsy_finder import HOOK, Clumsy
+from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.tokens.cache import Boxes, TokenCache, open_tokens
 from openvima.data.tokens.episode import COUNT, ID, PICK, PLACE, tokens_of
@@ -155,3 +156,13 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
     (problem,) = verify(copy).problems
     assert "not those of the demonstration" in problem.cause
     assert problem.file.endswith("objects-v2-clumsy-1/rotate-train-00000.arrow")
+
+
+def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["data", "tokens", str(copy), "--boxes", HOOK]
+    assert main(words) == 0
+    (folder,) = (copy / "tokens").iterdir()
+    assert capsys.readouterr().out.strip() == str(folder)
+    assert len(TokenCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v2-"))) == 10
+    assert main([*words, "--kind", "frames"]) == 2
+    assert "whole frames have none" in capsys.readouterr().err
