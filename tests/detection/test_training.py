@@ -1,7 +1,10 @@
 """Training: what a run leaves, going on after an interruption, and what is refused."""
 
 import json
-from dataclasses import replace
+import signal
+import subprocess
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,8 @@ import pytest
 from openvima.errors import ConfigError, DatasetError
 
 torch = pytest.importorskip("torch")
+from safetensors.torch import load_file  # noqa: E402
+
 from openvima.data import Dataset  # noqa: E402
 from openvima.detection import config as sizes  # noqa: E402
 from openvima.detection import load_detector  # noqa: E402
@@ -74,6 +79,48 @@ def test_an_interrupted_run_ends_with_the_weights_of_one_that_was_not(settings, 
     one, other = weights(whole / last), weights(run / last)
     assert all(torch.equal(one[name], other[name]) for name in one if "num_batches" not in name)
     assert [line["step"] for line in lines(run) if "loss" in line] == [1, 2]
+
+
+TRAIN = """
+import json, os, signal, sys
+from pathlib import Path
+from openvima.detection import config as sizes
+from openvima.detection.config import DetectorConfig
+from openvima.training.detector import DetectorTrainingConfig, learner, train_detector
+
+tiny, settings = json.loads(sys.argv[1])
+sizes.DETECTORS["small"] = lambda: DetectorConfig.from_dict(tiny)
+write, calls = learner.write_network, []
+
+def dying(*arguments):
+    calls.append(arguments)
+    write(*arguments)
+    if len(calls) == 2:  # metrics and weights are written, the optimizer's state is not
+        os.kill(os.getpid(), signal.SIGKILL)
+
+learner.write_network = dying
+folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
+train_detector(DetectorTrainingConfig(**folders, **settings))
+"""
+
+
+def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
+    plain = {
+        name: str(value) if isinstance(value, Path) else value for name, value in asdict(settings).items()
+    }
+    argument = json.dumps([tiny.to_dict(), plain])
+    killed = subprocess.run([sys.executable, "-c", TRAIN, argument], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    assert load_network(settings.out).config == tiny
+    run, whole = train_detector(settings), train_detector(replace(settings, out=tmp_path / "whole"))
+    for file in (whole / "checkpoints").rglob("*.safetensors"):
+        ours, theirs = load_file(run / file.relative_to(whole)), load_file(file)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {
+        path.name for path in (whole / "checkpoints").iterdir()
+    }
+    assert (run / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
 
 
 def test_other_settings_do_not_continue_a_run(settings):
