@@ -161,7 +161,6 @@ def test_too_few_demonstrations_are_told(settings):
         ({"learning_rate": float("nan")}, "learning_rate is nan; it must be between 0 and 1"),
         ({"clip_norm": 0.0}, "clip_norm is 0"),
         ({"preset": None}, "preset is None; it must be text"),
-        ({"init": "first"}, "init is 'first'; it must be a pathlib.Path"),
         ({"learning_rate": -1.0, "steps": 0}, r"steps is 0.*learning_rate is -1"),
     ],
 )

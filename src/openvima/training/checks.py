@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from openvima.errors import unknown_name
@@ -15,7 +14,6 @@ _TYPES = {
     float: (Real, "a number"),
     bool: (bool, "true or false"),
     str: (str, "text"),
-    Path: (Path, "a pathlib.Path"),
 }
 
 
