@@ -59,18 +59,16 @@ def run(words: Sequence[str]) -> int:
     settings = overridden(recipe_settings(recipe), file)
     if known.steps and not known.epochs:
         settings["epochs"] = None
-    missing = [name for name in ("data", "out") if name not in settings]
+    given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
+    others = {name: value for name, value in settings.items() if name not in given}
     if preset:
-        settings["preset"] = preset  # so that the defaults fit together even before it is parsed again
-    default = TrainingConfig(**{name: Path() for name in missing}, **settings)
-    for name in missing:
-        object.__setattr__(default, name, tyro.MISSING)  # to be given; no path, which a config would refuse
+        others["preset"] = preset  # so that the defaults fit together even before it is parsed again
     config = tyro.cli(
         TrainingConfig,
         prog="openvima train",
         description=DESCRIPTION,
         args=rest,
-        default=default,
+        default=TrainingConfig(**given, **others),
     )
     is_first = os.environ.get("RANK", "0") == "0"  # among those that torchrun starts
     with progress_bar("training") if is_first else nullcontext() as report:
