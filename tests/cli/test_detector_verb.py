@@ -49,6 +49,7 @@ def test_train_makes_a_run_that_evaluate_and_show_take(data, tiny, tmp_path, mon
     words = [str(run), "--data", str(data), "--frames", "4", "--held-out", "0.4", "--json"]
     assert main(["detector", "evaluate", *words]) == 0
     score = json.loads(capsys.readouterr().out)
+    assert (score["detector"], score["data"], score["held_out"]) == (str(run), str(data), 0.4)
     assert score["frames"] == 4 and 0 <= score["boxes"]["ap50"] <= 1
     picture = tmp_path / "seen.png"
     words = [str(run), "--data", str(data), "--frames", "2", "--out", str(picture)]

@@ -88,7 +88,9 @@ def evaluate(
         shown = _counted(held_out_frames(source, frames, seed=seed), frames, bar)
         score = score_detector(lambda rgb: loaded.detect(rgb, ""), shown)
     if as_json:
-        print(json.dumps(asdict(score)))
+        looked_at = {"data": str(data), "held_out": held_out} if data else {"level": level or LEVEL}
+        looked_at |= {"prompt_share": prompt_share, "seed": seed}
+        print(json.dumps({"detector": str(detector or "package"), **looked_at, **asdict(score)}))
     else:
         _print_score(score)
     return 0

@@ -137,7 +137,7 @@ class DetectorConfig:
 
 
 def small() -> DetectorConfig:
-    """1.1 M parameters, for frames of 128 × 256 pixels; trained from nothing within an hour on two cores."""
+    """0.96 M parameters, for frames of 128 × 256 pixels; trained from nothing within an hour on two cores."""
     backbone = BackboneConfig(
         block="basic",
         depths=(1, 1, 1),
