@@ -87,7 +87,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     Raises:
         ConfigError: The folder holds a run with other settings, preset and settings contradict each other, or
             there is no such detector.
-        DatasetError: There are no demonstrations.
+        DatasetError: There are no demonstrations, or one is too long for the network.
         CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
         PromptError: A prompt has a word that the policy's vocabulary lacks.
