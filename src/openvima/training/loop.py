@@ -101,8 +101,8 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         learner = build_learner(config)
         if boxes and learner.token_kind == "frames":
             raise ConfigError(
-                f"boxes is {config.boxes!r}, but preset {config.preset!r} sees whole frames; leave boxes out, "
-                "or take a preset that sees objects."
+                f"boxes is {config.boxes!r}, but preset {config.preset!r} sees whole frames; leave boxes "
+                "out, or take a preset that sees objects."
             )
         run = RunFolder(
             config.out,
