@@ -74,6 +74,17 @@ def test_without_pycocotools_the_extra_is_named(frames, monkeypatch):
         score_detector(Knowing(frames), frames)
 
 
+@pytest.mark.parametrize("background", [0, 255])
+def test_boxes_of_known_objects_are_seen_on_black_and_on_white(rectangles, background):
+    frame = rectangles()
+    plain = type(frame)(np.full_like(frame.rgb, background), frame.boxes, frame.masks)
+    nothing = Detections(np.zeros((0, 4), np.int64), np.zeros((0, 64, 96), bool), np.zeros(0))
+    drawn = np.asarray(draw_detections(plain, nothing))
+    for left, upper, right, lower in (3 * plain.boxes).astype(int):
+        for line in (drawn[upper, left:right], drawn[lower - 1, left:right], drawn[upper:lower, left]):
+            assert 0.3 < (line != background).all(axis=1).mean() < 0.7
+
+
 def test_pictures_show_what_is_sure_enough(rectangles, tmp_path):
     frame = rectangles()
     boxes = frame.boxes.astype(np.int64) - [0, 0, 1, 1]

@@ -12,7 +12,8 @@ from openvima.files import write_whole
 from openvima.policies.detection import Detections
 
 COLOURS = ((0, 158, 115), (230, 159, 0), (86, 180, 233), (204, 121, 167), (240, 228, 66), (213, 94, 0))
-KNOWN = (255, 255, 255)
+KNOWN, UNDER_KNOWN = (255, 255, 255), (0, 0, 0)  # one of them can be seen on any background
+PAPER = (214, 214, 214)  # pictures of prompts are white
 ENLARGE, GAP = 3, 8
 DASH = 6  # pixels
 
@@ -48,11 +49,11 @@ def draw_detections(frame: Frame, found: Detections, *, score: float = 0.5) -> I
 
 
 def save_sheet(pictures: Sequence[Image.Image], path: Path, *, columns: int = 2) -> None:
-    """Write pictures of one size side by side and below each other, on white, as a PNG file."""
+    """Write pictures of one size side by side and below each other, on grey, as a PNG file."""
     width, height = pictures[0].size
     rows = -(-len(pictures) // columns)
     size = (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP)
-    sheet = Image.new("RGB", size, (255, 255, 255))
+    sheet = Image.new("RGB", size, PAPER)
     for number, picture in enumerate(pictures):
         row, column = divmod(number, columns)
         sheet.paste(picture, (GAP + column * (width + GAP), GAP + row * (height + GAP)))
@@ -64,6 +65,7 @@ def save_sheet(pictures: Sequence[Image.Image], path: Path, *, columns: int = 2)
 def _dashed(draw: ImageDraw.ImageDraw, edges: Sequence[float]) -> None:
     left, upper, right, lower = edges
     right, lower = right - 1, lower - 1
+    draw.rectangle([left, upper, right, lower], outline=UNDER_KNOWN)
     for x in np.arange(left, right, 2 * DASH).tolist():
         for y in (upper, lower):
             draw.line([x, y, min(x + DASH, right), y], fill=KNOWN)
