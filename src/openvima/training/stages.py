@@ -229,7 +229,8 @@ def crop_parameters(model: PolicyNetwork) -> list[torch.nn.Parameter]:
     if not isinstance(images, ObjectEncoder):
         return list(images.frame_encoder.parameters())
     appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
-    return [*images.crop_encoder.parameters(), *appearance]
+    turns = list(images.turns.parameters()) if images.config.turn_bins else []
+    return [*images.crop_encoder.parameters(), *appearance, *turns]
 
 
 def _num_processors() -> int:

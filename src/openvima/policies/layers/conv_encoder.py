@@ -15,6 +15,7 @@ from openvima.errors import ConfigError
 from openvima.policies.layers.vit import PIXEL_MEAN, PIXEL_STD
 
 _GROUPS = 4
+_NUM_PLACES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,18 +25,28 @@ class ConvConfig:
     Args:
         width: Channels of the first layer; the next have 2, 4 and 4 times as many.
         output_width: Length of the feature vector.
+        place_channels: Channels that are read at each of the 4 × 4 places, too. Mean and maximum alone say
+            what there is but hardly where, and so not how an object lies.
     """
 
     width: int
     output_width: int
+    place_channels: int = 0
 
     def __post_init__(self) -> None:
         if self.width < _GROUPS or self.width % _GROUPS:
             raise ConfigError(f"crop encoder: width is {self.width}; it must be a multiple of {_GROUPS}.")
+        if self.place_channels < 0:
+            raise ConfigError(
+                f"crop encoder: place_channels is {self.place_channels}; it must be at least 0."
+            )
 
 
 class ConvEncoder(nn.Module):
-    """Three halving layers and one more, mean and maximum over the 4 × 4 places, one linear layer."""
+    """Three halving layers and one more, mean and maximum over the 4 × 4 places, one linear layer.
+
+    With `place_channels` the linear layer reads some channels at each place as well.
+    """
 
     pixel_mean: torch.Tensor
     pixel_std: torch.Tensor
@@ -53,7 +64,9 @@ class ConvEncoder(nn.Module):
             _layer(2 * width, 4 * width, stride=2),
             _layer(4 * width, 4 * width, stride=1),
         )
-        self.projection = nn.Linear(8 * width, config.output_width)
+        pooled_width = 8 * width + _NUM_PLACES * config.place_channels
+        self.projection = nn.Linear(pooled_width, config.output_width)
+        self.places = nn.Conv2d(4 * width, config.place_channels, 1) if config.place_channels else None
 
     def forward(self, crops_NCYX: torch.Tensor) -> torch.Tensor:
         """Encode crops.
@@ -68,6 +81,8 @@ class ConvEncoder(nn.Module):
         pixels = ((pixels - self.pixel_mean) / self.pixel_std).contiguous(memory_format=torch.channels_last)
         maps_NCYX = self.layers(pixels)
         pooled = torch.cat([maps_NCYX.mean(dim=(2, 3)), maps_NCYX.amax(dim=(2, 3))], dim=1)
+        if self.places is not None:
+            pooled = torch.cat([pooled, self.places(maps_NCYX).relu().flatten(1)], dim=1)
         return self.projection(pooled)
 
 

@@ -1,6 +1,7 @@
 """Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
 
-Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token; `...` any axes.
+Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token, R bins of
+turns; `...` any axes.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from torch.nn import functional as F
 from openvima.errors import ConfigError
 from openvima.policies.layers.conv_encoder import ConvConfig, ConvEncoder
 from openvima.policies.layers.mlp import mlp
+from openvima.policies.layers.turns import TurnEstimator
 from openvima.policies.layers.vit import VisionTransformer, VitConfig
 
 NUM_VIEWS = 2
@@ -36,6 +38,8 @@ class ObjectEncoderConfig:
         crop_dropout: Share of objects whose crop features are left out of their token in training. What is
             then left, box and appearance embedding, serves for unknown objects as well: the policy does not
             learn the training objects by heart.
+        turn_bins: Number of turns between which two images of an object are compared, 72 for steps of 5
+            degrees; 0 for no such comparison.
     """
 
     crop: VitConfig | ConvConfig
@@ -44,6 +48,7 @@ class ObjectEncoderConfig:
     fuse_views: bool = False
     appearance_width: int = 0
     crop_dropout: float = 0.0
+    turn_bins: int = 0
 
     @property
     def token_width(self) -> int:
@@ -57,6 +62,14 @@ class ObjectEncoderConfig:
             )
         if not 0 <= self.crop_dropout < 1:
             raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
+        if self.turn_bins < 0 or self.turn_bins == 1:
+            raise ConfigError(
+                f"object encoder: turn_bins is {self.turn_bins}; it must be 0, or at least 2, such as 72."
+            )
+        if self.turn_bins and not self.appearance_width:
+            raise ConfigError(
+                "object encoder: turn_bins needs an appearance width above 0; turns are learnt with looks."
+            )
 
 
 class ObjectEncoder(nn.Module):
@@ -82,6 +95,8 @@ class ObjectEncoder(nn.Module):
         self.fusion = nn.ModuleList(nn.Linear(width, config.width) for width in fusion_widths)
         if config.appearance_width:
             self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
+        if config.turn_bins:
+            self.turns = TurnEstimator(features, config.turn_bins)
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
@@ -128,6 +143,27 @@ class ObjectEncoder(nn.Module):
         seen_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
         both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
         return F.normalize(self.appearance(both), dim=-1)
+
+    def turn_between(
+        self,
+        features_a: torch.Tensor,
+        features_b: torch.Tensor,
+        masks_a: torch.Tensor,
+        masks_b: torch.Tensor,
+    ) -> torch.Tensor:
+        """Tell how far each object has turned from one image of it to another.
+
+        Args:
+            features_a: Crop features in the first image, shape (..., 2, N, F).
+            features_b: Those in the second image, of the same shape or one that broadcasts with it.
+            masks_a: Whether the object is visible in the view, bool, shape (..., 2, N).
+            masks_b: The same for the second image.
+
+        Returns:
+            Probabilities of turns, shape (..., N, R); bin k is k / R of a circle, counter-clockwise seen from
+            above. Shapes that look the same at several angles have several peaks.
+        """
+        return self.turns(features_a, features_b, masks_a, masks_b).exp()
 
 
 def _crop_encoder(config: VitConfig | ConvConfig) -> VisionTransformer | ConvEncoder:

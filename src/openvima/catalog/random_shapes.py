@@ -1,0 +1,252 @@
+"""Shapes of no catalogue: flat prisms with random outlines, and random vessels.
+
+Outlines are irregular throughout: each corner, bulge and stroke has a random place of its own. They know
+nothing of the catalogue's objects.
+"""
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+
+from openvima.catalog import boxes
+from openvima.catalog.geometry import Geometry
+from openvima.catalog.meshes import draped, prism, revolved
+from openvima.catalog.outlines import rectangle
+from openvima.catalog.triangulation import signed_area
+
+_WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
+_HEIGHTS_M = (0.02, 0.036)
+_MICROMETRES = 6
+_NUM_RADII, _NUM_ANGLES = 14, 72  # where a shape is compared with itself turned
+_SMALLEST_TURN = 5  # of these angles; below 25 degrees every shape looks like itself
+_LEAST_DIFFERENCE = 0.25  # share of the area by which a shape with a heading differs from itself turned
+
+Cell = tuple[int, int]
+
+
+def random_shape(rng: np.random.Generator) -> Geometry:
+    """Draw a flat prism, origin at its bottom, to be drawn; nothing collides with it."""
+    return Geometry(prism(random_outline(rng), 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
+
+
+def random_vessel(rng: np.random.Generator) -> Geometry:
+    """Draw an open box, a tray, a bowl, a frame or a flat square, to be drawn; nothing collides with it."""
+    return _VESSELS[int(rng.integers(len(_VESSELS)))](rng)
+
+
+def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Draw an outline: a star, a polygon, a blob, a ring, or strokes like those of a letter.
+
+    Args:
+        rng: Every draw comes from here.
+
+    Returns:
+        Loops of shape (N, 2), float64, metres: the outer one counter-clockwise, then holes clockwise.
+    """
+    loops = _OUTLINES[int(rng.integers(len(_OUTLINES)))](rng)
+    low, high = loops[0].min(axis=0), loops[0].max(axis=0)
+    stretch = np.array([rng.uniform(0.75, 1.0), 1.0])
+    scale = rng.uniform(*_WIDTHS_M) / ((high - low) * stretch).max()
+    placed = [np.round((loop - (low + high) / 2) * stretch * scale, _MICROMETRES) for loop in loops]
+    return tuple(
+        loop if (signed_area(loop) > 0) == (number == 0) else loop[::-1].copy()
+        for number, loop in enumerate(placed)
+    )
+
+
+def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
+    """Whether an outline looks clearly different at every other angle, so that its yaw can be seen.
+
+    Args:
+        loops: As `random_outline` returns them.
+    """
+    middle = (loops[0].min(axis=0) + loops[0].max(axis=0)) / 2
+    reach = float(np.linalg.norm(loops[0] - middle, axis=1).max())
+    radii = reach * (np.arange(_NUM_RADII) + 0.5) / _NUM_RADII
+    angles = 2 * np.pi * np.arange(_NUM_ANGLES) / _NUM_ANGLES
+    grid = middle + radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    inside = _inside(grid.reshape(-1, 2), loops).reshape(_NUM_RADII, _NUM_ANGLES)
+    area = (inside * radii[:, None]).sum()
+    differences = [
+        (np.abs(inside ^ np.roll(inside, turn, axis=1)) * radii[:, None]).sum() / area
+        for turn in range(_SMALLEST_TURN, _NUM_ANGLES // 2 + 1)
+    ]
+    return bool(min(differences) >= _LEAST_DIFFERENCE)
+
+
+def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Whether points lie inside an outline and in none of its holes, shape (N,), bool; by crossings."""
+    start = np.concatenate(loops)
+    end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
+    x, y = points[:, :1], points[:, 1:]
+    spans = (start[:, 1] > y) != (end[:, 1] > y)
+    rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
+    crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
+    return (spans & (x < crossing)).sum(axis=1) % 2 == 1
+
+
+def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    return np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+
+
+def _jittered_angles(rng: np.random.Generator, count: int) -> np.ndarray:
+    steps = np.arange(count) + rng.uniform(-0.2, 0.2, count)  # less than 180 degrees between two
+    return 2 * np.pi * steps / count + rng.uniform(0, 2 * np.pi)
+
+
+def _star(rng: np.random.Generator) -> list[np.ndarray]:
+    tips = int(rng.integers(3, 8))
+    radii = rng.uniform(0.7, 1.2, 2 * tips)
+    radii[1::2] *= rng.uniform(0.3, 0.7)
+    return [_polar(radii, _jittered_angles(rng, 2 * tips))]
+
+
+def _polygon(rng: np.random.Generator) -> list[np.ndarray]:
+    count = int(rng.integers(3, 8))
+    return [_polar(rng.uniform(0.55, 1.1, count), _jittered_angles(rng, count))]
+
+
+def _blob(rng: np.random.Generator) -> list[np.ndarray]:
+    angles = 2 * np.pi * np.arange(36) / 36
+    radii = np.ones(36)
+    for waves in range(1, 6):
+        radii += rng.uniform(0, 0.35) / waves**0.5 * np.cos(waves * angles + rng.uniform(0, 2 * np.pi))
+    return [_polar(np.maximum(radii, 0.25), angles)]
+
+
+def _ring(rng: np.random.Generator) -> list[np.ndarray]:
+    """A polygon or blob with a hole of its own form, smaller or larger, often to one side."""
+    outer = (_blob if rng.random() < 0.5 else _polygon)(rng)[0]
+    hole = outer * rng.uniform(0.25, 0.6)
+    return [outer, hole[::-1]]
+
+
+def _strokes(rng: np.random.Generator) -> list[np.ndarray]:
+    """Strokes of one width along a small grid, rounded or not, then slanted and tapered."""
+    while True:
+        cells = _random_cells(rng)
+        if not _touches_by_a_corner(cells) and not _is_straight(cells):
+            break
+    loops = _borders(cells)
+    if rng.random() < 0.5:
+        loops = [_rounded(_rounded(loop)) for loop in loops]
+    slant, taper = rng.uniform(-0.35, 0.35), rng.uniform(-0.12, 0.12)
+    stretch = rng.uniform(0.7, 1.4)
+
+    def bent(loop: np.ndarray) -> np.ndarray:
+        x, y = loop[:, 0] - 1.5, loop[:, 1] - 1.5
+        return np.stack([x * stretch * (1 + taper * y) + slant * y, y], axis=1)
+
+    loops.sort(key=lambda loop: -abs(signed_area(loop)))
+    return [bent(loop) for loop in loops]
+
+
+def _random_cells(rng: np.random.Generator) -> set[Cell]:
+    """Cells of a grid that hang together: a walk in straight strokes, perhaps with a branch."""
+    side = int(rng.integers(3, 6))
+    cells: set[Cell] = {(int(rng.integers(side)), int(rng.integers(side)))}
+    for _ in range(int(rng.integers(2, 6))):
+        x, y = sorted(cells)[int(rng.integers(len(cells)))]
+        dx, dy = ((1, 0), (-1, 0), (0, 1), (0, -1))[int(rng.integers(4))]
+        for _ in range(int(rng.integers(2, side + 1))):
+            if not (0 <= x < side and 0 <= y < side):
+                break
+            cells.add((x, y))
+            x, y = x + dx, y + dy
+    return cells
+
+
+def _is_straight(cells: set[Cell]) -> bool:
+    return min(len({cell[axis] for cell in cells}) for axis in (0, 1)) < 2
+
+
+def _rounded(loop: np.ndarray) -> np.ndarray:
+    """Cut every corner at a quarter of its sides.
+
+    Source: Chaikin, "An algorithm for high speed curve generation" (1974).
+    """
+    following = np.roll(loop, -1, axis=0)
+    return np.stack([0.75 * loop + 0.25 * following, 0.25 * loop + 0.75 * following], axis=1).reshape(-1, 2)
+
+
+def _touches_by_a_corner(cells: set[Cell]) -> bool:
+    return any(
+        (x + dx, y + 1) in cells and (x + dx, y) not in cells and (x, y + 1) not in cells
+        for x, y in cells
+        for dx in (-1, 1)
+    )
+
+
+def _borders(cells: set[Cell]) -> list[np.ndarray]:
+    """Closed loops around cells, with the cells on their left, corners only."""
+    following: dict[Cell, Cell] = {}
+    for x, y in cells:
+        corners = ((x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1))
+        beside = ((x, y - 1), (x + 1, y), (x, y + 1), (x - 1, y))
+        for side in range(4):
+            if beside[side] not in cells:
+                following[corners[side]] = corners[(side + 1) % 4]
+    loops = []
+    while following:
+        corner = min(following)
+        loop = [corner]
+        while (corner := following.pop(corner)) != loop[0]:
+            loop.append(corner)
+        points = np.array(loop, dtype=np.float64)
+        before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+        loops.append(points[np.abs(before - after).sum(axis=1) > 0])
+    return loops
+
+
+def _open_box(rng: np.random.Generator) -> Geometry:
+    x, y = rng.uniform(0.12, 0.2, 2)
+    geometry = boxes.container((float(x), float(y), float(rng.uniform(0.015, 0.07))))
+    return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
+
+
+def _flat_square(rng: np.random.Generator) -> Geometry:
+    geometry = boxes.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
+    return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
+
+
+def _frame(rng: np.random.Generator) -> Geometry:
+    if rng.random() < 0.5:
+        half = cast("tuple[float, float]", tuple(rng.uniform(0.06, 0.1, 2).tolist()))
+        outer = np.array(rectangle((0.0, 0.0), half))
+    else:
+        count = int(rng.integers(3, 9))
+        outer = _polar(np.full(count, rng.uniform(0.075, 0.105)), _jittered_angles(rng, count))
+    hole = outer * rng.uniform(0.55, 0.9)
+    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(0.0015, 0.03), texture_per_m=2.9), (), 0.0)
+
+
+def _bowl(rng: np.random.Generator) -> Geometry:
+    foot, rim = rng.uniform(0.04, 0.075), rng.uniform(0.075, 0.105)
+    height, wall = rng.uniform(0.02, 0.075), rng.uniform(0.003, 0.02)
+    belly = (foot + rim) / 2 + rng.uniform(-0.01, 0.015)
+    profile = [
+        (0.0, 0.0),
+        (foot, 0.0),
+        (belly, height / 2),
+        (rim, height),
+        (rim - wall, height),
+        (belly - wall, height / 2),
+        (foot - wall, 0.008),
+        (0.0, 0.008),
+    ]
+    sides = int(rng.choice((4, 6, 8, 26)))
+    radii = [2.5 * (r + (height - z if number < 4 else 0.0)) for number, (r, z) in enumerate(profile)]
+    return Geometry(revolved(profile, sides, texture_radii=radii), (), 0.0)
+
+
+_OUTLINES: tuple[Callable[[np.random.Generator], list[np.ndarray]], ...] = (
+    _star,
+    _polygon,
+    _blob,
+    _ring,
+    _strokes,
+    _strokes,
+    _strokes,
+)
+_VESSELS: tuple[Callable[[np.random.Generator], Geometry], ...] = (_open_box, _flat_square, _frame, _bowl)
