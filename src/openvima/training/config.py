@@ -30,6 +30,9 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "pretraining_scenes": (1, None),
     "pretraining_batch": (2, None),
     "pretraining_learning_rate": (0, 1),
+    "pretraining_random_looks": (0, 1),
+    "pretraining_twins": (0, 1),
+    "pretraining_box_shift": (0, 8),
     "temperature": (1e-3, None),
     "bucket": (0, None),
     "seed": (0, 2**63 - 1),
@@ -86,6 +89,13 @@ class TrainingConfig:
         pretraining_scenes: Scenes drawn for that.
         pretraining_batch: Pairs of one object a step.
         pretraining_learning_rate: Highest learning rate of that.
+        pretraining_random_looks: How probable it is for each object of these scenes that a random texture
+            replaces that of the training partition, and how probable a random shape.
+        pretraining_twins: How probable it is for each object that can be moved that a twin lies beside it
+            which differs in height, shade, texture or shape alone. Above 0 batches are of whole scenes, and
+            each scene is laid a second time with everything turned.
+        pretraining_box_shift: Largest random shift of a crop's borders, in pixels of its 32, as with the
+            boxes of a detector.
         temperature: Divisor of similarities in the matching loss.
         tune_crops: Go on training the crop encoder while cloning. Slower: each step encodes its crops anew.
         bucket: Batches among which demonstrations are sorted by length, to pad less; 0 draws each batch
@@ -137,6 +147,9 @@ class TrainingConfig:
     pretraining_scenes: int = 2500
     pretraining_batch: int = 128
     pretraining_learning_rate: float = 1e-3
+    pretraining_random_looks: float = 0.0
+    pretraining_twins: float = 0.0
+    pretraining_box_shift: float = 0.0
     temperature: float = 0.07
     tune_crops: bool = False
     bucket: int = 0

@@ -32,7 +32,7 @@ from openvima.training.parallel import (
     set_whole_state,
     whole_state,
 )
-from openvima.training.pretrain import render_pairs
+from openvima.training.pretrain import Variety, render_pairs
 from openvima.training.provenance import provenance
 from openvima.training.run_folder import (
     METRICS_FILE,
@@ -43,7 +43,7 @@ from openvima.training.run_folder import (
 )
 from openvima.training.schedule import learning_rate_at, step_seed
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
-from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops, keeps_crops
+from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops, has_turns, keeps_crops
 
 Report = Callable[[int, int, str], None]
 # A trial in the simulator: checkpoint folder to metrics. It is handed in, since training needs no simulation.
@@ -314,14 +314,20 @@ class _Trainer:
     def _matching(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolved` has seen to it
         tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
+        network, config = self.learner.network, self.config
         pairs = render_pairs(
             tasks,
-            num_scenes=self.config.pretraining_scenes,
-            seed=self.config.seed,
-            assets=self.config.assets,
+            num_scenes=config.pretraining_scenes,
+            seed=config.seed,
+            assets=config.assets,
+            variety=Variety(
+                config.pretraining_random_looks,
+                config.pretraining_twins,
+                again=has_turns(network) or config.pretraining_twins > 0,
+            ),
             report=self._say,
         )
-        return Matching(self.learner.network, self.config, pairs.to(self.parallel.device))
+        return Matching(network, config, pairs.to(self.parallel.device))
 
     def _cloning(self) -> Stage:
         self._report(f"reading {len(self.dataset)} demonstrations")

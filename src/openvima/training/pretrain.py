@@ -2,26 +2,48 @@
 
 Scenes are drawn for this purpose from the training partition: sampled like episodes of the tasks in the data,
 then every object gets another texture of its role in training and a prompt image of its own. Nothing of the
-test levels is ever shown.
+test levels is ever shown. If wanted, part of the looks are random ones of no catalogue, some objects have a
+twin, and each scene is laid a second time with everything turned.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
+from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
-from openvima.perception.objects import observe_prompt_image, see_objects
+from openvima.catalog.random_pack import RandomLooks
+from openvima.perception.objects import ObjectViews, observe_prompt_image, see_objects
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode
+from openvima.training.scene_variants import laid_again, with_random_looks, with_twins
 from openvima.training.schedule import step_seed
 
+_NUM_COLUMNS = 6  # of `Pairs`, those of the scene laid again left out
 _DOMAIN = "user"  # neither training nor evaluation episodes are reused
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Again:
+    """K objects in a scene that was laid again.
+
+    Args:
+        crops: Shape (K, 2, 3, 32, 32), uint8.
+        masks: Whether it is visible in the view, shape (K, 2), bool.
+        turns: Turn from the scene to the one laid again, counter-clockwise seen from above, in radians, 0 to
+            2π; NaN for shapes that do not show it. Shape (K,), float32.
+    """
+
+    crops: torch.Tensor
+    masks: torch.Tensor
+    turns: torch.Tensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +57,7 @@ class Pairs:
         scene_masks: Shape (K, 2), bool.
         looks: Number of its pair of shape and texture, shape (K,), int64.
         scenes: Number of its scene, shape (K,), int64.
+        again: The objects in the scene laid again; None if it was laid once.
     """
 
     prompt_crops: torch.Tensor
@@ -43,24 +66,56 @@ class Pairs:
     scene_masks: torch.Tensor
     looks: torch.Tensor
     scenes: torch.Tensor
+    again: Again | None = None
 
     def to(self, device: torch.device) -> "Pairs":
         """Return the pairs on another device."""
-        return Pairs(*(getattr(self, name).to(device) for name in self.__slots__))
+        return self._each(lambda column: column.to(device))
 
     def select(self, rows: torch.Tensor) -> "Pairs":
         """Return some of the pairs."""
+        return self._each(lambda column: column[rows])
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "Pairs":
+        again = self.again
         return Pairs(
-            self.prompt_crops[rows],
-            self.prompt_masks[rows],
-            self.scene_crops[rows],
-            self.scene_masks[rows],
-            self.looks[rows],
-            self.scenes[rows],
+            change(self.prompt_crops),
+            change(self.prompt_masks),
+            change(self.scene_crops),
+            change(self.scene_masks),
+            change(self.looks),
+            change(self.scenes),
+            Again(change(again.crops), change(again.masks), change(again.turns)) if again else None,
         )
 
 
-def render_pairs(tasks: Sequence[str], *, num_scenes: int, seed: int, assets: str, report=None) -> Pairs:
+@dataclass(frozen=True, slots=True)
+class Variety:
+    """What scenes show beyond the training partition laid once.
+
+    Args:
+        random_looks: How probable a random texture is for each object, and how probable a random shape.
+        twins: How probable a twin is that differs in height, shade, texture or shape alone.
+        again: Lay each scene a second time, with everything turned.
+    """
+
+    random_looks: float = 0.0
+    twins: float = 0.0
+    again: bool = False
+
+
+PLAIN = Variety()
+
+
+def render_pairs(
+    tasks: Sequence[str],
+    *,
+    num_scenes: int,
+    seed: int,
+    assets: str,
+    variety: Variety = PLAIN,
+    report=None,
+) -> Pairs:
     """Draw scenes and the prompt images of everything in them.
 
     Args:
@@ -68,23 +123,35 @@ def render_pairs(tasks: Sequence[str], *, num_scenes: int, seed: int, assets: st
         num_scenes: How many scenes.
         seed: Seed of the run.
         assets: Asset pack, as `load_assets` takes it.
+        variety: What scenes show beyond that.
         report: Called with scenes done, scenes in all, and a note.
     """
-    rasteriser = Rasteriser(load_assets(assets))
-    looks: dict[tuple[str, str], int] = {}
+    pack = load_assets(assets)
+    rasteriser = Rasteriser(RandomLooks(pack))
+    shades = {name for task in tasks for name in pool(task, "train").dragged_textures}
+    looks: dict[tuple, int] = {}
     columns: list[tuple] = []
     for number in range(num_scenes):
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
-        episode = sample_episode(
-            task, level="train", seed=episode_seed, domain=_DOMAIN, assets=rasteriser.assets
-        )
+        episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
         textures = pool(task, "train")
         scene = _retextured(episode.problem.scene, textures, np.random.default_rng(episode_seed))
-        columns += _pairs_of_scene(scene, _magnifications(episode), rasteriser, looks, number)
+        # Of its own, so that the same scenes are laid whatever comes on top.
+        rng = np.random.default_rng([episode_seed, 1])
+        scene = _varied(scene, variety, shades, rasteriser.assets, rng)
+        again = laid_again(scene, rng) if variety.again else None
+        columns += pairs_of_scene(scene, _magnifications(episode), rasteriser, looks, number, again)
         if report and number % 50 == 0:
             report(number, num_scenes, "drawing scenes")
-    return Pairs(*(torch.from_numpy(np.stack(column)) for column in zip(*columns, strict=True)))
+    return stacked(columns)
+
+
+def stacked(rows: Sequence[tuple]) -> Pairs:
+    """Put the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
+    columns = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
+    first, again = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
+    return Pairs(*first, again=Again(*again) if again else None)
 
 
 def matching_loss(
@@ -109,16 +176,31 @@ def matching_loss(
     mixing = colour_mixing(generator).to(pairs.prompt_crops.device)
     prompt = embed_looks(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
     scene = embed_looks(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
-    scores = prompt @ scene.T / temperature
+    loss, accuracy = contrast(prompt, scene, pairs.looks, temperature=temperature)
+    return loss, {"match_accuracy": accuracy}
+
+
+def contrast(
+    first: torch.Tensor, second: torch.Tensor, looks: torch.Tensor, *, temperature: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Loss of telling which of K objects is which, in both directions, and the share that is right.
+
+    Args:
+        first: Embeddings, shape (K, A).
+        second: Those of other images of the same objects, shape (K, A).
+        looks: Objects of one number look alike and are not told apart, shape (K,), int64.
+        temperature: Divisor of the similarities.
+    """
+    scores = first @ second.T / temperature
     count = len(scores)
     diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
-    same_look = (pairs.looks[:, None] == pairs.looks[None, :]) & ~diagonal
+    same_look = (looks[:, None] == looks[None, :]) & ~diagonal
     scores = scores.masked_fill(same_look, torch.finfo(scores.dtype).min)
     target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
     with torch.no_grad():
         accuracy = (scores.argmax(1) == target).to(scores.dtype).mean()
-    return loss, {"match_accuracy": accuracy}
+    return loss, accuracy
 
 
 @torch.no_grad()
@@ -131,6 +213,12 @@ def scene_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) ->
     apart = pairs.scenes[:, None] != pairs.scenes[None, :]
     nearest = (prompt @ scene.T).masked_fill(apart, -2.0).argmax(1)
     return float((pairs.looks[nearest] == pairs.looks).double().mean())
+
+
+def pairs_again(pairs: Pairs, again: Again) -> Pairs:
+    """Put the scene laid again in the place of prompt images, for the objects that show there."""
+    shown = torch.nonzero(again.masks.any(dim=1))[:, 0]
+    return replace(pairs, prompt_crops=again.crops, prompt_masks=again.masks).select(shown)
 
 
 def embed_looks(
@@ -177,34 +265,65 @@ def _magnifications(episode: Episode) -> dict[str, float]:
     return {image.placement.object: image.magnification for image in images}
 
 
-def _pairs_of_scene(
+def _varied(
+    scene: Scene, variety: Variety, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
+) -> Scene:
+    if variety.random_looks:
+        scene = with_random_looks(scene, variety.random_looks, assets, rng)
+    return with_twins(scene, variety.twins, shades, assets, rng) if variety.twins else scene
+
+
+def pairs_of_scene(
     scene: Scene,
-    magnifications: dict[str, float],
+    magnifications: Mapping[str, float],
     rasteriser: Rasteriser,
-    looks: dict[tuple[str, str], int],
+    looks: dict[tuple, int],
     number: int,
+    again: tuple[Scene, dict[int, float]] | None = None,
 ) -> list[tuple]:
-    views = rasteriser.scene(scene)
-    rgb = {name: image.rgb for name, image in views.items()}
-    segm = {name: image.segm for name, image in views.items()}
-    seen = see_objects(rgb, segm, [placement.id for placement in scene.placements])
+    """Draw a scene and the prompt images of what it shows.
+
+    Args:
+        scene: The scene.
+        magnifications: How much prompt images enlarge each kind of object; others are not enlarged.
+        rasteriser: Draws.
+        looks: Numbers of looks, by object and texture; where the scene is laid again objects may be
+            twins, and stretched ones have looks of their own. New ones are added.
+        number: Number of the scene.
+        again: The scene laid again, and turns by object id.
+
+    Returns:
+        For each object that shows the fields of `Pairs`, and those of `Again` if it is laid again.
+    """
+    seen = _seen(scene, rasteriser)
+    moved = _seen(again[0], rasteriser) if again else None
     pairs = []
     for slot, placement in enumerate(scene.placements):
         if not seen.masks[:, slot].any():
             continue
         shown = _prompt_image(placement, magnifications.get(placement.object, 1.0), rasteriser)
-        look = looks.setdefault((placement.object, placement.texture), len(looks))
-        pairs.append(
-            (
-                shown.crops[:, 0],
-                shown.masks[:, 0],
-                seen.crops[:, slot],
-                seen.masks[:, slot],
-                np.int64(look),
-                np.int64(number),
-            )
+        key = (placement.object, placement.texture, *(placement.scale if again else ()))
+        look = looks.setdefault(key, len(looks))
+        pair = (
+            shown.crops[:, 0],
+            shown.masks[:, 0],
+            seen.crops[:, slot],
+            seen.masks[:, slot],
+            np.int64(look),
+            np.int64(number),
         )
+        if again and moved:
+            turn = np.float32(again[1].get(placement.id, np.nan))
+            pair = (*pair, moved.crops[:, slot], moved.masks[:, slot], turn)
+        pairs.append(pair)
     return pairs
+
+
+def _seen(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
+    views = rasteriser.scene(scene)
+    rgb = {name: image.rgb for name, image in views.items()}
+    segm = {name: image.segm for name, image in views.items()}
+    return see_objects(rgb, segm, [placement.id for placement in scene.placements])
 
 
 def _prompt_image(placement: Placement, magnification: float, rasteriser: Rasteriser):

@@ -17,9 +17,10 @@ from openvima.policies.network import PolicyNetwork
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.parallel import Parallel
-from openvima.training.pretrain import Pairs, matching_loss, scene_accuracy
+from openvima.training.pretrain import Pairs, matching_loss, pairs_again, scene_accuracy
 from openvima.training.schedule import step_generator
 from openvima.training.source import ExampleSource, Parts, by_length, order_of
+from openvima.training.turning import joint_loss, mirrored, shifted, turn_accuracy
 
 Metrics = dict[str, float]
 CHUNK = 64  # demonstrations whose images are encoded together
@@ -67,19 +68,36 @@ class Matching:
         """Draw a batch of pairs and add its gradients."""
         config = self._config
         generator = step_generator(config.seed, self.name, step)
-        count = len(self._training.looks)
-        rows = torch.randperm(count, generator=generator)[: config.pretraining_batch]
-        rows = rows.to(self._training.looks.device)
-        loss, metrics = matching_loss(
-            self.encoder, self._training.select(rows), temperature=config.temperature, generator=generator
-        )
+        batch = self._training.select(self._rows(generator).to(self._training.looks.device))
+        if self.encoder.config.turn_bins:
+            batch = mirrored(batch, generator)
+        if config.pretraining_box_shift:
+            batch = shifted(batch, config.pretraining_box_shift, generator)
+        loss_of = matching_loss if batch.again is None else joint_loss
+        loss, metrics = loss_of(self.encoder, batch, temperature=config.temperature, generator=generator)
         loss.backward()
         return {"loss": loss.item(), **{name: value.item() for name, value in metrics.items()}}
 
     def validate(self) -> Metrics:
-        """Share of prompt images whose object is the most similar one in its scene."""
-        accuracy = scene_accuracy(self.encoder, self._validation)
-        return {"scene_accuracy": accuracy}
+        """Share of prompt images whose object is the most similar one in its scene.
+
+        Where scenes are laid twice, the same share for objects laid again, and the share of right turns.
+        """
+        pairs = self._validation
+        metrics = {"scene_accuracy": scene_accuracy(self.encoder, pairs)}
+        if pairs.again:
+            metrics["again_accuracy"] = scene_accuracy(self.encoder, pairs_again(pairs, pairs.again))
+        if self.encoder.config.turn_bins:
+            metrics["turn_accuracy"] = turn_accuracy(self.encoder, pairs)
+        return metrics
+
+    def _rows(self, generator: torch.Generator) -> torch.Tensor:
+        """Draw a batch: of whole scenes if there are twins in them, to be told apart, else of any objects."""
+        batch, scenes = self._config.pretraining_batch, self._training.scenes
+        if not self._config.pretraining_twins:
+            return torch.randperm(len(scenes), generator=generator)[:batch]
+        rank = torch.rand(int(scenes.max()) + 1, generator=generator)
+        return rank[scenes.cpu()].argsort(stable=True)[:batch]
 
 
 class Cloning:
@@ -195,6 +213,11 @@ def keeps_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
     images = network.images
     matches = isinstance(images, ObjectEncoder) and images.config.appearance_width > 0
     return matches and bool(config.pretraining_steps or config.init) and not config.tune_crops
+
+
+def has_turns(network: PolicyNetwork) -> bool:
+    """Whether a network compares how objects lie in two images."""
+    return isinstance(network.images, ObjectEncoder) and network.images.config.turn_bins > 0
 
 
 def freeze_crops(learner: PolicyLearner, caches: Sequence[TokenCache]) -> None:
