@@ -271,7 +271,8 @@ def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:
                 for slot, part, valid in _places(network, objects, counts)
             ]
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
-        prompts.append(PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images)))
+        numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
+        prompts.append(PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers))
     return prompts
 
 

@@ -159,7 +159,7 @@ def _sequence_stages(
     """Read the whole sequence with its masked places, which the network itself leaves out."""
     trunk = network.trunk
     with watched(network) as seen:
-        _, state = trunk.extend(network.begin(memory), tokens_BLD, mask_BL)
+        _, state = trunk.extend(network.begin(memory).trunk, tokens_BLD, mask_BL)
     known_BL, mask = torch.ones_like(mask_BL), state.mask_BS.numpy()
     if isinstance(trunk, PrefixTrunk):
         separator_B1D = trunk.separator.expand(len(tokens_BLD), 1, -1)

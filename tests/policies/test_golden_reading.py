@@ -62,6 +62,7 @@ def longer_companion(inputs: Inputs) -> Inputs:
         np.concatenate([first.parts, second.parts]),
         np.concatenate([first.mask, second.mask]),
         ObjectViews.concatenated([first.objects, second.objects]),
+        np.concatenate([first.numbers, second.numbers]),
     )
     history = [*inputs.histories[0], *inputs.histories[1][:2]]
     if len(history[0].objects) > 1:  # whole frames are always one

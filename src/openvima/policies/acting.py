@@ -21,8 +21,7 @@ from openvima.policies.inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.policies.layers.trunk import TrunkState
-from openvima.policies.network import Memory, PolicyNetwork
+from openvima.policies.network import HistoryState, Memory, PolicyNetwork
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
@@ -39,7 +38,7 @@ class _Episodes:
         readers: Readers of their observations.
         generators: Generators of their draws.
         memory: Their prompts.
-        state: What the trunk has read of them.
+        state: What has been read of them.
         actions_BC: Their last actions, metres and quaternions, float32; None before the first.
         margins_B: How far the best class of their last action lay above the next, in its tightest choice;
             None before the first.
@@ -50,7 +49,7 @@ class _Episodes:
     readers: tuple[EpisodeReader, ...]
     generators: tuple[torch.Generator, ...]
     memory: Memory
-    state: TrunkState
+    state: HistoryState
     actions_BC: torch.Tensor | None
     margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]

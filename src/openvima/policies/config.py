@@ -8,7 +8,9 @@ from typing import Any, get_args, get_type_hints
 from openvima.errors import ConfigError
 from openvima.policies.heads.autoregressive import AutoregressiveConfig
 from openvima.policies.heads.bins import BinsConfig
+from openvima.policies.heads.copying import CopyingConfig
 from openvima.policies.heads.pointing import PointingConfig
+from openvima.policies.layers.comparison import ComparisonConfig
 from openvima.policies.layers.frame_encoder import FrameEncoderConfig
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
@@ -23,19 +25,23 @@ class PolicyConfig:
         images: How images become tokens: object by object, or as whole frames.
         prompt: Prompt encoder.
         trunk: How the history is read in the light of the prompt.
-        head: How actions are given: as table bins, as bins one after the other, or by pointing.
+        head: How actions are given: as table bins, as bins one after the other, by pointing, or by
+            pointing with places to copy.
         action_width: Width of the features of each part of a past action; not used where each component is a
             token of its own.
         query_token: Append a learned token to each step's images and act from there; without it the policy
             acts from its last image token, as the published ones do.
+        comparison: Compare objects with each other and with those of the prompt, and add to their tokens how
+            they differ; None to leave them as they are.
     """
 
     images: ObjectEncoderConfig | FrameEncoderConfig
     prompt: PromptEncoderConfig
     trunk: DecoderConfig | PrefixConfig
-    head: BinsConfig | AutoregressiveConfig | PointingConfig
+    head: BinsConfig | AutoregressiveConfig | PointingConfig | CopyingConfig
     action_width: int
     query_token: bool = False
+    comparison: ComparisonConfig | None = None
 
     def __post_init__(self) -> None:
         if self.images.width != self.trunk.width:
@@ -43,14 +49,18 @@ class PolicyConfig:
                 f"policy: image tokens are {self.images.width} wide, the trunk {self.trunk.width}; "
                 "make them equal."
             )
-        if isinstance(self.head, PointingConfig):
-            images = self.images
-            points = isinstance(images, ObjectEncoderConfig) and images.fuse_views and images.appearance_width
-            if not (points and self.query_token):
-                raise ConfigError(
-                    "policy: the pointing head needs objects with fuse_views, an appearance width above 0 "
-                    "and a query token."
-                )
+        images = self.images
+        matches = isinstance(images, ObjectEncoderConfig) and images.fuse_views and images.appearance_width
+        if isinstance(self.head, PointingConfig | CopyingConfig) and not (matches and self.query_token):
+            name = "pointing" if isinstance(self.head, PointingConfig) else "copying"
+            raise ConfigError(
+                f"policy: the {name} head needs objects with fuse_views, an appearance width above 0 "
+                "and a query token."
+            )
+        if self.comparison and not matches:
+            raise ConfigError(
+                "policy: comparison needs objects with fuse_views and an appearance width above 0."
+            )
 
     def to_dict(self) -> dict[str, Any]:  # Any: plain YAML values
         """Return nested dictionaries of plain values, for files."""

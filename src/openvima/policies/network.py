@@ -4,12 +4,12 @@ Its members differ in how images become tokens and in how the history is read in
 are parts that the config names. See `openvima.policies.families`.
 
 Shape suffixes: B batch, T steps, L prompt places, I image tokens of all prompts, S objects in all prompts, V
-views, N objects in view, Q slots of a step, P places kept, D width of the trunk, F width of image features, C
-components of an action.
+views, N objects in view, M objects in one prompt, Q slots of a step, P places kept, D width of the trunk, F
+width of image features, C components of an action.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
@@ -21,11 +21,21 @@ from openvima.policies.heads.autoregressive import (
     AutoregressiveHead,
     ComponentTokens,
 )
-from openvima.policies.heads.base import ActionHead, Choose, HeadInputs, likeliest, to_unit_range
+from openvima.policies.heads.base import (
+    ActionHead,
+    Choose,
+    HeadInputs,
+    Recollection,
+    Remembered,
+    likeliest,
+    to_unit_range,
+)
 from openvima.policies.heads.bins import BinsConfig, BinsHead
+from openvima.policies.heads.copying import CopyingConfig, CopyingHead
 from openvima.policies.heads.pointing import PointingHead
 from openvima.policies.inputs import HistoryBatch, PromptBatch
 from openvima.policies.layers.action_encoder import ActionEncoder
+from openvima.policies.layers.comparison import Comparison, Sights, TurnBetween, earlier, others
 from openvima.policies.layers.frame_encoder import FrameEncoder
 from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoder
@@ -47,6 +57,8 @@ class Memory:
         mask_BL: Which places exist.
         object_mask_BL: Which of them are images.
         appearance_BLA: Appearance of their objects; zero elsewhere.
+        sights: What the images show, shapes (B, M, ...), for networks that compare or copy.
+        scenes: The same as the head needs it.
     """
 
     tokens_BLD: torch.Tensor
@@ -54,6 +66,8 @@ class Memory:
     mask_BL: torch.Tensor
     object_mask_BL: torch.Tensor
     appearance_BLA: torch.Tensor
+    sights: Sights | None = None
+    scenes: Remembered | None = None
 
     def select(self, rows: Sequence[int]) -> "Memory":
         """Return the prompts of some rows of the batch."""
@@ -64,7 +78,29 @@ class Memory:
             self.mask_BL[index],
             self.object_mask_BL[index],
             self.appearance_BLA[index],
+            self.sights.select(rows) if self.sights else None,
+            self.scenes.select(rows) if self.scenes else None,
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryState:
+    """What has been read of the histories of a batch; all are equally long.
+
+    Args:
+        trunk: What the trunk keeps.
+        num_steps: Steps that were read.
+        first: Objects in view at the first of them, for heads that copy.
+    """
+
+    trunk: TrunkState
+    num_steps: int = 0
+    first: Remembered | None = None
+
+    def select(self, rows: Sequence[int]) -> "HistoryState":
+        """Return the state of some rows of the batch."""
+        first = self.first.select(rows) if self.first else None
+        return HistoryState(self.trunk.select(rows), self.num_steps, first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +116,23 @@ class _Places:
     tokens_BTQD: torch.Tensor
     mask_BTQ: torch.Tensor
     kept_BTQ: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shown:
+    """What the images of prompts show.
+
+    Args:
+        order_BM: Where in the prompt each object stands.
+        sights: Looks and places.
+        changes_SD: What comparisons add to the token of each object of all prompts, if there are any.
+        turns_BMR: Chances of the turns since an earlier image, if they are estimated.
+    """
+
+    order_BM: torch.Tensor
+    sights: Sights
+    changes_SD: torch.Tensor | None
+    turns_BMR: torch.Tensor | None
 
 
 class PolicyNetwork(nn.Module):
@@ -114,6 +167,12 @@ class PolicyNetwork(nn.Module):
         self.trunk = build_trunk(config.trunk)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head: ActionHead = _head(config)
+        self.compare_within: Comparison | None = None  # the prompt, or what is in view
+        self.compare_with_prompt: Comparison | None = None
+        if config.comparison:
+            assert isinstance(images, ObjectEncoderConfig)  # the config has seen to it
+            self.compare_within = Comparison(config.comparison, images)
+            self.compare_with_prompt = Comparison(config.comparison, images)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
@@ -128,21 +187,32 @@ class PolicyNetwork(nn.Module):
         """
         features_VSF = features_KF[prompts.crops_VS]
         is_image_BL = (prompts.images_BL >= 0) & prompts.mask_BL
-        encoded_BLD = self._read(prompts, features_VSF)
         width = _appearance_width(self.config)
-        appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
-        if not width:
-            return Memory(encoded_BLD, encoded_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
-        assert isinstance(self.images, ObjectEncoder)
-        roles_BLD = self._read(prompts, torch.zeros_like(features_VSF))
-        if prompts.masks_VS.shape[1]:
+        looks_SA = features_VSF.new_zeros(prompts.masks_VS.shape[1], width)
+        if width and len(looks_SA):
+            assert isinstance(self.images, ObjectEncoder)
             looks_SA = self.images.embed_appearance(features_VSF, prompts.masks_VS)
-            appearance_BLA = looks_SA[prompts.images_BL.clamp(min=0)] * is_image_BL[..., None]
-        return Memory(encoded_BLD, roles_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
+        shown = None
+        if self.compare_within or isinstance(self.head, CopyingHead):
+            shown = self._shown(prompts, is_image_BL, features_VSF, looks_SA)
+        changes_SD = None if shown is None else shown.changes_SD
+        encoded_BLD = self._read(prompts, features_VSF, changes_SD)
+        roles_BLD = encoded_BLD
+        appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
+        if width:
+            roles_BLD = self._read(prompts, torch.zeros_like(features_VSF), changes_SD)
+            if len(looks_SA):
+                appearance_BLA = looks_SA[prompts.images_BL.clamp(min=0)] * is_image_BL[..., None]
+        memory = Memory(encoded_BLD, roles_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
+        if shown is None:
+            return memory
+        place_BMD = shown.order_BM[..., None].expand(-1, -1, encoded_BLD.shape[-1])
+        scenes = _remembered(encoded_BLD.gather(1, place_BMD), shown.sights, shown.turns_BMR)
+        return replace(memory, sights=shown.sights, scenes=scenes)
 
-    def begin(self, memory: Memory) -> TrunkState:
-        """Return the state of the trunk after the prompt and before the first step."""
-        return self.trunk.begin(memory.tokens_BLD, memory.mask_BL)
+    def begin(self, memory: Memory) -> HistoryState:
+        """Return the state after the prompt and before the first step."""
+        return HistoryState(self.trunk.begin(memory.tokens_BLD, memory.mask_BL))
 
     def forward(
         self, memory: Memory, history: HistoryBatch, features_KF: torch.Tensor, actions_BTC: torch.Tensor
@@ -169,17 +239,17 @@ class PolicyNetwork(nn.Module):
     def extend(
         self,
         memory: Memory,
-        state: TrunkState,
+        state: HistoryState,
         history: HistoryBatch,
         features_KF: torch.Tensor,
         previous_BTC: torch.Tensor,
         has_previous_BT: torch.Tensor,
-    ) -> tuple[HeadInputs, TrunkState]:
+    ) -> tuple[HeadInputs, HistoryState]:
         """Read the next steps of histories; those before them are in the state.
 
         Args:
             memory: Encoded prompts.
-            state: What the trunk has read.
+            state: What has been read.
             history: Observations of the next steps.
             features_KF: Encoded images, by number.
             previous_BTC: The action that was taken before each of these observations, metres and quaternions.
@@ -194,7 +264,7 @@ class PolicyNetwork(nn.Module):
         previous = self._action_places(previous_BTC, has_previous_BT, features_KF.dtype)
         return self._read_steps(memory, state, history, features_KF, before=previous)
 
-    def decide(self, inputs: HeadInputs, state: TrunkState, choose: Choose = likeliest) -> torch.Tensor:
+    def decide(self, inputs: HeadInputs, state: HistoryState, choose: Choose = likeliest) -> torch.Tensor:
         """Decide on the action of the step that was read last.
 
         Args:
@@ -210,10 +280,12 @@ class PolicyNetwork(nn.Module):
         if not isinstance(actions, ComponentTokens):
             return self.head.decide(inputs, choose)
 
+        trunk = state.trunk
+
         def read_on(component: int, bins_B1: torch.Tensor) -> torch.Tensor:
-            nonlocal state
+            nonlocal trunk
             exists_B1 = torch.ones_like(bins_B1, dtype=torch.bool)
-            output_B1D, state = self.trunk.extend(state, actions.of(component, bins_B1), exists_B1)
+            output_B1D, trunk = self.trunk.extend(trunk, actions.of(component, bins_B1), exists_B1)
             return output_B1D
 
         return self.head.decide(inputs, choose, read_on)
@@ -221,30 +293,37 @@ class PolicyNetwork(nn.Module):
     def _read_steps(
         self,
         memory: Memory,
-        state: TrunkState,
+        state: HistoryState,
         history: HistoryBatch,
         features_KF: torch.Tensor,
         *,
         before: _Places | None = None,
         after: _Places | None = None,
-    ) -> tuple[HeadInputs, TrunkState]:
+    ) -> tuple[HeadInputs, HistoryState]:
         """Read the slots of steps, and the places of actions before or after those of each step."""
         features = features_KF[history.crops_BTVN]
-        slots_BTQD, mask_BTQ, read_BT = self.observe(history, features)
+        appearance_BTNA = self._appearance(features, history.masks_BTVN)
+        sights = _sights_in_view(history, features, appearance_BTNA, memory.sights)
+        slots_BTQD, mask_BTQ, read_BT = self.observe(history, features, self._relations(memory, sights))
         metric = torch.promote_types(slots_BTQD.dtype, torch.float32)  # half precision: too coarse for metres
         # Masked places are left out, except the slot that is read: it is read even if it is padding.
         is_read_BTQ = F.one_hot(read_BT, mask_BTQ.shape[-1]).bool() & history.steps_BT[..., None]
         slots = _Places(slots_BTQD, mask_BTQ, mask_BTQ | is_read_BTQ)
         places = [part for part in (before, slots, after) if part is not None]
-        outputs, state = self._read_on(state, places)
+        outputs, trunk = self._read_on(state.trunk, places)
         outputs_BTQD = outputs[places.index(slots)]
         place_BT1D = read_BT[..., None, None].expand(-1, -1, 1, outputs_BTQD.shape[-1])
         query_BT1D = outputs_BTQD.gather(2, place_BT1D)
+        objects_BTND = outputs_BTQD[:, :, :-1] if self.query is not None else outputs_BTQD
+        first = state.first
+        if first is None and isinstance(self.head, CopyingHead):
+            first = _remembered(objects_BTND[:, 0], sights.at_step(0))
+        state = HistoryState(trunk, state.num_steps + history.steps_BT.shape[1], first)
         inputs = HeadInputs(
             query_BTD=query_BT1D.squeeze(2),
-            objects_BTND=outputs_BTQD[:, :, :-1] if self.query is not None else outputs_BTQD,
+            objects_BTND=objects_BTND,
             masks_BTN=history.masks_BTVN.any(dim=2),
-            appearance_BTNA=self._appearance(features, history.masks_BTVN),
+            appearance_BTNA=appearance_BTNA,
             positions_BTN2=history.positions_BTN2.to(metric),
             grasps_BTN2=history.grasps_BTN2.to(metric),
             lifts_BT=history.end_effector_BT == SUCTION,
@@ -253,19 +332,30 @@ class PolicyNetwork(nn.Module):
             prompt_appearance_BMA=memory.appearance_BLA,
             # The first component is told at the query, each other one at the one before it.
             components_BTCD=torch.cat([query_BT1D, outputs[-1][:, :, :-1]], dim=2) if after else None,
+            recollection=self._recollection(memory, state, history.steps_BT.shape[1]),
         )
         return inputs, state
 
     def observe(
-        self, history: HistoryBatch, features_BTVNF: torch.Tensor
+        self,
+        history: HistoryBatch,
+        features_BTVNF: torch.Tensor,
+        relations_BTND: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Make the slots of each step.
+
+        Args:
+            history: Observations.
+            features_BTVNF: Encoded images of their objects.
+            relations_BTND: What comparisons say of the objects, if there are any.
 
         Returns:
             Image tokens, then the query if there is one, (B, T, Q, D); which of them exist, (B, T, Q); and
             the slot from whose output the step's action is read, (B, T).
         """
         tokens_BTQE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
+        if relations_BTND is not None:
+            tokens_BTQE = tokens_BTQE + relations_BTND
         effector = self.end_effectors(history.end_effector_BT)[:, :, None]
         effector = effector.expand(*tokens_BTQE.shape[:3], NUM_END_EFFECTORS)
         slots_BTQD = self.observation_out(torch.cat([tokens_BTQE, effector], dim=-1))
@@ -286,9 +376,56 @@ class PolicyNetwork(nn.Module):
             read_BT = read_BT - history.masks_BTVN.shape[-1] + history.counts_BT.clamp(min=1)
         return slots_BTQD, mask_BTQ, read_BT
 
-    def _read(self, prompts: PromptBatch, features_VSF: torch.Tensor) -> torch.Tensor:
+    def _read(
+        self, prompts: PromptBatch, features_VSF: torch.Tensor, changes_SD: torch.Tensor | None
+    ) -> torch.Tensor:
         tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
+        if changes_SD is not None:
+            tokens_IE = tokens_IE + changes_SD
         return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE)
+
+    def _shown(
+        self,
+        prompts: PromptBatch,
+        is_image_BL: torch.Tensor,
+        features_VSF: torch.Tensor,
+        looks_SA: torch.Tensor,
+    ) -> _Shown:
+        """Gather what prompts show, and compare the objects of each with those of its earlier images."""
+        order_BM = _objects_first(is_image_BL)
+        exists_BM = is_image_BL.gather(1, order_BM)
+        row_BM = prompts.images_BL.gather(1, order_BM).clamp(min=0)
+        sights = _sights_of(prompts, row_BM, exists_BM, features_VSF, looks_SA)
+        if self.compare_within is None:
+            return _Shown(order_BM, sights, None, None)
+        changes_BMD, turns_BMR = self.compare_within(sights, sights, earlier(sights), self._turn_between)
+        changes_SD = changes_BMD.new_zeros(prompts.masks_VS.shape[1], changes_BMD.shape[-1])
+        changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
+        return _Shown(order_BM, sights, changes_SD, turns_BMR)
+
+    def _relations(self, memory: Memory, sights: Sights) -> torch.Tensor | None:
+        """Compare the objects in view with each other and with those of the prompt, (B, T, N, D)."""
+        if self.compare_within is None or self.compare_with_prompt is None or memory.sights is None:
+            return None
+        shown, turns = memory.sights.at_each_step(), self._turn_between
+        within_BTND, _ = self.compare_within(sights, sights, others(sights), turns)
+        prompt_BTND, _ = self.compare_with_prompt(sights, shown, earlier(sights, shown), turns)
+        return within_BTND + prompt_BTND
+
+    @property
+    def _turn_between(self) -> TurnBetween | None:
+        images = self.images
+        if isinstance(images, ObjectEncoder) and images.config.turn_bins:
+            return images.turn_between
+        return None
+
+    def _recollection(self, memory: Memory, state: HistoryState, num_steps: int) -> Recollection | None:
+        """What a head may copy from at the steps that were read last."""
+        if memory.scenes is None or state.first is None:
+            return None
+        device = memory.mask_BL.device
+        steps_T = torch.arange(state.num_steps - num_steps, state.num_steps, device=device)
+        return Recollection(state.first, memory.scenes, steps_T)
 
     def _action_places(
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
@@ -352,6 +489,69 @@ def outline_network(config: PolicyConfig) -> PolicyNetwork:
         return PolicyNetwork(config)
 
 
+def _objects_first(is_image_BL: torch.Tensor) -> torch.Tensor:
+    """Places of the objects of each prompt, in reading order, then some others, (B, M)."""
+    order_BL = is_image_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    return order_BL[:, : int(is_image_BL.sum(dim=1).max())]
+
+
+def _sights_of(
+    prompts: PromptBatch,
+    row_BM: torch.Tensor,
+    exists_BM: torch.Tensor,
+    features_VSF: torch.Tensor,
+    looks_SA: torch.Tensor,
+) -> Sights:
+    """What the objects of each prompt look like and where they are."""
+    metric = torch.promote_types(features_VSF.dtype, torch.float32)
+    return Sights(
+        features_VNF=features_VSF[:, row_BM].transpose(0, 1),
+        boxes_VN4=prompts.boxes_VS4[:, row_BM].transpose(0, 1),
+        masks_VN=(prompts.masks_VS[:, row_BM] & exists_BM).transpose(0, 1),
+        appearance_NA=looks_SA[row_BM],
+        positions_N2=prompts.positions_S2[row_BM].to(metric),
+        on_table_N=prompts.on_table_S[row_BM] & exists_BM,
+        numbers_N=prompts.numbers_S[row_BM] * exists_BM,
+    )
+
+
+def _sights_in_view(
+    history: HistoryBatch,
+    features_BTVNF: torch.Tensor,
+    appearance_BTNA: torch.Tensor,
+    prompt: Sights | None,
+) -> Sights:
+    """What the objects in view look like and where they are; their time is after the prompt's last image."""
+    exists_BTN = history.masks_BTVN.any(dim=2)
+    now_BTN = torch.zeros_like(exists_BTN, dtype=torch.int64)
+    if prompt is not None and prompt.numbers_N.shape[1]:
+        now_BTN = now_BTN + (prompt.numbers_N.amax(dim=1) + 1)[:, None, None]
+    metric = torch.promote_types(features_BTVNF.dtype, torch.float32)
+    return Sights(
+        features_BTVNF,
+        history.boxes_BTVN4,
+        history.masks_BTVN,
+        appearance_BTNA,
+        history.positions_BTN2.to(metric),
+        exists_BTN,
+        now_BTN,
+    )
+
+
+def _remembered(
+    tokens_BKD: torch.Tensor, sights: Sights, turns_BKR: torch.Tensor | None = None
+) -> Remembered:
+    """Keep objects as places to copy."""
+    return Remembered(
+        tokens_BKD,
+        sights.masks_VN.any(dim=-2) & sights.on_table_N,
+        sights.appearance_NA,
+        sights.positions_N2,
+        sights.numbers_N,
+        turns_BKR,
+    )
+
+
 def _appearance_width(config: PolicyConfig) -> int:
     return config.images.appearance_width if isinstance(config.images, ObjectEncoderConfig) else 0
 
@@ -360,4 +560,7 @@ def _head(config: PolicyConfig) -> ActionHead:
     width, head = config.trunk.width, config.head
     if isinstance(head, AutoregressiveConfig):
         return AutoregressiveHead(head, width)
+    if isinstance(head, CopyingConfig):
+        assert isinstance(config.images, ObjectEncoderConfig)  # the config has seen to it
+        return CopyingHead(head, width, config.images.turn_bins if config.comparison else 0)
     return BinsHead(head, width) if isinstance(head, BinsConfig) else PointingHead(head, width)

@@ -45,6 +45,39 @@ def nano_bins() -> "PolicyConfig":
     return replace(nano(), head=BinsConfig(hidden_width=256))
 
 
+def small() -> "PolicyConfig":
+    """7.9 M parameters: it copies places that it has seen, and compares objects with each other."""
+    from openvima.policies.config import PolicyConfig
+    from openvima.policies.heads.copying import CopyingConfig
+    from openvima.policies.layers.comparison import ComparisonConfig
+    from openvima.policies.layers.conv_encoder import ConvConfig
+    from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+    from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
+    from openvima.policies.layers.text_encoder import TextEncoderConfig
+    from openvima.policies.layers.trunk import DecoderConfig
+    from openvima.policies.tokenizer import vocabulary_size
+
+    crop = ConvConfig(width=48, output_width=192)
+    text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
+    return PolicyConfig(
+        images=ObjectEncoderConfig(
+            crop,
+            box_width=64,
+            width=192,
+            fuse_views=True,
+            appearance_width=128,
+            crop_dropout=0.5,
+            turn_bins=72,
+        ),
+        prompt=PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size()),
+        trunk=DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
+        head=CopyingConfig(),
+        action_width=64,
+        query_token=True,
+        comparison=ComparisonConfig(),
+    )
+
+
 def _member(family: str, size_name: str) -> "PolicyConfig":
     from openvima.policies.families.common import size
     from openvima.policies.families.flamingo import flamingo
@@ -60,6 +93,7 @@ def _member(family: str, size_name: str) -> "PolicyConfig":
 PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
     "nano": nano,
     "nano-bins": nano_bins,
+    "small": small,
     **{f"{family}-{size}": partial(_member, family, size) for family in FAMILIES for size in SIZE_NAMES},
 }
 
@@ -71,6 +105,6 @@ def preset(name: str) -> "PolicyConfig":
         UnknownPolicyError: There is no preset of that name.
     """
     if name not in PRESETS:
-        hint = f"Allowed: nano, nano-bins, and {'|'.join(FAMILIES)}-{'|'.join(SIZE_NAMES)}."
+        hint = f"Allowed: nano, nano-bins, small, and {'|'.join(FAMILIES)}-{'|'.join(SIZE_NAMES)}."
         raise UnknownPolicyError(unknown_name("preset", name, PRESETS, hint))
     return PRESETS[name]()

@@ -11,7 +11,7 @@ from openvima.policies.network import PolicyNetwork, outline_network
 # Part → where its parameters are. The published names of sizes, such as 200M, count the trunk alone.
 PARTS = {
     "prompt": ("prompt.",),
-    "images": ("images.", "end_effectors.", "observation_out."),
+    "images": ("images.", "end_effectors.", "observation_out.", "compare_"),
     "trunk": ("trunk.self_blocks.", "trunk.cross_blocks."),
     "actions": ("actions.",),
     "head": ("head.",),

@@ -28,7 +28,7 @@ from openvima.data.tokens.episode import (
 from openvima.errors import DatasetError
 from openvima.perception.objects import FRONT, TOP
 from openvima.policies.heads.base import ActionTargets
-from openvima.policies.inputs import WORD, HistoryBatch, PromptBatch, Reader
+from openvima.policies.inputs import WORD, HistoryBatch, PromptBatch, Reader, on_table
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.training.dataset import Batch, Example, Spurious
@@ -147,7 +147,23 @@ class Collator:
         shown = rows[:, NUMBERS] > 0
         numbers_VS = np.ascontiguousarray(np.where(shown, rows[:, NUMBERS] + base, 0).T)
         boxes_VS4 = np.ascontiguousarray(rows[:, BOXES].reshape(-1, len(VIEWS), 4).swapaxes(0, 1))
-        arrays = (words_BL, images_BL, mask_BL, numbers_VS, boxes_VS4, np.ascontiguousarray(shown.T))
+        shown_VS = np.ascontiguousarray(shown.T)
+        starts = np.cumsum([0, *(len(prompt.rows) for prompt in prompts)])
+        lying = [
+            on_table(prompt.places.images, boxes_VS4[:, start:end], shown_VS[:, start:end])
+            for prompt, start, end in zip(prompts, starts[:-1], starts[1:], strict=True)
+        ]
+        arrays = (
+            words_BL,
+            images_BL,
+            mask_BL,
+            numbers_VS,
+            boxes_VS4,
+            shown_VS,
+            _on_table(boxes_VS4[..., :2].swapaxes(0, 1), shown[:, TOP]),
+            np.concatenate([prompt.places.images for prompt in prompts]),
+            np.concatenate(lying),
+        )
         return PromptBatch(*(torch.from_numpy(array) for array in arrays))
 
     def _prompt(self, episode: TokenEpisode) -> "_Prompt":
@@ -182,35 +198,40 @@ class Collator:
         layout, tokenizer = self.reader.layout, self.reader.tokenizer
         places: list[tuple[int, int, int]] = []  # word, entry, part
         starts, order, count = np.cumsum([0, *counts]), [], 0
+        sizes: list[int] = []  # rows of each image
         for piece in pieces_of(text):
             if isinstance(piece, str):
                 places += [(word, WORD, 0) for word in tokenizer.encode(piece)]
                 continue
             order += range(starts[piece], starts[piece + 1])
+            sizes.append({"views": max(slots, default=0), "frames": 1, "objects": counts[piece]}[layout])
             if layout == "views":
                 places += [(PADDING_ID, count + k, v) for v, size in enumerate(slots) for k in range(size)]
-                count += max(slots)
             elif layout == "frames":
                 places += [(PADDING_ID, count, part) for part in range(self.reader.tokens_per_frame_pair)]
-                count += 1
             else:
                 places += [(PADDING_ID, count + k, 0) for k in range(counts[piece])]
-                count += counts[piece]
+            count += sizes[-1]
         places.append((tokenizer.end_id, WORD, 0))
         words, entries, parts = np.array(places).T
         in_order = order == list(range(starts[-1]))
-        is_word = entries == WORD
-        return _Places(words, np.maximum(entries, 0), parts, is_word, None if in_order else np.array(order))
+        is_word, images = entries == WORD, np.repeat(np.arange(len(sizes)), sizes)
+        in_other_order = None if in_order else np.array(order)
+        return _Places(words, np.maximum(entries, 0), parts, is_word, images, in_other_order)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Places:
-    """The places of a prompt: word, or row and part of what is shown; and the rows as the text shows them."""
+    """The places of a prompt: word, or row and part of what is shown; and the rows as the text shows them.
+
+    `images` is the number of the image that each row is of, counted in reading order.
+    """
 
     words: np.ndarray
     entries: np.ndarray
     parts: np.ndarray
     is_word: np.ndarray
+    images: np.ndarray
     order: np.ndarray | None  # None: as they are stored
 
 

@@ -63,12 +63,12 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "nano": {},
     }
 )
-_SMALL = "nano"  # part of the names of the small presets
+_SMALL = ("nano", "small")  # parts of the names of the small presets
 
 
 def default_recipe(preset: str | None) -> str:
     """Return the recipe for a preset: "nano" for small networks and those of your own, else "paper"."""
-    return "nano" if preset and (_SMALL in preset or ":" in preset) else "paper"
+    return "nano" if preset and any(part in preset for part in (*_SMALL, ":")) else "paper"
 
 
 def recipe_settings(name: str) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """What every action head takes and gives.
 
-Shape suffixes: B batch, T steps, N objects in view, M objects in the prompt, D width, A width of appearance.
+Shape suffixes: B batch, T steps, N objects in view, M places of the prompt, K objects that are remembered, D
+width, A width of appearance.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +21,8 @@ __all__ = [
     "Choose",
     "HeadInputs",
     "ReadOn",
+    "Recollection",
+    "Remembered",
     "from_unit_range",
     "likeliest",
     "masked_mean",
@@ -33,6 +36,55 @@ ReadOn = Callable[[int, torch.Tensor], torch.Tensor]
 
 _LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
 _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Remembered:
+    """Objects that are not in view now, each where it once was.
+
+    Args:
+        tokens_BKD: What is known of them.
+        masks_BK: Which of them exist and have a place on the table.
+        appearance_BKA: Their appearance.
+        positions_BK2: Table points under their boxes, metres; in float32 at least.
+        numbers_BK: Which image shows each, counted from 0.
+        turns_BKR: Chances of the turns that each has made since an earlier image, counterclockwise, if they
+            are estimated.
+    """
+
+    tokens_BKD: torch.Tensor
+    masks_BK: torch.Tensor
+    appearance_BKA: torch.Tensor
+    positions_BK2: torch.Tensor
+    numbers_BK: torch.Tensor
+    turns_BKR: torch.Tensor | None = None
+
+    def select(self, rows: Sequence[int]) -> "Remembered":
+        """Return those of some rows of the batch."""
+        index = torch.as_tensor(rows, dtype=torch.int64, device=self.masks_BK.device)
+        return Remembered(
+            self.tokens_BKD[index],
+            self.masks_BK[index],
+            self.appearance_BKA[index],
+            self.positions_BK2[index],
+            self.numbers_BK[index],
+            None if self.turns_BKR is None else self.turns_BKR[index],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recollection:
+    """What a head may copy places from.
+
+    Args:
+        first: Objects that were in view at the first step of the episode.
+        scenes: Objects that the prompt's images show.
+        steps_T: Numbers of the steps, counted from 0.
+    """
+
+    first: Remembered
+    scenes: Remembered
+    steps_T: torch.Tensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +104,7 @@ class HeadInputs:
         prompt_appearance_BMA: Appearance of the prompt's objects.
         components_BTCD: Output of the decoder from which each component of the step's action is told, given
             those before it. Only with a token for each component, and where whole histories are read.
+        recollection: What was seen elsewhere and before. Only with a head that copies places.
     """
 
     query_BTD: torch.Tensor
@@ -65,6 +118,7 @@ class HeadInputs:
     prompt_masks_BM: torch.Tensor
     prompt_appearance_BMA: torch.Tensor
     components_BTCD: torch.Tensor | None = None
+    recollection: Recollection | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

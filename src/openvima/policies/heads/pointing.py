@@ -24,8 +24,8 @@ from openvima.policies.heads.base import (
 )
 from openvima.policies.layers.mlp import mlp
 
-_OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
-_RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
+OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
+RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,23 +85,23 @@ class PointingHead(ActionHead):
         true_offset = true_place - at(inputs.positions_BTN2, place)
         yaw = yaw_bin(turn_of(actions), self.config.num_yaw_bins)
         huber = F.smooth_l1_loss(
-            offset / _OFFSET_UNIT_M, true_offset / _OFFSET_UNIT_M, reduction="none", beta=0.1
+            offset / OFFSET_UNIT_M, true_offset / OFFSET_UNIT_M, reduction="none", beta=0.1
         )
         losses = {
-            "pick": masked_mean(_cross_entropy(pick_scores, pick), has_pick),
-            "place": masked_mean(_cross_entropy(place_scores, place), has_place),
+            "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
+            "place": masked_mean(cross_entropy(place_scores, place), has_place),
             "offset": masked_mean(huber.sum(-1), has_place) * self.config.offset_weight,
-            "yaw": masked_mean(_cross_entropy(yaw_scores, yaw), has_place) * self.config.yaw_weight,
+            "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_place) * self.config.yaw_weight,
         }
         with torch.no_grad():
             error_BT = (offset - true_offset).norm(dim=-1)
             right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == place)
-            right_BT &= error_BT < _RIGHT_OFFSET_M
+            right_BT &= error_BT < RIGHT_OFFSET_M
             metrics = {
                 "accuracy": masked_mean(right_BT.to(offset.dtype), has_place),
-                "pick_accuracy": _accuracy(pick_scores, pick, has_pick),
-                "place_accuracy": _accuracy(place_scores, place, has_place),
-                "yaw_accuracy": _accuracy(yaw_scores, yaw, has_place),
+                "pick_accuracy": accuracy(pick_scores, pick, has_pick),
+                "place_accuracy": accuracy(place_scores, place, has_place),
+                "yaw_accuracy": accuracy(yaw_scores, yaw, has_place),
                 "offset_error_m": masked_mean(error_BT, has_place),
             }
         return torch.stack(list(losses.values())).sum(), metrics
@@ -133,10 +133,10 @@ class PointingHead(ActionHead):
         grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
         goal = at(inputs.positions_BTN2, place_BT)
         tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), at(inputs.objects_BTND, place_BT)]
-        metric = torch.cat([grasp - start, start - 0.5, goal - 0.5], dim=-1) / _OFFSET_UNIT_M
+        metric = torch.cat([grasp - start, start - 0.5, goal - 0.5], dim=-1) / OFFSET_UNIT_M
         metric = metric.to(inputs.query_BTD.dtype)
         hidden_BTH = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
-        return self.offset(hidden_BTH) * _OFFSET_UNIT_M, self.yaw(hidden_BTH)
+        return self.offset(hidden_BTH) * OFFSET_UNIT_M, self.yaw(hidden_BTH)
 
 
 class Pointer(nn.Module):
@@ -195,11 +195,15 @@ def carried_place(actions_BTC: torch.Tensor, grasp_BT2: torch.Tensor) -> torch.T
     Returns:
         Places for them, shape (B, T, 2), metres.
     """
-    turn = turn_of(actions_BTC)
-    x, y = (grasp_BT2 - actions_BTC[..., 0:2]).unbind(-1)
-    cosine, sine = torch.cos(turn), torch.sin(turn)
-    moved = torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
-    return actions_BTC[..., 6:8] + moved
+    held_BT2 = grasp_BT2 - actions_BTC[..., 0:2]
+    return actions_BTC[..., 6:8] + turned(held_BT2, turn_of(actions_BTC))
+
+
+def turned(vectors_BT2: torch.Tensor, turn_BT: torch.Tensor) -> torch.Tensor:
+    """Turn vectors on the table by angles in radians, counterclockwise seen from above."""
+    x, y = vectors_BT2.unbind(-1)
+    cosine, sine = torch.cos(turn_BT), torch.sin(turn_BT)
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], dim=-1)
 
 
 def yaw_bin(turn: torch.Tensor, num_bins: int) -> torch.Tensor:
@@ -207,10 +211,12 @@ def yaw_bin(turn: torch.Tensor, num_bins: int) -> torch.Tensor:
     return torch.round(turn / (2 * math.pi / num_bins)).to(torch.int64) % num_bins
 
 
-def _cross_entropy(scores_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:
+def cross_entropy(scores_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:
+    """Negative log-likelihood of a class at every step, shape (B, T)."""
     loss = F.cross_entropy(scores_BTN.flatten(0, 1), target_BT.flatten(), reduction="none")
     return loss.view_as(target_BT)
 
 
-def _accuracy(scores_BTN: torch.Tensor, target_BT: torch.Tensor, mask_BT: torch.Tensor) -> torch.Tensor:
+def accuracy(scores_BTN: torch.Tensor, target_BT: torch.Tensor, mask_BT: torch.Tensor) -> torch.Tensor:
+    """Share of the steps at which the class scores highest."""
     return masked_mean((scores_BTN.argmax(-1) == target_BT).to(scores_BTN.dtype), mask_BT)

@@ -1,0 +1,340 @@
+"""A head that copies places: it puts an object where another is, where one was, or where a picture shows one.
+
+"Rearrange to this {scene} and then restore." asks for places at which nothing lies now. One of them is where
+the scene shows the object, the other one where it lay at first; both were seen.
+
+Shape suffixes as in `base.py`; C candidates for the place, G features of how they lie, H hidden width, R bins
+of turns.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+from openvima.policies.heads.base import (
+    ActionHead,
+    ActionTargets,
+    Choose,
+    HeadInputs,
+    ReadOn,
+    Recollection,
+    Remembered,
+    from_unit_range,
+    likeliest,
+    masked_mean,
+    to_unit_range,
+)
+from openvima.policies.heads.pointing import (
+    OFFSET_UNIT_M,
+    RIGHT_OFFSET_M,
+    Pointer,
+    accuracy,
+    at,
+    carried_place,
+    cross_entropy,
+    turn_of,
+    turned,
+    yaw_bin,
+)
+from openvima.policies.layers.mlp import mlp
+
+KINDS = ("in view", "at first", "in the prompt")  # where candidates come from
+_HERE_M = 0.03  # a candidate this near to the picked object is, more or less, where that is
+_NUM_GEOMETRY = 4
+_SURE = 5.0  # score of a turn that is seen without doubt, before the network learns how much it counts
+
+
+@dataclass(frozen=True, slots=True)
+class CopyingConfig:
+    """Sizes of the copying head and weights of its losses.
+
+    Args:
+        hidden_width: Width of the hidden layers that give offset and yaw.
+        num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 means no turn.
+        offset_weight: Weight of the offset's loss against the pointers'.
+        yaw_weight: Weight of the yaw's loss.
+        num_numbers: Images of a prompt, and steps, that are told apart by their number; later ones count as
+            the last of these.
+    """
+
+    hidden_width: int = 128
+    num_yaw_bins: int = 72
+    offset_weight: float = 2.0
+    yaw_weight: float = 0.5
+    num_numbers: int = 16
+
+    def __post_init__(self) -> None:
+        if self.num_yaw_bins < 2 or self.hidden_width < 1 or self.num_numbers < 1:
+            raise ConfigError(
+                f"copying head: num_yaw_bins is {self.num_yaw_bins}, hidden_width {self.hidden_width} and "
+                f"num_numbers {self.num_numbers}; they must be at least 2, 1 and 1."
+            )
+
+
+class CopyingHead(ActionHead):
+    """Points at the object to pick, then at a place to copy; offset and turn say what differs there.
+
+    Candidates for the place, with two objects on the table and one in the only scene of the prompt:
+
+        [1 in view, 2 in view, 1 at first, 2 at first, 1 in the scene]
+
+    The centre of the picked object goes to the candidate's, moved by the offset. Where it is held, and how it
+    is turned on the way, then says where the tool goes. So a wrong turn leaves the object in its place.
+
+    Turns are copied as well, where the network estimates those that the prompt's images show in as many bins
+    as the head has.
+    """
+
+    def __init__(self, config: CopyingConfig, width: int, turn_bins: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.shown_turn = ShownTurn(width) if turn_bins == config.num_yaw_bins else None
+        self.pick = Pointer(width)
+        self.place = PlacePointer(config, width)
+        self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
+        self.offset = nn.Linear(config.hidden_width, 2)
+        self.yaw = nn.Linear(config.hidden_width, config.num_yaw_bins)
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.offset.bias)
+
+    def loss(
+        self, inputs: HeadInputs, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Cross-entropy of both pointers and of the yaw, and Huber loss of the offset.
+
+        Every candidate at the demonstrated place is right: the loss is that of their chances together. Where
+        there is none, the object that the demonstration names is, or else the picked one itself, and the
+        offset has to lead from there to the place.
+        """
+        has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
+        pick_scores, place_scores = self.pick(inputs), self.place(inputs, pick)
+        goal = self._goal(inputs, targets, pick)
+        right_BTC = self._right(inputs, targets, pick, goal) | ~has_pick[..., None]
+        right_scores = place_scores.masked_fill(~right_BTC, torch.finfo(place_scores.dtype).min)
+        copied = right_scores.argmax(-1)  # the right one that is chosen first
+        offset, yaw_scores = self.relate(inputs, pick, copied)
+        true_offset = goal - _positions_at(inputs, copied)
+        yaw = yaw_bin(turn_of(targets.actions_BTC), self.config.num_yaw_bins)
+        huber = F.smooth_l1_loss(
+            offset / OFFSET_UNIT_M, true_offset / OFFSET_UNIT_M, reduction="none", beta=0.1
+        )
+        surprise = place_scores.logsumexp(-1) - right_scores.logsumexp(-1)
+        losses = {
+            "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
+            "place": masked_mean(surprise, has_pick),
+            "offset": masked_mean(huber.sum(-1), has_pick) * self.config.offset_weight,
+            "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * self.config.yaw_weight,
+        }
+        with torch.no_grad():
+            error_BT = (offset - true_offset).norm(dim=-1)
+            right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == copied)
+            right_BT &= error_BT < RIGHT_OFFSET_M
+            metrics = {
+                "accuracy": masked_mean(right_BT.to(offset.dtype), has_pick),
+                "pick_accuracy": accuracy(pick_scores, pick, has_pick),
+                "place_accuracy": accuracy(place_scores, copied, has_pick),
+                "yaw_accuracy": accuracy(yaw_scores, yaw, has_pick),
+                "offset_error_m": masked_mean(error_BT, has_pick),
+            }
+        return torch.stack(list(losses.values())).sum(), metrics
+
+    def decide(
+        self, inputs: HeadInputs, choose: Choose = likeliest, read_on: ReadOn | None = None
+    ) -> torch.Tensor:
+        """Point at an object and at a place, then bring the centre of the one to the other."""
+        pick = choose(self.pick(inputs))
+        place = choose(self.place(inputs, pick))
+        offset, yaw_scores = self.relate(inputs, pick, place)
+        offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
+        turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
+        zero, one = torch.zeros_like(turn), torch.ones_like(turn)
+        grasp, goal = at(inputs.grasps_BTN2, pick), _positions_at(inputs, place) + offset
+        held = turned(grasp - at(inputs.positions_BTN2, pick), turn)
+        pose1 = [torch.where(inputs.lifts_BT[..., None], goal + held, goal)]
+        pose1.append(torch.stack([zero, zero, torch.sin(turn / 2), torch.cos(turn / 2)], dim=-1))
+        pose0 = [grasp, torch.stack([zero, zero, zero, one], dim=-1)]
+        return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
+
+    def relate(
+        self, inputs: HeadInputs, pick_BT: torch.Tensor, place_BT: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Offset from the candidate in metres, (B, T, 2), and scores of yaw bins, (B, T, bins)."""
+        grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
+        goal = _positions_at(inputs, place_BT)
+        metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
+        kept = _recollection(inputs)
+        value = _of_candidate(
+            self.values[0](at(inputs.objects_BTND, place_BT.clamp(max=inputs.masks_BTN.shape[-1] - 1))),
+            torch.cat([self.values[1](kept.first.tokens_BKD), self.values[2](kept.scenes.tokens_BKD)], dim=1),
+            place_BT - inputs.masks_BTN.shape[-1],
+        )
+        tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), value]
+        metric = metric.to(inputs.query_BTD.dtype)
+        hidden_BTH = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
+        yaw_scores = self.yaw(hidden_BTH)
+        if self.shown_turn is not None:
+            yaw_scores = yaw_scores + self.shown_turn(inputs.query_BTD, kept.scenes)
+        return self.offset(hidden_BTH) * OFFSET_UNIT_M, yaw_scores
+
+    def _goal(self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Where the centre of the picked object goes, or the tool that pushes it, (B, T, 2), metres."""
+        actions = targets.actions_BTC
+        centre = carried_place(actions, at(inputs.positions_BTN2, pick_BT))
+        return torch.where(inputs.lifts_BT[..., None], centre, actions[..., 6:8])
+
+    def _right(
+        self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor, goal_BT2: torch.Tensor
+    ) -> torch.Tensor:
+        """Which candidates are right, (B, T, C): at least one where something is picked."""
+        near_BTC = (candidate_positions(inputs) - goal_BT2[:, :, None]).norm(dim=-1) < RIGHT_OFFSET_M
+        right_BTC = near_BTC & candidate_masks(inputs)
+        named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, pick_BT)
+        named_BTC = F.one_hot(named_BT, right_BTC.shape[-1]).bool()
+        return torch.where(right_BTC.any(-1, keepdim=True), right_BTC, named_BTC)
+
+
+class ShownTurn(nn.Module):
+    """Scores of the turns that objects make from one image of the prompt to another."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width)
+        self.weight = nn.Linear(width, 1)  # how much what is shown counts
+
+    def forward(self, query_BTD: torch.Tensor, scenes: Remembered) -> torch.Tensor:
+        """Return the scores of the bins, (B, T, R)."""
+        assert scenes.turns_BKR is not None  # the network estimates them
+        scores_BTK = self.query(query_BTD) @ self.key(scenes.tokens_BKD).mT * query_BTD.shape[-1] ** -0.5
+        has_turn_BK = scenes.masks_BK & (scenes.turns_BKR > 0).any(dim=-1)
+        scores_BTK = scores_BTK.masked_fill(~has_turn_BK[:, None], torch.finfo(scores_BTK.dtype).min)
+        chances_BTK = torch.softmax(scores_BTK, dim=-1) * has_turn_BK[:, None]
+        return F.softplus(self.weight(query_BTD)) * _SURE * (chances_BTK @ scenes.turns_BKR)
+
+
+class PlacePointer(nn.Module):
+    """Scores the candidates for the place of an object that was chosen.
+
+    A score sums up: query · key; how much the candidate looks like the picked object, and like the prompt
+    object that the query attends to; where it comes from; and how it lies to the picked object.
+    """
+
+    def __init__(self, config: CopyingConfig, width: int) -> None:
+        super().__init__()
+        self.context = nn.Linear(2 * width, width)
+        self.steps = nn.Embedding(config.num_numbers, width)
+        self.images = nn.Embedding(config.num_numbers, width)
+        self.query = nn.Linear(width, width)
+        self.keys = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.prompt_query = nn.Linear(width, width)
+        self.prompt_key = nn.Linear(width, width)
+        # For each kind of candidate: how much either likeness counts, and how much the kind is wanted.
+        self.alike, self.asked, self.kind = (nn.Linear(width, len(KINDS)) for _ in range(3))
+        self.geometry = nn.Linear(width, _NUM_GEOMETRY)
+        self.same = nn.Linear(width, 1)  # how much the place wants to be that of the picked object itself
+        for layer, bias in ((self.alike, (0.0, 5.0, 5.0)), (self.asked, (10.0, 0.0, 0.0))):
+            nn.init.zeros_(layer.weight)
+            with torch.no_grad():
+                layer.bias.copy_(torch.tensor(bias))
+        for table in (self.steps, self.images):
+            nn.init.normal_(table.weight, std=0.1)
+
+    def forward(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Return scores, shape (B, T, C); candidates that do not exist score the most negative number."""
+        kept, last = _recollection(inputs), self.steps.num_embeddings - 1
+        picked_BTD, scale = at(inputs.objects_BTND, pick_BT), inputs.query_BTD.shape[-1] ** -0.5
+        context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
+        context_BTD = torch.relu(context_BTD + self.steps(kept.steps_T.clamp(max=last)))
+        query_BTD = self.query(context_BTD) * scale
+        scenes_BKD = self.keys[2](kept.scenes.tokens_BKD) + self.images(
+            kept.scenes.numbers_BK.clamp(max=last)
+        )
+        kept_BKD = torch.cat([self.keys[1](kept.first.tokens_BKD), scenes_BKD], dim=1)
+        keys_BTND = self.keys[0](inputs.objects_BTND)
+        scores_BTC = _with_candidates(query_BTD, keys_BTND, kept_BKD)
+        alike_BTC, asked_BTC = self._likeness(inputs, pick_BT, context_BTD, scale)
+        kinds_C = _kinds(inputs)
+        scores_BTC = scores_BTC + F.softplus(self.alike(context_BTD))[..., kinds_C] * alike_BTC
+        scores_BTC = scores_BTC + F.softplus(self.asked(context_BTD))[..., kinds_C] * asked_BTC
+        scores_BTC = scores_BTC + self.kind(context_BTD)[..., kinds_C]
+        lies_BTCG = _geometry(inputs, pick_BT).to(scores_BTC.dtype)
+        scores_BTC = scores_BTC + torch.einsum("btg,btcg->btc", self.geometry(context_BTD), lies_BTCG)
+        picked_BTC = F.one_hot(pick_BT, scores_BTC.shape[-1]).to(scores_BTC.dtype)
+        scores_BTC = scores_BTC + self.same(context_BTD) * picked_BTC
+        return scores_BTC.masked_fill(~candidate_masks(inputs), torch.finfo(scores_BTC.dtype).min)
+
+    def _likeness(
+        self, inputs: HeadInputs, pick_BT: torch.Tensor, context_BTD: torch.Tensor, scale: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """How much candidates look like the picked object and like what is asked for, both (B, T, C)."""
+        kept = _recollection(inputs)
+        kept_BKA = torch.cat([kept.first.appearance_BKA, kept.scenes.appearance_BKA], dim=1)
+        picked_BTA = at(inputs.appearance_BTNA, pick_BT)
+        asked_BTA = torch.zeros_like(picked_BTA)
+        if inputs.prompt_BMD.shape[1]:
+            asked_BTM = self.prompt_query(context_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
+            hidden = torch.finfo(asked_BTM.dtype).min
+            asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
+            asked_BTA = asked_BTM @ inputs.prompt_appearance_BMA
+        alike_BTC = _with_candidates(picked_BTA, inputs.appearance_BTNA, kept_BKA)
+        return alike_BTC, _with_candidates(asked_BTA, inputs.appearance_BTNA, kept_BKA)
+
+
+def candidate_masks(inputs: HeadInputs) -> torch.Tensor:
+    """Which candidates exist, shape (B, T, C)."""
+    kept = _recollection(inputs)
+    masks_BTK = torch.cat([kept.first.masks_BK, kept.scenes.masks_BK], dim=1)[:, None]
+    return torch.cat([inputs.masks_BTN, masks_BTK.expand(-1, inputs.masks_BTN.shape[1], -1)], dim=2)
+
+
+def candidate_positions(inputs: HeadInputs) -> torch.Tensor:
+    """Where they lie, shape (B, T, C, 2), metres."""
+    kept_BTK2 = _kept_positions(inputs)[:, None].expand(-1, inputs.masks_BTN.shape[1], -1, -1)
+    return torch.cat([inputs.positions_BTN2, kept_BTK2], dim=2)
+
+
+def _kept_positions(inputs: HeadInputs) -> torch.Tensor:
+    kept = _recollection(inputs)
+    return torch.cat([kept.first.positions_BK2, kept.scenes.positions_BK2], dim=1)
+
+
+def _positions_at(inputs: HeadInputs, place_BT: torch.Tensor) -> torch.Tensor:
+    """Where the chosen candidate lies, (B, T, 2), metres."""
+    return at(candidate_positions(inputs), place_BT)
+
+
+def _geometry(inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+    """How candidates lie to the picked object, (B, T, C, G): x, y and distance apart, and whether there."""
+    apart_BTC2 = candidate_positions(inputs) - at(inputs.positions_BTN2, pick_BT)[:, :, None]
+    distance_BTC1 = apart_BTC2.norm(dim=-1, keepdim=True)
+    here_BTC1 = torch.exp(-(distance_BTC1 / _HERE_M).square())
+    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1], dim=-1)
+
+
+def _kinds(inputs: HeadInputs) -> torch.Tensor:
+    """Where each candidate comes from, as a number of `KINDS`, shape (C,), int64."""
+    kept, device = _recollection(inputs), inputs.masks_BTN.device
+    counts = (inputs.masks_BTN.shape[2], kept.first.masks_BK.shape[1], kept.scenes.masks_BK.shape[1])
+    return torch.repeat_interleave(torch.arange(len(KINDS)), torch.tensor(counts)).to(device)
+
+
+def _with_candidates(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
+    """Products of a vector at each step with those of the candidates, (B, T, C)."""
+    now_BTN = torch.einsum("btx,btnx->btn", query_BTX, now_BTNX)
+    return torch.cat([now_BTN, query_BTX @ kept_BKX.mT], dim=2)
+
+
+def _of_candidate(now_BTX: torch.Tensor, kept_BKX: torch.Tensor, place_BT: torch.Tensor) -> torch.Tensor:
+    """Take the row of a remembered object, or what is given for one in view where the number is negative."""
+    index_BTX = place_BT.clamp(min=0)[..., None].expand(*place_BT.shape, kept_BKX.shape[-1])
+    return torch.where((place_BT < 0)[..., None], now_BTX, kept_BKX.gather(1, index_BTX))
+
+
+def _recollection(inputs: HeadInputs) -> Recollection:
+    assert inputs.recollection is not None  # the network gives it to heads that copy
+    return inputs.recollection
