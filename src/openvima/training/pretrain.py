@@ -17,10 +17,10 @@ from torch.nn import functional as F
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
-from openvima.catalog.random_pack import RandomLooks
+from openvima.catalog.random_pack import RandomLooks, shows_heading
 from openvima.perception.objects import ObjectViews, observe_prompt_image, see_objects
 from openvima.policies.layers.object_encoder import ObjectEncoder
-from openvima.render.rasteriser import Rasteriser
+from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode
 from openvima.training.scene_variants import laid_again, with_random_looks, with_twins
@@ -37,8 +37,9 @@ class Again:
     Args:
         crops: Shape (K, 2, 3, 32, 32), uint8.
         masks: Whether it is visible in the view, shape (K, 2), bool.
-        turns: Turn from the scene to the one laid again, counter-clockwise seen from above, in radians, 0 to
-            2π; NaN for shapes that do not show it. Shape (K,), float32.
+        turns: Turn from the prompt image to the scene, and from there to the scene laid again,
+            counter-clockwise seen from above, in radians; NaN for shapes that do not show it. Shape (K, 2),
+            float32.
     """
 
     crops: torch.Tensor
@@ -313,8 +314,10 @@ def pairs_of_scene(
             np.int64(number),
         )
         if again and moved:
-            turn = np.float32(again[1].get(placement.id, np.nan))
-            pair = (*pair, moved.crops[:, slot], moved.masks[:, slot], turn)
+            from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
+            turns = np.array([from_prompt, again[1][placement.id]], dtype=np.float32)
+            turns = turns if shows_heading(placement.object) else np.full_like(turns, np.nan)
+            pair = (*pair, moved.crops[:, slot], moved.masks[:, slot], turns)
         pairs.append(pair)
     return pairs
 

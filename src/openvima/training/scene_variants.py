@@ -12,7 +12,7 @@ import numpy as np
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.partitions import OBJECT_SETS
-from openvima.catalog.random_pack import is_random, random_name, shows_heading
+from openvima.catalog.random_pack import is_random, random_name
 from openvima.catalog.textures import texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
 
@@ -77,8 +77,7 @@ def laid_again(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int,
     """Turn everything by a random angle; in half of the scenes objects change places, too.
 
     Returns:
-        The scene, and the turn of each object whose heading can be seen, by id: counter-clockwise seen from
-        above, in 0 … 2π.
+        The scene, and the turn of each object by id: counter-clockwise seen from above, in 0 … 2π.
     """
     turns = {p.id: rng.uniform(0, 2 * math.pi) for p in scene.placements}
     movable = [p for p in scene.placements if not p.fixed]
@@ -90,8 +89,7 @@ def laid_again(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int,
         p.id: Pose((*places[p.id], p.pose.z), p.pose.rotated(turns[p.id]).quaternion)
         for p in scene.placements
     }
-    seen = {p.id: turns[p.id] for p in scene.placements if shows_heading(p.object)}
-    return scene.with_poses(poses), seen
+    return scene.with_poses(poses), turns
 
 
 def _with_random_shape(placement: Placement, assets: Assets, rng: np.random.Generator) -> Placement:

@@ -40,36 +40,36 @@ def joint_loss(
     loss = (alone_loss + again_loss) / 2
     metrics = {"match_accuracy": alone, "again_accuracy": matched}
     if encoder.config.turn_bins:
-        loss = loss + turn_loss(encoder, features[1:], masks[1:], again.turns)
-        metrics["turn_accuracy"] = _right_turns(encoder, features[1:], masks[1:], again.turns).float().mean()
+        loss = loss + turn_loss(encoder, features, masks, again.turns)
+        metrics["turn_accuracy"] = _right_turns(encoder, features, masks, again.turns).float().mean()
     return loss, metrics
 
 
 def turn_loss(
-    encoder: ObjectEncoder, features_2VKF: torch.Tensor, masks_2VK: torch.Tensor, turns_K: torch.Tensor
+    encoder: ObjectEncoder, features_3VKF: torch.Tensor, masks_3VK: torch.Tensor, turns_K2: torch.Tensor
 ) -> torch.Tensor:
-    """Cross-entropy of the turns, over the objects that show theirs.
+    """Cross-entropy of the turns between any two of three images, over the objects that show theirs.
 
     A turn between two bins belongs to both, to the nearer one more.
 
     Args:
         encoder: One with turn bins.
-        features_2VKF: Crop features in the scene and in the scene laid again, shape (2, 2, K, F).
-        masks_2VK: Whether the object is visible, shape (2, 2, K).
-        turns_K: The turns in radians, NaN where objects do not show theirs, shape (K,).
+        features_3VKF: Crop features in the prompt image, in the scene, and in the scene laid again.
+        masks_3VK: Whether the object is visible there, shape (3, 2, K).
+        turns_K2: Turns from each image to the next, in radians; NaN where objects do not show theirs.
     """
-    rows, turns = _comparable(masks_2VK, turns_K)
-    if not len(rows):
-        return features_2VKF.sum() * 0
-    (first, second), (seen, seen_again) = features_2VKF[:, :, rows], masks_2VK[:, :, rows]
-    scores_KR = encoder.turns(first, second, seen, seen_again)
-    bins = scores_KR.shape[-1]
-    place = turns * (bins / (2 * math.pi))
-    low = place.floor()
-    share = (place - low).to(scores_KR.dtype)
-    of_low = F.nll_loss(scores_KR, low.long() % bins, reduction="none")
-    of_high = F.nll_loss(scores_KR, (low.long() + 1) % bins, reduction="none")
-    return ((1 - share) * of_low + share * of_high).mean()
+    first_turn, second_turn = turns_K2.unbind(1)
+    losses = []
+    for a, b, turns in ((0, 1, first_turn), (1, 2, second_turn), (0, 2, first_turn + second_turn)):
+        scores_KR, turns = _compared(encoder, features_3VKF[[a, b]], masks_3VK[[a, b]], turns)
+        bins = scores_KR.shape[-1]
+        place = turns * (bins / (2 * math.pi))
+        low = place.floor()
+        share = (place - low).to(scores_KR.dtype)
+        of_low = F.nll_loss(scores_KR, low.long() % bins, reduction="none")
+        of_high = F.nll_loss(scores_KR, (low.long() + 1) % bins, reduction="none")
+        losses.append((1 - share) * of_low + share * of_high)
+    return torch.cat(losses).sum() / max(1, sum(map(len, losses)))
 
 
 @torch.no_grad()
@@ -87,22 +87,23 @@ def turn_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) -> 
 
 @torch.no_grad()
 def _right_turns(
-    encoder: ObjectEncoder, features_2VKF: torch.Tensor, masks_2VK: torch.Tensor, turns_K: torch.Tensor
+    encoder: ObjectEncoder, features: torch.Tensor, masks: torch.Tensor, turns_K2: torch.Tensor
 ) -> torch.Tensor:
-    """Whether the likeliest turn is right, for the objects that show theirs; shape (at most K,), bool."""
-    rows, turns = _comparable(masks_2VK, turns_K)
-    (first, second), (seen, seen_again) = features_2VKF[:, :, rows], masks_2VK[:, :, rows]
-    scores_KR = encoder.turns(first, second, seen, seen_again)
+    """Whether the turn between the last two images is right, for objects that show it; (at most K,), bool."""
+    scores_KR, turns = _compared(encoder, features[-2:], masks[-2:], turns_K2[:, 1])
     likeliest = scores_KR.argmax(dim=-1) * (2 * math.pi / scores_KR.shape[-1])
     error = torch.remainder(likeliest - turns + math.pi, 2 * math.pi) - math.pi
     return error.abs() <= TURN_TOLERANCE_RAD
 
 
-def _comparable(masks_2VK: torch.Tensor, turns_K: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Objects that show their turn and are visible in one view twice; their numbers and turns."""
+def _compared(
+    encoder: ObjectEncoder, features_2VKF: torch.Tensor, masks_2VK: torch.Tensor, turns_K: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scores and true turns of the objects that show theirs and are visible in one view of both images."""
     is_seen = (masks_2VK[0] & masks_2VK[1]).any(dim=0)
     rows = torch.nonzero(is_seen & ~turns_K.isnan())[:, 0]
-    return rows, turns_K[rows]
+    (first, second), (seen, seen_again) = features_2VKF[:, :, rows], masks_2VK[:, :, rows]
+    return encoder.turns(first, second, seen, seen_again), turns_K[rows]
 
 
 def _again(pairs: Pairs) -> Again:
@@ -121,7 +122,7 @@ def mirrored(pairs: Pairs, generator: torch.Generator) -> Pairs:
     def flipped(crops: torch.Tensor) -> torch.Tensor:
         return torch.where(is_mirrored[:, None, None, None, None], crops.flip(-1), crops)
 
-    turns = torch.where(is_mirrored, torch.remainder(-again.turns, 2 * math.pi), again.turns)
+    turns = torch.where(is_mirrored[:, None], -again.turns, again.turns)
     return replace(
         pairs,
         prompt_crops=flipped(pairs.prompt_crops),
