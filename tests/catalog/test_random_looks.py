@@ -1,0 +1,111 @@
+"""Looks of no catalogue: drawn from seeds, whole, varied, and beside the catalogue's own."""
+
+import numpy as np
+import pytest
+
+from openvima.catalog import outlines
+from openvima.catalog.packs import load_assets
+from openvima.catalog.random_pack import RandomLooks, is_random, random_name, shows_heading
+from openvima.catalog.random_shapes import has_heading, random_outline, random_vessel
+from openvima.catalog.random_textures import darkened_texture, random_texture
+from openvima.catalog.triangulation import signed_area
+from openvima.errors import UnknownTextureError
+
+SIZE = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def looks() -> RandomLooks:
+    return RandomLooks(load_assets("procedural"))
+
+
+def test_a_name_always_stands_for_the_same_look(looks):
+    again = RandomLooks(load_assets("procedural"))
+    names = [random_name("texture", np.random.default_rng(k)) for k in range(20)]
+    assert len(set(names)) == 20
+    assert all(np.array_equal(looks.texture(name), again.texture(name)) for name in names)
+    shape = looks.geometry("random shape 3", SIZE).visual.vertices
+    assert np.array_equal(shape, again.geometry("random shape 3", SIZE).visual.vertices)
+
+
+def test_random_textures_are_of_many_kinds_and_colours():
+    textures = [random_texture(np.random.default_rng(k)) for k in range(60)]
+    assert all(texture.dtype == np.uint8 and texture.ndim == 3 for texture in textures)
+    assert 3 < sum(texture.shape == (1, 1, 3) for texture in textures) < 30
+    assert len({tuple(texture[0, 0].tolist()) for texture in textures}) > 50
+
+
+def test_dark_random_textures_are_made_as_those_of_the_catalogue(looks):
+    blue = looks.texture("blue")
+    assert np.abs(darkened_texture(blue).astype(int) - looks.texture("dark blue")).max() <= 1
+    light, dark = looks.texture("random texture 7"), looks.texture("dark random texture 7")
+    assert np.array_equal(dark, darkened_texture(light))
+    assert (dark <= light).all() and (dark < light).any()
+
+
+def test_random_outlines_are_whole_and_of_the_size_of_kit_objects(looks):
+    for seed in range(150):
+        loops = random_outline(np.random.default_rng(seed))
+        assert 0.07 - 1e-5 <= np.ptp(loops[0], axis=0).max() <= 0.125 + 1e-5
+        mesh = looks.geometry(f"random shape {seed}", SIZE).visual  # cutting it up finds lines that cross
+        area = sum(signed_area(loop) for loop in loops)
+        top = mesh.vertices[(mesh.normals[:, 0, 2] == 1)]
+        triangles = np.cross(top[:, 1] - top[:, 0], top[:, 2] - top[:, 0])[:, 2] / 2
+        np.testing.assert_allclose(triangles.sum(), area, rtol=1e-6)
+
+
+def test_random_vessels_stand_on_the_table():
+    for seed in range(40):
+        vessel = random_vessel(np.random.default_rng(seed))
+        assert abs(vessel.visual.vertices[..., 2].min() + vessel.rest_z_m) < 0.0025
+        assert 0.08 < np.ptp(vessel.visual.vertices[..., :2].reshape(-1, 2), axis=0).max() < 0.3
+
+
+def test_stretched_random_shapes_are_as_much_higher(looks):
+    flat = looks.geometry("random shape 3", SIZE).visual.vertices
+    high = looks.geometry("random shape 3", SIZE, (1.0, 1.0, 2.0)).visual.vertices
+    np.testing.assert_allclose(high, flat * (1, 1, 2))
+
+
+@pytest.mark.parametrize("name", ["letter A", "letter R", "letter G", "heart", "L-shaped block"])
+def test_shapes_without_symmetry_show_their_heading(name):
+    assert has_heading(outlines.outline(name))
+    assert shows_heading(name)
+
+
+@pytest.mark.parametrize("name", ["cross", "flower", "hexagon", "ring", "diamond", "star"])
+def test_symmetric_shapes_do_not_show_their_heading(name):
+    assert not has_heading(outlines.outline(name))
+    assert not shows_heading(name)
+
+
+def test_vessels_count_as_shapes_without_heading():
+    assert not shows_heading("random vessel 4")
+    assert sum(shows_heading(f"random shape {seed}") for seed in range(40)) > 20
+
+
+def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkeypatch):
+    def refused(*arguments):
+        raise AssertionError(f"{arguments} was asked for")
+
+    class Empty:
+        name = "empty"
+        geometry = texture = refused
+
+    monkeypatch.setattr(outlines, "_OUTLINES", {})
+    looks = RandomLooks(Empty())
+    rng = np.random.default_rng(0)
+    for kind in ("shape", "vessel", "texture"):
+        for _ in range(20):
+            name = random_name(kind, rng)
+            assert is_random(name)
+            looks.texture(name) if kind == "texture" else looks.geometry(name, SIZE)
+
+
+def test_names_of_the_catalogue_go_through(looks):
+    base = load_assets("procedural")
+    assert looks.texture("red swirl") is base.texture("red swirl")
+    assert looks.geometry("letter A", SIZE) is base.geometry("letter A", SIZE)
+    assert not is_random("red swirl")
+    with pytest.raises(UnknownTextureError):
+        looks.texture("random texture seven")

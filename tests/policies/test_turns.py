@@ -1,0 +1,106 @@
+"""Turns between two images of an object: which view decides, and what exchanging the images does."""
+
+import math
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.layers.turns import TurnEstimator  # noqa: E402
+
+BINS = 72
+FRONT, TOP = 0, 1
+
+
+@pytest.fixture
+def encoder() -> ObjectEncoder:
+    torch.manual_seed(0)
+    crop = ConvConfig(8, 16, place_channels=2)
+    sizes = ObjectEncoderConfig(
+        crop, box_width=4, width=8, fuse_views=True, appearance_width=16, turn_bins=BINS
+    )
+    return ObjectEncoder(sizes)
+
+
+def _features(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, 2, 3, 16, generator=torch.Generator().manual_seed(len(shape)))
+
+
+SEEN = torch.ones(2, 3, dtype=torch.bool)
+
+
+def test_probabilities_of_turns_sum_to_one(encoder):
+    chances = encoder.turn_between(_features(4, 5), _features(1, 5), SEEN, SEEN)
+    assert chances.shape == (4, 5, 3, BINS)
+    torch.testing.assert_close(chances.sum(-1), torch.ones(4, 5, 3))
+
+
+def test_exchanging_the_images_reverses_the_turn(encoder):
+    first, second = _features(), _features(1)[0]
+    there = encoder.turn_between(first, second, SEEN, SEEN)
+    back = encoder.turn_between(second, first, SEEN, SEEN)
+    torch.testing.assert_close(there, back.flip(-1).roll(1, -1))
+
+
+def test_equal_crops_are_not_turned(encoder):
+    chances = encoder.turn_between(_features(), _features(), SEEN, SEEN)
+    assert (chances.argmax(-1) == 0).all()
+
+
+def test_the_top_view_decides_where_it_shows_both(encoder):
+    first, second = _features(), _features(1)[0]
+    chances = encoder.turn_between(first, second, SEEN, SEEN)
+    other_front = first.clone()
+    other_front[FRONT] += 1.0
+    assert torch.equal(chances, encoder.turn_between(other_front, second, SEEN, SEEN))
+
+    hidden = SEEN.clone()
+    hidden[TOP, 1] = False
+    of_front = encoder.turn_between(first, second, hidden, SEEN)
+    assert torch.equal(of_front[[0, 2]], chances[[0, 2]])
+    assert not torch.equal(of_front[1], chances[1])
+
+
+def test_without_a_common_view_all_turns_are_equally_probable(encoder):
+    only_top, only_front = SEEN.clone(), SEEN.clone()
+    only_top[FRONT], only_front[TOP] = False, False
+    chances = encoder.turn_between(_features(), _features(1)[0], only_top, only_front)
+    torch.testing.assert_close(chances, torch.full((3, BINS), 1 / BINS))
+
+
+def test_moved_phases_are_a_turn():
+    estimator = TurnEstimator(features=256, bins=BINS)
+    with torch.no_grad():
+        for view in estimator.views:  # features are the waves themselves
+            view.weight.copy_(torch.eye(256))
+            view.bias.zero_()
+    turn = 2 * math.pi * 17 / BINS
+    waves = torch.randn(16, 8, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    turned = waves * torch.exp(1j * turn * torch.arange(1, 9))
+    first, second = (
+        torch.stack([w.real, w.imag]).flatten().expand(2, 1, 256).contiguous() for w in (waves, turned)
+    )
+    seen = torch.ones(2, 1, dtype=torch.bool)
+    assert int(estimator(first, second, seen, seen).argmax()) == 17
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"turn_bins": 1}, "turn_bins is 1; it must be 0, or at least 2"),
+        ({"turn_bins": -3}, "turn_bins is -3"),
+        ({"turn_bins": 72, "appearance_width": 0}, "turn_bins needs an appearance width"),
+    ],
+)
+def test_sizes_that_cannot_be_are_named(change, message):
+    sizes = {"box_width": 4, "width": 8, "fuse_views": True, "appearance_width": 16}
+    with pytest.raises(ConfigError, match=message):
+        ObjectEncoderConfig(ConvConfig(8, 16), **{**sizes, **change})
+
+
+def test_places_need_at_least_no_channels():
+    with pytest.raises(ConfigError, match="place_channels is -1"):
+        ConvConfig(8, 16, place_channels=-1)

@@ -1,0 +1,220 @@
+"""Harder pretraining: random looks, twins, scenes laid twice, and the turns between them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.catalog.packs import load_assets  # noqa: E402
+from openvima.catalog.partitions import pool  # noqa: E402
+from openvima.catalog.random_pack import RandomLooks, is_random  # noqa: E402
+from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.render.rasteriser import Rasteriser  # noqa: E402
+from openvima.scene import Placement, Pose, Scene  # noqa: E402
+from openvima.training import pretrain, turning  # noqa: E402
+from openvima.training.pretrain import Variety, pairs_of_scene, render_pairs, stacked  # noqa: E402
+from openvima.training.scene_variants import laid_again, with_twins  # noqa: E402
+from openvima.training.schedule import step_generator  # noqa: E402
+
+TASKS = ("twist", "novel_adj", "visual_manipulation")
+HARD = Variety(random_looks=0.5, twins=0.6, again=True)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", variety=HARD)
+
+
+def _encoder(turn_bins: int = 72) -> ObjectEncoder:
+    torch.manual_seed(0)
+    crop = ConvConfig(8, 32, place_channels=8)
+    return ObjectEncoder(
+        ObjectEncoderConfig(
+            crop, box_width=4, width=8, fuse_views=True, appearance_width=16, turn_bins=turn_bins
+        )
+    )
+
+
+def test_nothing_of_the_test_levels_is_drawn(monkeypatch):
+    shown = []
+    original = pretrain.pairs_of_scene
+
+    def spy(scene, *rest):
+        shown.extend((p.object, p.texture, p.fixed) for p in scene.placements)
+        return original(scene, *rest)
+
+    monkeypatch.setattr(pretrain, "pairs_of_scene", spy)
+    render_pairs(TASKS, num_scenes=24, seed=3, assets="procedural", variety=HARD)
+    pools = [pool(task, "train") for task in TASKS]
+    objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
+    textures = {
+        (name, fixed)
+        for entry in pools
+        for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
+        for name in names
+    }
+    assert {name for name, _, _ in shown if not is_random(name)} <= objects
+    assert {(name, fixed) for _, name, fixed in shown if not is_random(name)} <= textures
+    share = sum(is_random(name) for _, name, _ in shown) / len(shown)
+    assert 0.2 < share < 0.8
+
+
+def test_all_that_is_drawn_follows_from_the_seed(pairs):
+    again = render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", variety=HARD)
+    assert torch.equal(pairs.scene_crops, again.scene_crops)
+    assert torch.equal(pairs.again.crops, again.again.crops)
+    assert torch.equal(pairs.again.turns.nan_to_num(), again.again.turns.nan_to_num())
+
+
+def test_without_variety_scenes_are_as_they_always_were():
+    plain = render_pairs(TASKS, num_scenes=4, seed=0, assets="procedural")
+    twice = render_pairs(TASKS, num_scenes=4, seed=0, assets="procedural", variety=Variety(again=True))
+    assert plain.again is None
+    assert torch.equal(plain.prompt_crops, twice.prompt_crops)
+    assert torch.equal(plain.scene_crops, twice.scene_crops)
+
+
+def test_twins_differ_in_one_respect():
+    assets = RandomLooks(load_assets("procedural"))
+    rng = np.random.default_rng(0)
+    originals = tuple(
+        Placement(5 + k, name, texture, (0.144, 0.144, 0.036), Pose.planar(0.4 + 0.1 * k, 0.2 * k, z=0.0))
+        for k, (name, texture) in enumerate((("letter A", "red"), ("heart", "green")))
+    )
+    kinds = set()
+    for _ in range(40):
+        scene = with_twins(Scene(originals), 1.0, {"red", "dark red", "green"}, assets, rng)
+        for twin in scene.placements[2:]:
+            differing = min(
+                (
+                    [
+                        name
+                        for name in ("object", "texture", "scale")
+                        if getattr(twin, name) != getattr(p, name)
+                    ]
+                    for p in originals
+                ),
+                key=len,
+            )
+            assert len(differing) <= 1
+            kinds |= {*differing, twin.texture}
+    assert {"object", "scale", "dark red"} <= kinds or {"scale", "texture", "dark red"} <= kinds
+    assert "dark green" not in kinds
+
+
+def test_turns_are_those_between_the_headings():
+    rng = np.random.default_rng(1)
+    hearts = (Placement(k, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1 * k, k)) for k in (1, 2))
+    scene = Scene(tuple(hearts))
+    again, turns = laid_again(scene, rng)
+    for before, after in zip(scene.placements, again.placements, strict=True):
+        error = after.pose.yaw_rad - before.pose.yaw_rad - turns[before.id]
+        assert abs(math.remainder(error, 2 * math.pi)) < 1e-9
+
+
+def test_a_prompt_image_turned_as_the_pairs_say_looks_like_the_scene():
+    """Turns from prompt images are right: no turn gives the crop that a lone object would have anyway."""
+    scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, math.pi / 2)),))
+    rasteriser = Rasteriser(load_assets("procedural"))
+    rows = pairs_of_scene(scene, {}, rasteriser, {}, 0, (scene, {5: 0.0}))
+    drawn = stacked(rows)
+    assert drawn.again.turns.tolist() == [[0.0, 0.0]]
+    red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
+    also_red = (drawn.scene_crops[0, 1, 0] == 255) & (drawn.scene_crops[0, 1, 1] == 87)
+    assert (red == also_red).float().mean() > 0.95
+
+
+def test_objects_of_other_height_are_other_looks():
+    low = Placement(5, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1))
+    high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))
+    scene = Scene((low, high))
+    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.0, 6: 0.0}))
+    assert stacked(rows).looks.tolist() == [0, 1]
+
+
+def test_mirroring_reverses_turns_and_flips_all_images(pairs):
+    mirrored = turning.mirrored(pairs, step_generator(0, "mirror", 0))
+    is_mirrored = (mirrored.scene_crops == pairs.scene_crops.flip(-1)).flatten(1).all(1)
+    shows = ~pairs.again.turns[:, 0].isnan()
+    assert 0.2 < is_mirrored.float().mean() < 0.8
+    expected = torch.where(is_mirrored[:, None], -pairs.again.turns, pairs.again.turns)
+    assert torch.equal(mirrored.again.turns[shows], expected[shows])
+    crops = pairs.again.crops
+    flipped = torch.where(is_mirrored[:, None, None, None, None], crops.flip(-1), crops)
+    assert torch.equal(mirrored.again.crops, flipped)
+
+
+def test_shifted_crops_stay_near(pairs):
+    still = turning.shifted(pairs, 1e-6, step_generator(0, "shift", 0))
+    torch.testing.assert_close(still.scene_crops, pairs.scene_crops.float(), atol=0.1, rtol=0)
+    moved = turning.shifted(pairs, 2.0, step_generator(0, "shift", 0))
+    change = (moved.scene_crops - pairs.scene_crops).abs().mean()
+    assert 1 < change < 40
+    assert torch.equal(moved.again.turns.nan_to_num(), pairs.again.turns.nan_to_num())
+
+
+def test_looks_and_turns_are_learnt_together():
+    pairs = render_pairs(("twist",), num_scenes=20, seed=0, assets="procedural", variety=Variety(again=True))
+    encoder = _encoder()
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
+    losses = []
+    for step in range(30):
+        generator = step_generator(0, "test", step)
+        batch = turning.mirrored(pairs, generator)
+        loss, metrics = turning.joint_loss(encoder, batch, temperature=0.1, generator=generator)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert set(metrics) == {"match_accuracy", "again_accuracy", "turn_accuracy"}
+    assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
+    assert turning.turn_accuracy(encoder, pairs) > 0.25  # by chance a tenth
+
+
+def test_without_turn_bins_only_looks_are_learnt(pairs):
+    generator = step_generator(0, "test", 0)
+    _, metrics = turning.joint_loss(_encoder(turn_bins=0), pairs, temperature=0.1, generator=generator)
+    assert set(metrics) == {"match_accuracy", "again_accuracy"}
+
+
+def test_a_turn_counts_as_right_within_fifteen_degrees():
+    class Fixed(torch.nn.Module):
+        """Answers 25 degrees, whatever the crops show."""
+
+        def forward(self, first, second, seen, seen_again):
+            return torch.log_softmax(50.0 * torch.eye(72)[[5] * seen.shape[-1]], dim=-1)
+
+    encoder = _encoder()
+    encoder.turns = Fixed()
+    features, seen = torch.zeros(3, 2, 4, 1), torch.ones(3, 2, 4, dtype=torch.bool)
+    turns = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
+    right = turning._right_turns(encoder, features, seen, turns)
+    assert right.tolist() == [True, True, False, True]
+    exact = torch.deg2rad(torch.tensor([[25.0, 360.0], [25.0, -360.0]]))
+    assert turning.turn_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) > 10  # the second is wrong
+    seen[1] = False
+    assert turning.turn_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
+
+
+def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
+    import json
+
+    from openvima.policies import presets
+    from openvima.training import TrainingConfig, train
+
+    tiny = presets.PRESETS["tiny"]()
+
+    def turning_tiny():
+        return replace(tiny, images=replace(tiny.images, turn_bins=24))
+
+    monkeypatch.setitem(presets.PRESETS, "turning-tiny", turning_tiny)
+    harder = {"pretraining_random_looks": 0.5, "pretraining_twins": 0.5, "pretraining_box_shift": 1.0}
+    changes = {"preset": "turning-tiny", "steps": 2, **harder}
+    run = train(TrainingConfig(**{**settings, **changes}))
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    matching = {name for line in lines if line["name"] == "1-matching" for name in line}
+    assert {"turn_accuracy", "validation_turn_accuracy", "validation_again_accuracy"} <= matching
