@@ -14,6 +14,7 @@ the circle, R bins of turns; `...` any axes.
 
 import math
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -43,12 +44,13 @@ class TurnEstimator(nn.Module):
         width = 2 * _NUM_KINDS * _NUM_WAVES
         self.views = nn.ModuleList(nn.Linear(features, width) for _ in (_FRONT, _TOP))
         self.log_sharpness = nn.Parameter(torch.tensor(math.log(_SHARPNESS)))
-        # Constants have a device of their own, so that a network without weights has them, too.
-        waves = torch.arange(1, _NUM_WAVES + 1, dtype=torch.float64, device="cpu")
-        turns = 2 * math.pi * torch.arange(bins, dtype=torch.float64, device="cpu") / bins
-        phases = waves[:, None] * turns
-        self.register_buffer("cosines_MR", phases.cos().to(torch.float32), persistent=False)
-        self.register_buffer("sines_MR", phases.sin().to(torch.float32), persistent=False)
+        # Constants have a device of their own, so that a network without weights has them, too; numpy makes
+        # them, since there the arithmetic of torch is left out.
+        waves, turns = np.arange(1, _NUM_WAVES + 1), 2 * np.pi * np.arange(bins) / bins
+        phases = np.outer(waves, turns)
+        for name, table in (("cosines_MR", np.cos(phases)), ("sines_MR", np.sin(phases))):
+            constant = torch.tensor(table, dtype=torch.float32, device="cpu")
+            self.register_buffer(name, constant, persistent=False)
 
     def forward(
         self,
