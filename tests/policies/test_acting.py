@@ -19,14 +19,15 @@ from openvima.policies.inputs import batch_histories, batch_prompts  # noqa: E40
 from openvima.policies.layers.trunk import MAX_PLACES  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
 
-NAMES = ("nano", "nano-bins", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
+NAMES = ("nano", "nano-bins", "small", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
 LENGTHS = (8, 3, 5, 8)  # steps of the episodes that are played together
 
 
 def network_of(name: str) -> PolicyNetwork:
     """A network whose outputs depend visibly on everything; fresh heads start near zero."""
-    network = build_network(preset(name), seed=3)
+    network = build_network(narrow_small() if name == "small" else preset(name), seed=3)
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
         for parameter in network.parameters():

@@ -6,6 +6,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.families.common import Size  # noqa: E402
@@ -21,6 +23,7 @@ from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E40
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
 from training_examples import examples_of  # noqa: E402
 
 FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
@@ -83,12 +86,28 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
     return model, {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
 
 
+@pytest.fixture(scope="module")
+def long_and_short(demonstrations) -> list[Demonstration]:
+    """Demonstrations of one step and of several, some with prompts that show changes."""
+    changes = [
+        rollout_oracle(TabletopEnv(task, level="train", domain="user"), 0)
+        for task in ("twist", "follow_order", "rearrange_then_restore")
+    ]
+    return [*demonstrations[:3], *changes]
+
+
 def names(model: PolicyNetwork) -> set[str]:
     return {name for name, _ in model.named_parameters()}
 
 
 def test_the_pointing_loss_reaches_every_parameter(demonstrations, small_sizes) -> None:
     model, moved = reached(small_sizes, demonstrations)
+    assert names(model) - moved == set()
+
+
+def test_the_copying_loss_reaches_every_parameter(long_and_short) -> None:
+    """With prompts that show changes: other ones leave nothing to compare."""
+    model, moved = reached(narrow_small(), long_and_short)
     assert names(model) - moved == set()
 
 

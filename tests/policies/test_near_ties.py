@@ -8,11 +8,12 @@ torch = pytest.importorskip("torch")
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
 
 
 def decisive(name: str) -> PolicyNetwork:
     """A network whose classes score far apart; fresh heads score them all alike."""
-    network = build_network(preset(name), seed=3)
+    network = build_network(narrow_small() if name == "small" else preset(name), seed=3)
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -22,7 +23,7 @@ def decisive(name: str) -> PolicyNetwork:
 
 @pytest.mark.parametrize(
     ("name", "last_layer"),
-    [("nano", "yaw"), ("nano-bins", "classifiers.5.4"), ("midas-nano", "classifiers.11.4")],
+    [("nano", "yaw"), ("small", "yaw"), ("nano-bins", "classifiers.5.4"), ("midas-nano", "classifiers.11.4")],
 )
 def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
     envs, observations = zip(*starts, strict=True)
@@ -40,7 +41,7 @@ def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
     assert policy.near_ties == [True, False, True]
 
 
-@pytest.mark.parametrize("name", ["nano", "nano-bins", "midas-nano"])
+@pytest.mark.parametrize("name", ["nano", "small", "nano-bins", "midas-nano"])
 def test_in_single_precision_only_near_ties_turn_with_the_batch(name, starts):
     envs, observations = zip(*starts, strict=True)
     policy = NetworkPolicy(decisive(name), dtype=torch.float32)

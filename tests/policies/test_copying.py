@@ -1,0 +1,290 @@
+"""The copying head: which places it may choose, what it learns to copy, where it brings what it holds."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies.heads.base import ActionTargets, HeadInputs, Recollection, Remembered  # noqa: E402
+from openvima.policies.heads.copying import (  # noqa: E402
+    CopyingConfig,
+    CopyingHead,
+    candidate_masks,
+    candidate_positions,
+)
+from openvima.policies.heads.pointing import at, turn_of, turned  # noqa: E402
+
+B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
+NUM_FIRST, NUM_SCENE = 3, 2
+IN_VIEW, AT_FIRST, IN_PROMPT = 0, N, N + NUM_FIRST  # number of the first candidate of each kind
+
+
+@pytest.fixture
+def head() -> CopyingHead:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+        torch.nn.init.normal_(network.offset.weight, std=0.1)  # it starts at zero
+        return network
+
+
+def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    def looks(*shape):
+        return torch.nn.functional.normalize(drawn(*shape, A), dim=-1)
+
+    def places(*shape):
+        low, size = torch.tensor([0.3, -0.4]), torch.tensor([0.4, 0.8])
+        return low + size * torch.rand(*shape, 2, generator=generator).double()
+
+    def remembered(count):
+        exist = torch.ones(batch, count, dtype=torch.bool)
+        numbers = torch.arange(count).expand(batch, count)
+        return Remembered(drawn(batch, count, D), exist, looks(batch, count), places(batch, count), numbers)
+
+    positions = places(batch, T, N)
+    lifts = torch.tensor([[True, True], [False, False], [True, False]])
+    return HeadInputs(
+        query_BTD=drawn(batch, T, D),
+        objects_BTND=drawn(batch, T, N, D),
+        masks_BTN=torch.ones(batch, T, N, dtype=torch.bool),
+        appearance_BTNA=looks(batch, T, N),
+        positions_BTN2=positions,
+        grasps_BTN2=positions + 0.01,
+        lifts_BT=lifts.repeat(batch // B + 1, 1)[:batch],
+        prompt_BMD=drawn(batch, M, D),
+        prompt_masks_BM=torch.ones(batch, M, dtype=torch.bool),
+        prompt_appearance_BMA=looks(batch, M),
+        recollection=Recollection(remembered(NUM_FIRST), remembered(NUM_SCENE), torch.arange(T)),
+    )
+
+
+@pytest.fixture
+def inputs() -> HeadInputs:
+    """Three episodes; some of what the second one sees and remembers does not exist."""
+    whole = drawn_inputs()
+    masks = whole.masks_BTN.clone()
+    masks[1, :, 3] = False
+    return remembering(replace(whole, masks_BTN=masks), "scenes", "masks_BK", [[1, 1], [0, 1], [1, 1]])
+
+
+def remembering(inputs: HeadInputs, kind: str, name: str, value) -> HeadInputs:
+    """The same with another memory."""
+    old = getattr(inputs.recollection, kind)
+    new = replace(old, **{name: torch.as_tensor(value, dtype=getattr(old, name).dtype)})
+    return replace(inputs, recollection=replace(inputs.recollection, **{kind: new}))
+
+
+def targets_at(inputs: HeadInputs, place_BT2, *, yaw: float = 0.0, place_slot: int = -1) -> ActionTargets:
+    """Pick slot 0 a centimetre beside the grasp point, and bring its centre to a place."""
+    batch = len(inputs.masks_BTN)
+    held = inputs.grasps_BTN2[:, :, 0] + 0.01 - inputs.positions_BTN2[:, :, 0]
+    actions = torch.zeros(batch, T, 12, dtype=torch.float64)
+    actions[..., 0:2] = inputs.positions_BTN2[:, :, 0] + held
+    tool = place_BT2 + turned(held, torch.full((batch, T), yaw, dtype=torch.float64))
+    actions[..., 6:8] = torch.where(inputs.lifts_BT[..., None], tool, place_BT2)
+    actions[..., 5], actions[..., 10], actions[..., 11] = 1, math.sin(yaw / 2), math.cos(yaw / 2)
+    slots = torch.zeros(batch, T, dtype=torch.int64)
+    return ActionTargets(actions, slots, slots + place_slot, torch.ones(batch, T, dtype=torch.bool))
+
+
+def place_of(inputs: HeadInputs, candidate: int) -> "torch.Tensor":
+    return candidate_positions(inputs)[:, :, candidate]
+
+
+def test_candidates_are_what_is_in_view_then_what_was_and_then_what_the_prompt_shows(inputs):
+    positions = candidate_positions(inputs)
+    kept = inputs.recollection
+    assert torch.equal(positions[:, :, :N], inputs.positions_BTN2)
+    assert torch.equal(positions[:, 1, AT_FIRST:IN_PROMPT], kept.first.positions_BK2)
+    assert torch.equal(positions[:, 1, IN_PROMPT:], kept.scenes.positions_BK2)
+    assert candidate_masks(inputs)[1, 0].tolist() == [True] * 3 + [False] + [True] * 3 + [False, True]
+
+
+@pytest.mark.parametrize("candidate", [IN_VIEW + 1, AT_FIRST + 2, IN_PROMPT + 1])
+@pytest.mark.parametrize("yaw", [0.0, math.radians(60)])
+def test_the_centre_goes_to_the_candidate_however_the_object_is_held_and_turned(head, inputs, candidate, yaw):
+    only = torch.full((B, T), candidate)
+    head.pick.forward = lambda inputs: torch.eye(N)[torch.zeros(B, T, dtype=torch.int64)]
+    head.place.forward = lambda inputs, pick: torch.eye(N + NUM_FIRST + NUM_SCENE)[only].double()
+    torch.nn.init.zeros_(head.offset.weight)
+    torch.nn.init.constant_(head.yaw.bias, -50.0)
+    with torch.no_grad():
+        head.yaw.bias[round(math.degrees(yaw) / 5)] = 50.0
+    decided = head.decide(inputs)
+    torch.testing.assert_close(decided[..., 0:2], inputs.grasps_BTN2[:, :, 0])
+    turn = turn_of(decided)
+    torch.testing.assert_close(turn, torch.full_like(turn, yaw))
+    held = turned(inputs.grasps_BTN2[:, :, 0] - inputs.positions_BTN2[:, :, 0], turn)
+    goal = place_of(inputs, candidate)
+    tool = torch.where(inputs.lifts_BT[..., None], goal + held, goal)  # what is pushed is not held
+    torch.testing.assert_close(decided[..., 6:8], tool)
+
+
+def test_what_does_not_exist_is_never_chosen(head, inputs):
+    gone = torch.zeros(B, T, N, dtype=torch.bool)
+    gone[..., 2] = True
+    one = replace(inputs, masks_BTN=gone)
+    for kind in ("first", "scenes"):
+        none = torch.zeros_like(getattr(inputs.recollection, kind).masks_BK)
+        one = remembering(one, kind, "masks_BK", none)
+    pick = torch.full((B, T), 2)
+    assert (head.place(one, pick).argmax(-1) == 2).all()
+    torch.testing.assert_close(head.decide(one)[..., 0:2], inputs.grasps_BTN2[:, :, 2])
+
+
+def test_values_behind_the_masks_change_nothing(head, inputs):
+    changed = replace(inputs, positions_BTN2=inputs.positions_BTN2.clone())
+    changed.positions_BTN2[~inputs.masks_BTN] = 9.0
+    hidden = ~inputs.recollection.scenes.masks_BK
+    for name in ("tokens_BKD", "appearance_BKA", "positions_BK2"):
+        value = getattr(inputs.recollection.scenes, name).clone()
+        value[hidden] = 9.0
+        changed = remembering(changed, "scenes", name, value)
+    wanted = targets_at(inputs, place_of(inputs, AT_FIRST))
+    assert torch.equal(head.decide(changed), head.decide(inputs))
+    assert torch.equal(head.loss(changed, wanted)[0], head.loss(inputs, wanted)[0])
+
+
+def test_neither_the_order_in_view_nor_that_in_memory_changes_action_or_loss(head, inputs):
+    order, other = torch.tensor([2, 0, 3, 1]), torch.tensor([1, 0])
+    shuffled = replace(
+        inputs,
+        objects_BTND=inputs.objects_BTND[:, :, order],
+        masks_BTN=inputs.masks_BTN[:, :, order],
+        appearance_BTNA=inputs.appearance_BTNA[:, :, order],
+        positions_BTN2=inputs.positions_BTN2[:, :, order],
+        grasps_BTN2=inputs.grasps_BTN2[:, :, order],
+    )
+    for kind, places in (("first", order[order < NUM_FIRST]), ("scenes", other)):
+        for name in ("tokens_BKD", "masks_BK", "appearance_BKA", "positions_BK2", "numbers_BK"):
+            value = getattr(getattr(inputs.recollection, kind), name)[:, places]
+            shuffled = remembering(shuffled, kind, name, value)
+    torch.testing.assert_close(head.decide(shuffled), head.decide(inputs))
+    wanted = targets_at(inputs, place_of(inputs, AT_FIRST + 1))
+    moved = replace(wanted, pick_BT=wanted.pick_BT + 1)  # slot 0 has become slot 1
+    torch.testing.assert_close(head.loss(shuffled, moved), head.loss(inputs, wanted))
+
+
+def test_every_candidate_at_the_demonstrated_place_is_right(head, inputs):
+    same = inputs.recollection.scenes.positions_BK2.clone()
+    same[:, 1] = inputs.recollection.first.positions_BK2[:, 0] + 0.005
+    twice = remembering(inputs, "scenes", "positions_BK2", same)
+    wanted = targets_at(twice, place_of(twice, AT_FIRST))
+    goal = place_of(twice, AT_FIRST)
+    scores = head.place(twice, wanted.pick_BT)
+    near = (candidate_positions(twice) - goal[:, :, None]).norm(dim=-1) < 0.02
+    assert near[..., [AT_FIRST, IN_PROMPT + 1]].all()
+    chances = (torch.softmax(scores, dim=-1) * near).sum(-1)
+    no_others = replace(head.config, offset_weight=0.0, yaw_weight=0.0)
+    head.config = no_others
+    picks = torch.softmax(head.pick(twice), dim=-1)[..., 0]
+    loss, _ = head.loss(twice, wanted)
+    torch.testing.assert_close(loss, -(chances.log().mean() + picks.log().mean()))
+
+
+def test_without_a_candidate_there_the_named_object_is_right_and_else_the_picked_one(head, inputs):
+    nowhere = torch.full((B, T, 2), 0.26, dtype=torch.float64)
+    for slot, asked in ((2, 2), (-1, 0)):
+        wanted = targets_at(inputs, nowhere, place_slot=slot)
+        right = head._right(inputs, wanted, wanted.pick_BT, nowhere)
+        assert (right.nonzero()[:, 2].view(B, T) == asked).all()
+
+
+@pytest.mark.parametrize("unknown", ["steps_BT", "pick_BT"])
+def test_steps_without_a_target_have_no_loss(head, inputs, unknown):
+    masks = inputs.masks_BTN.clone()
+    masks[0, 0] = False  # as in the padding of a batch
+    inputs = replace(inputs, masks_BTN=masks)
+    wanted = targets_at(inputs, place_of(inputs, AT_FIRST))
+    value = getattr(wanted, unknown).clone()
+    value[0, 0] = False if unknown == "steps_BT" else -1
+    partial = replace(wanted, **{unknown: value})
+    loss, metrics = head.loss(inputs, partial)
+    actions = partial.actions_BTC.clone()
+    actions[0, 0, 6:8] += 0.2
+    assert head.loss(inputs, replace(partial, actions_BTC=actions)) == (loss, metrics)
+    loss.backward()
+    assert loss.isfinite()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in head.parameters())
+
+
+def test_a_prompt_that_shows_nothing_is_possible(head, inputs):
+    blank = replace(
+        inputs,
+        prompt_BMD=inputs.prompt_BMD[:, :0],
+        prompt_masks_BM=inputs.prompt_masks_BM[:, :0],
+        prompt_appearance_BMA=inputs.prompt_appearance_BMA[:, :0],
+    )
+    for name in ("tokens_BKD", "masks_BK", "appearance_BKA", "positions_BK2", "numbers_BK"):
+        blank = remembering(blank, "scenes", name, getattr(inputs.recollection.scenes, name)[:, :0])
+    assert head.decide(blank).isfinite().all()
+    assert head.loss(blank, targets_at(blank, place_of(blank, AT_FIRST)))[0].isfinite()
+
+
+@pytest.mark.parametrize(("kind", "first"), [("first", AT_FIRST), ("scenes", IN_PROMPT)])
+def test_it_learns_to_copy_the_place_of_what_looks_alike_and_does_so_for_looks_never_seen(kind, first):
+    """Objects differ from step to step; that a remembered one looks like the picked one stays the same."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+
+    def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
+        drawn = drawn_inputs(batch=32, seed=seed)
+        looks = getattr(drawn.recollection, kind).appearance_BKA.clone()
+        alike = torch.randint(looks.shape[1], (32,), generator=torch.Generator().manual_seed(seed))
+        appearance = drawn.appearance_BTNA.clone()
+        rows = torch.arange(32)
+        appearance[:, :, 0] = looks[rows, alike][:, None]
+        prompt = looks[rows, alike][:, None].expand(-1, M, -1)
+        drawn = replace(drawn, appearance_BTNA=appearance, prompt_appearance_BMA=prompt)
+        place = candidate_positions(drawn)[rows, :, first + alike]
+        return drawn, targets_at(drawn, place)
+
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.01)
+    for step in range(60):
+        optimizer.zero_grad()
+        loss, _ = head.loss(*example(step))
+        loss.backward()
+        optimizer.step()
+    _, metrics = head.loss(*example(1000))
+    assert metrics["pick_accuracy"] > 0.97
+    assert metrics["place_accuracy"] > 0.9
+    assert metrics["accuracy"] > 0.9
+
+
+def test_turns_that_the_prompt_shows_are_copied(inputs):
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        head = CopyingHead(CopyingConfig(hidden_width=16), D, turn_bins=72).double()
+    torch.nn.init.zeros_(head.yaw.weight)
+    torch.nn.init.zeros_(head.yaw.bias)
+    turns = torch.zeros(B, NUM_SCENE, 72, dtype=torch.float64)
+    turns[:, 1, 66] = 1.0  # the first object has no picture to be compared with
+    kept = replace(inputs.recollection.scenes, turns_BKR=turns)
+    shown = replace(inputs, recollection=replace(inputs.recollection, scenes=kept))
+    expected = torch.full((B, T), math.radians(-30), dtype=torch.float64)
+    torch.testing.assert_close(turn_of(head.decide(shown)) - 0.0, expected)
+
+
+def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_episode(head, inputs):
+    first = inputs.recollection.first.select([2, 0])
+    assert torch.equal(first.positions_BK2, inputs.recollection.first.positions_BK2[[2, 0]])
+    place = torch.tensor([[1, AT_FIRST], [IN_PROMPT, 0], [AT_FIRST + 2, IN_PROMPT + 1]])
+    got = at(candidate_positions(inputs), place)
+    for b in range(B):
+        for t in range(T):
+            assert torch.equal(got[b, t], candidate_positions(inputs)[b, t, place[b, t]])
+
+
+@pytest.mark.parametrize("sizes", [{"num_yaw_bins": 1}, {"hidden_width": 0}, {"num_numbers": 0}])
+def test_sizes_that_make_no_sense_are_refused(sizes):
+    with pytest.raises(ConfigError, match="copying head"):
+        CopyingConfig(**sizes)

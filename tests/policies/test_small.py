@@ -1,0 +1,203 @@
+"""The network that copies and compares: what it keeps of an episode, and what must not matter to it."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
+from openvima.data.tokens.episode import tokens_of  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.heads.base import HeadInputs, Remembered  # noqa: E402
+from openvima.policies.inputs import Reader, batch_histories, batch_prompts, on_table  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.inverse_dynamics import as_motion  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
+from training_examples import examples_of  # noqa: E402
+
+TASKS = ("rearrange_then_restore", "follow_order", "twist", "visual_manipulation", "scene_understanding")
+
+
+@pytest.fixture(scope="module")
+def demos() -> list[Demonstration]:
+    """One of each task, of one to several steps."""
+    runs = [rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1) for task in TASKS]
+    assert {run.num_steps for run in runs} >= {1, 2}
+    return runs
+
+
+def network_of(config: PolicyConfig) -> PolicyNetwork:
+    network = build_network(config, seed=3).eval()
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+@pytest.fixture(scope="module")
+def network() -> PolicyNetwork:
+    return network_of(narrow_small()).double()
+
+
+@torch.no_grad()
+def read_whole(network: PolicyNetwork, demos) -> tuple[HeadInputs, "torch.Tensor"]:
+    """What the head is given for all steps of some demonstrations, and what it decides."""
+    reader = Reader.of(network.config.images)
+    examples, images = examples_of(demos, reader)
+    batch = Collator(reader)(examples)
+    features = network.encode_images(images)
+    memory = network.encode_prompts(batch.prompts, features)
+    inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
+    return inputs, network.head.decide(inputs)
+
+
+@torch.no_grad()
+def read_stepwise(network: PolicyNetwork, demo: Demonstration) -> list[HeadInputs]:
+    """The same as one episode is played, with the actions of the demonstration."""
+    reader = Reader.of(network.config.images)
+    (example,), images = examples_of([demo], reader)
+    batch = Collator(reader)([example])
+    features = network.encode_images(images)
+    memory = network.encode_prompts(batch.prompts, features)
+    state, given = network.begin(memory), []
+    actions = torch.cat([torch.zeros(1, 1, 12), batch.targets.actions_BTC], dim=1)
+    for t in range(demo.num_steps):
+        now = slice(t, t + 1)
+        step = type(batch.history)(
+            *(getattr(batch.history, field.name)[:, now] for field in fields(batch.history))
+        )
+        has_previous = torch.full((1, 1), t > 0)
+        inputs, state = network.extend(memory, state, step, features, actions[:, now], has_previous)
+        given.append(inputs)
+    return given
+
+
+def test_reading_step_by_step_gives_the_head_what_reading_at_once_does(network, demos):
+    whole, decided = read_whole(network, demos)
+    for b, demo in enumerate(demos):
+        for t, now in enumerate(read_stepwise(network, demo)):
+            count = now.masks_BTN.shape[2]
+            torch.testing.assert_close(now.query_BTD[0, 0], whole.query_BTD[b, t])
+            torch.testing.assert_close(now.objects_BTND[0, 0], whole.objects_BTND[b, t, :count])
+            assert now.recollection.steps_T.tolist() == [t]
+            for kind in ("first", "scenes"):
+                one, all_of_them = getattr(now.recollection, kind), getattr(whole.recollection, kind)
+                exist = one.masks_BK[0]
+                assert all_of_them.masks_BK[b].sum() == exist.sum()
+                for field in fields(Remembered):
+                    if (value := getattr(one, field.name)) is not None:
+                        others = getattr(all_of_them, field.name)[b, : len(exist)]
+                        torch.testing.assert_close(value[0][exist], others[exist])
+            torch.testing.assert_close(network.head.decide(now)[0, 0], decided[b, t])
+
+
+def test_the_first_observation_stays_in_memory_and_pictures_of_single_objects_are_no_places(network, demos):
+    inputs, _ = read_whole(network, demos)
+    first, scenes = inputs.recollection.first, inputs.recollection.scenes
+    assert torch.equal(first.positions_BK2, inputs.positions_BTN2[:, 0])
+    assert torch.equal(first.masks_BK, inputs.masks_BTN[:, 0])
+    shown = {task: scenes.masks_BK[b].sum().item() for b, task in enumerate(TASKS)}
+    records = [sum(len(image.objects) for image in demo.prompt.images.values()) for demo in demos]
+    assert shown == {**dict(zip(TASKS, records, strict=True)), "visual_manipulation": 0}
+
+
+def test_places_keep_all_their_digits_in_half_precision(demos):
+    inputs, decided = read_whole(network_of(narrow_small()).bfloat16(), demos)
+    for positions in (inputs.recollection.first.positions_BK2, inputs.recollection.scenes.positions_BK2):
+        assert positions.dtype == torch.float32
+    assert decided.isfinite().all()
+
+
+def test_sessions_have_memories_of_their_own(network, demos):
+    policy = NetworkPolicy(network)
+    other = policy.new_session()
+    long, another = demos[0], demos[1]
+    policy.reset([long.prompt])
+    first = policy.act([long.observation(0)])
+    other.reset([another.prompt, long.prompt])
+    other.act([another.observation(0), long.observation(1)])
+    other.act([None, long.observation(0)])
+    second = policy.act([long.observation(1)])
+    policy.reset([another.prompt, long.prompt])
+    for t, expected in ((0, first), (1, second)):
+        got = policy.act([another.observation(t), long.observation(t)])[1]
+        for key, value in expected[0].items():
+            np.testing.assert_array_equal(got[key], value)
+
+
+def test_it_survives_its_files(demos, tmp_path):
+    policy = NetworkPolicy(network_of(narrow_small()))
+    policy.save_pretrained(tmp_path / "small")
+    again = NetworkPolicy.from_pretrained(tmp_path / "small")
+    assert again.network.config == policy.network.config == narrow_small()
+    observation = demos[0].observation(0)
+    for each in (policy, again):
+        each.reset([demos[0].prompt])
+    (ours,), (theirs,) = policy.act([observation]), again.act([observation])
+    assert all(np.allclose(ours[key], theirs[key], atol=1e-6) for key in ours)
+
+
+def test_without_comparisons_it_copies_places_but_estimates_no_turns(demos):
+    network = network_of(replace(narrow_small(), comparison=None)).double()
+    inputs, decided = read_whole(network, demos)
+    assert inputs.recollection.scenes.turns_BKR is None
+    assert decided.isfinite().all()
+
+
+def test_comparisons_serve_the_other_heads_as_well(demos):
+    for head in ("nano", "nano-bins"):
+        network = network_of(replace(narrow_small(), head=preset(head).head)).double()
+        inputs, decided = read_whole(network, demos)
+        assert inputs.recollection is None
+        assert decided.isfinite().all()
+
+
+def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(demos):
+    reader = Reader("objects")
+    for demo, task in zip(demos, TASKS, strict=True):
+        prompt = reader.read_prompt(demo.prompt)
+        batch = batch_prompts([prompt], [np.zeros((2, len(prompt.objects)), np.int64)])
+        counts = [len(image.objects) for image in demo.prompt.images.values()]
+        assert batch.numbers_S.tolist() == np.repeat(np.arange(len(counts)), counts).tolist()
+        kinds = [image.kind == "scene" for image in demo.prompt.images.values()]
+        assert batch.on_table_S.tolist() == np.repeat(kinds, counts).tolist(), task
+        np.testing.assert_array_equal(batch.positions_S2, prompt.objects.positions())
+
+
+def test_one_object_in_the_middle_stands_alone_and_all_else_is_the_table():
+    middle, aside = [128, 63, 20, 20], [100, 63, 20, 20]
+    numbers = np.array([0, 1, 2, 2, 3])
+    boxes = np.array([[middle] * 5, [middle, aside, middle, middle, [0, 0, 0, 0]]])
+    masks = np.array([[True] * 5, [True] * 4 + [False]])
+    assert on_table(numbers, boxes, masks).tolist() == [False, True, True, True, True]
+    assert on_table(numbers[:0], boxes[:, :0], masks[:, :0]).shape == (0,)
+
+
+def test_motions_show_the_table(demos):
+    reader = Reader("objects")
+    examples, _ = examples_of(demos[:1], reader)
+    motion = as_motion(tokens_of(demos[0], "objects"))
+    batch = Collator(reader)([replace(examples[0], tokens=motion)])
+    assert batch.prompts.on_table_S.all()
+    assert batch.prompts.numbers_S.max() == demos[0].num_steps
+
+
+def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):
+    demo = demos[3]
+    reader = Reader.of(network.config.images)
+    prompt = reader.read_prompt(replace(demo.prompt, text="Rotate it 30 degrees.", images={}))
+    step = reader.begin_episode().read_step(demo.observation(0))
+    images = torch.from_numpy(step.objects.crops.reshape(-1, 3, 32, 32))
+    numbers = np.arange(len(images)).reshape(2, -1)
+    features = network.encode_images(images)
+    memory = network.encode_prompts(batch_prompts([prompt], [numbers[:, :0]]), features)
+    history = batch_histories([[step]], [[numbers]])
+    inputs = network(memory, history, features, torch.zeros(1, 1, 12))
+    assert network.head.decide(inputs).isfinite().all()

@@ -1,0 +1,23 @@
+"""Networks that are small enough to be trained in a test."""
+
+from dataclasses import replace
+
+from openvima.policies import preset
+from openvima.policies.config import PolicyConfig
+from openvima.policies.layers.comparison import ComparisonConfig
+from openvima.policies.layers.conv_encoder import ConvConfig
+
+
+def narrow_small(width: int = 32, crop_width: int = 4) -> PolicyConfig:
+    """The preset small, narrower and shallower."""
+    sizes = preset("small")
+    text = replace(sizes.prompt.text, width=width, num_layers=1, num_heads=2, head_width=16, hidden_width=32)
+    crop = ConvConfig(width=crop_width, output_width=4 * crop_width)
+    return replace(
+        sizes,
+        images=replace(sizes.images, crop=crop, box_width=16, width=width),
+        prompt=replace(sizes.prompt, text=text, image_width=width),
+        trunk=replace(sizes.trunk, width=width, num_layers=1, num_self_heads=2, num_cross_heads=2),
+        head=replace(sizes.head, hidden_width=32),
+        comparison=ComparisonConfig(hidden_width=32),
+    )
