@@ -128,6 +128,25 @@ def test_a_prompt_image_turned_as_the_pairs_say_looks_like_the_scene():
     assert (red == also_red).float().mean() > 0.95
 
 
+def test_turns_from_prompt_images_follow_from_the_heading():
+    scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
+    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.5}))
+    np.testing.assert_allclose(stacked(rows).again.turns[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.4, 1.9])
+def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
+    """The T is its own mirror image about its upright, which at yaw 0 points to the left of the robot."""
+    rasteriser = Rasteriser(load_assets("procedural"))
+    crops = []
+    for heading in (yaw, -yaw - math.pi):
+        scene = Scene((Placement(5, "letter T", "red", (0, 0, 0), Pose.planar(0.5, 0.0, heading)),))
+        rows = pairs_of_scene(scene, {}, rasteriser, {}, 0)
+        crops.append(stacked(rows).scene_crops[0, :, 0].float())
+    difference = (crops[0].flip(-1) - crops[1]).abs()
+    assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
+
+
 def test_objects_of_other_height_are_other_looks():
     low = Placement(5, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1))
     high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))

@@ -46,7 +46,7 @@ def nano_bins() -> "PolicyConfig":
 
 
 def small() -> "PolicyConfig":
-    """7.9 M parameters: it copies places that it has seen, and compares objects with each other."""
+    """8.2 M parameters: it copies places that it has seen, and compares objects with each other."""
     from openvima.policies.config import PolicyConfig
     from openvima.policies.heads.copying import CopyingConfig
     from openvima.policies.layers.comparison import ComparisonConfig
@@ -57,7 +57,7 @@ def small() -> "PolicyConfig":
     from openvima.policies.layers.trunk import DecoderConfig
     from openvima.policies.tokenizer import vocabulary_size
 
-    crop = ConvConfig(width=48, output_width=192)
+    crop = ConvConfig(width=48, output_width=192, place_channels=32)
     text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
     return PolicyConfig(
         images=ObjectEncoderConfig(
