@@ -14,6 +14,7 @@ from openvima.policies.heads.copying import (  # noqa: E402
     CopyingHead,
     candidate_masks,
     candidate_positions,
+    right_candidates,
 )
 from openvima.policies.heads.pointing import at, turn_of, turned  # noqa: E402
 
@@ -179,9 +180,10 @@ def test_every_candidate_at_the_demonstrated_place_is_right(head, inputs):
     twice = remembering(inputs, "scenes", "positions_BK2", same)
     wanted = targets_at(twice, place_of(twice, AT_FIRST))
     goal = place_of(twice, AT_FIRST)
-    scores = head.place(twice, wanted.pick_BT)
-    near = (candidate_positions(twice) - goal[:, :, None]).norm(dim=-1) < 0.02
+    scores = head.place(head.with_free_points(twice), wanted.pick_BT)
+    near, is_told = right_candidates(head.with_free_points(twice), wanted, goal)
     assert near[..., [AT_FIRST, IN_PROMPT + 1]].all()
+    assert is_told.all()
     chances = (torch.softmax(scores, dim=-1) * near).sum(-1)
     no_others = replace(head.config, offset_weight=0.0, yaw_weight=0.0)
     head.config = no_others
@@ -190,12 +192,26 @@ def test_every_candidate_at_the_demonstrated_place_is_right(head, inputs):
     torch.testing.assert_close(loss, -(chances.log().mean() + picks.log().mean()))
 
 
-def test_without_a_candidate_there_the_named_object_is_right_and_else_the_picked_one(head, inputs):
-    nowhere = torch.full((B, T, 2), 0.26, dtype=torch.float64)
-    for slot, asked in ((2, 2), (-1, 0)):
-        wanted = targets_at(inputs, nowhere, place_slot=slot)
-        right = head._right(inputs, wanted, wanted.pick_BT, nowhere)
+def test_without_a_candidate_there_the_named_object_is_right_and_else_the_nearest_free_point(head, inputs):
+    nowhere = torch.tensor([0.29, -0.43], dtype=torch.float64).expand(B, T, 2)
+    known = head.with_free_points(inputs)
+    free = IN_PROMPT + NUM_SCENE
+    assert ((candidate_positions(known)[:, :, :free] - nowhere[:, :, None]).norm(dim=-1) > 0.04).all()
+    for slot, asked in ((2, 2), (-1, free)):
+        right, is_told = right_candidates(known, targets_at(inputs, nowhere, place_slot=slot), nowhere)
         assert (right.nonzero()[:, 2].view(B, T) == asked).all()
+        assert (is_told == (slot >= 0)).all()
+
+
+def test_steps_that_only_clear_the_way_count_in_the_loss_but_not_in_the_metrics(head, inputs):
+    away = torch.tensor([0.29, -0.43], dtype=torch.float64).expand(B, T, 2)
+    loss, metrics = head.loss(inputs, targets_at(inputs, away))
+    assert loss > 0
+    assert (
+        metrics["pick_accuracy"]
+        == head.loss(inputs, targets_at(inputs, away, place_slot=1))[1]["pick_accuracy"]
+    )
+    assert all(value == 0 for name, value in metrics.items() if name != "pick_accuracy")
 
 
 @pytest.mark.parametrize("unknown", ["steps_BT", "pick_BT"])

@@ -88,9 +88,9 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
 
 @pytest.fixture(scope="module")
 def long_and_short(demonstrations) -> list[Demonstration]:
-    """Demonstrations of one step and of several, some with prompts that show changes."""
+    """Of one step and of several; prompts show changes, and something has to be cleared away."""
     changes = [
-        rollout_oracle(TabletopEnv(task, level="train", domain="user"), 0)
+        rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1)
         for task in ("twist", "follow_order", "rearrange_then_restore")
     ]
     return [*demonstrations[:3], *changes]

@@ -193,5 +193,5 @@ def test_the_copying_network_learns_places_by_heart_that_prompt_and_past_show(ta
         for run, action in zip(runs, policy.act(seen), strict=True):
             if action is not None:
                 asked = run.actions[t].to_arrays()
-                # Held at another point and turned by bins of 5 degrees, a place moves by some centimetres.
-                assert abs(action["pose1_position"] - asked["pose1_position"]).max() < 0.06, (run.seed, t)
+                # Held at another point, an object moves by some centimetres, and so do free points.
+                assert abs(action["pose1_position"] - asked["pose1_position"]).max() < 0.1, (run.seed, t)

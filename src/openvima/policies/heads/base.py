@@ -80,11 +80,18 @@ class Recollection:
         first: Objects that were in view at the first step of the episode.
         scenes: Objects that the prompt's images show.
         steps_T: Numbers of the steps, counted from 0.
+        free: Points of the table that stand for places at which nothing is or was; a head may add its own.
     """
 
     first: Remembered
     scenes: Remembered
     steps_T: torch.Tensor
+    free: Remembered | None = None
+
+    @property
+    def parts(self) -> tuple[Remembered, ...]:
+        """All of it, in this order."""
+        return (self.first, self.scenes) if self.free is None else (self.first, self.scenes, self.free)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

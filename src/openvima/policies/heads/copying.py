@@ -8,8 +8,9 @@ of turns.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -42,9 +43,14 @@ from openvima.policies.heads.pointing import (
 )
 from openvima.policies.layers.mlp import mlp
 
-KINDS = ("in view", "at first", "in the prompt")  # where candidates come from
+KINDS = ("in view", "at first", "in the prompt", "free")  # where candidates come from
+# A candidate this near to the demonstrated place is right. Boxes of turned objects have their centres up to
+# 36 mm from where the old centre goes; in 500 demonstrations nothing else lay nearer than 60 mm.
+COPIED_WITHIN_M = 0.04
 _HERE_M = 0.03  # a candidate this near to the picked object is, more or less, where that is
-_NUM_GEOMETRY = 4
+_BESIDE_M = 0.1  # objects that are this near to a candidate are beside it
+_NUM_GEOMETRY = 6
+_FREE_X_M, _FREE_Y_M = (0.3, 0.7, 4), (-0.42, 0.42, 8)  # first and last line of the points, and how many
 _SURE = 5.0  # score of a turn that is seen without doubt, before the network learns how much it counts
 
 
@@ -80,7 +86,10 @@ class CopyingHead(ActionHead):
 
     Candidates for the place, with two objects on the table and one in the only scene of the prompt:
 
-        [1 in view, 2 in view, 1 at first, 2 at first, 1 in the scene]
+        [1 in view, 2 in view, 1 at first, 2 at first, 1 in the scene, free point 1, …, free point 32]
+
+    What is only to be cleared out of the way goes to a free point: a demonstration chooses one of many places
+    that would do, and their mean would not.
 
     The centre of the picked object goes to the candidate's, moved by the offset. Where it is held, and how it
     is turned on the way, then says where the tool goes. So a wrong turn leaves the object in its place.
@@ -95,6 +104,7 @@ class CopyingHead(ActionHead):
         self.shown_turn = ShownTurn(width) if turn_bins == config.num_yaw_bins else None
         self.pick = Pointer(width)
         self.place = PlacePointer(config, width)
+        self.free = FreePoints(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
         self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
         self.offset = nn.Linear(config.hidden_width, 2)
@@ -108,13 +118,15 @@ class CopyingHead(ActionHead):
         """Cross-entropy of both pointers and of the yaw, and Huber loss of the offset.
 
         Every candidate at the demonstrated place is right: the loss is that of their chances together. Where
-        there is none, the object that the demonstration names is, or else the picked one itself, and the
-        offset has to lead from there to the place.
+        there is none, the object that the demonstration names is, and the offset has to lead from there to
+        the place. If none is named, the nearest free point is right; metrics leave out such a step.
         """
+        inputs = self.with_free_points(inputs)
         has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
         pick_scores, place_scores = self.pick(inputs), self.place(inputs, pick)
         goal = self._goal(inputs, targets, pick)
-        right_BTC = self._right(inputs, targets, pick, goal) | ~has_pick[..., None]
+        right_BTC, is_told_BT = right_candidates(inputs, targets, goal)
+        right_BTC = right_BTC | ~has_pick[..., None]
         right_scores = place_scores.masked_fill(~right_BTC, torch.finfo(place_scores.dtype).min)
         copied = right_scores.argmax(-1)  # the right one that is chosen first
         offset, yaw_scores = self.relate(inputs, pick, copied)
@@ -131,15 +143,16 @@ class CopyingHead(ActionHead):
             "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * self.config.yaw_weight,
         }
         with torch.no_grad():
+            told = has_pick & is_told_BT
             error_BT = (offset - true_offset).norm(dim=-1)
             right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == copied)
             right_BT &= error_BT < RIGHT_OFFSET_M
             metrics = {
-                "accuracy": masked_mean(right_BT.to(offset.dtype), has_pick),
+                "accuracy": masked_mean(right_BT.to(offset.dtype), told),
                 "pick_accuracy": accuracy(pick_scores, pick, has_pick),
-                "place_accuracy": accuracy(place_scores, copied, has_pick),
-                "yaw_accuracy": accuracy(yaw_scores, yaw, has_pick),
-                "offset_error_m": masked_mean(error_BT, has_pick),
+                "place_accuracy": accuracy(place_scores, copied, told),
+                "yaw_accuracy": accuracy(yaw_scores, yaw, told),
+                "offset_error_m": masked_mean(error_BT, told),
             }
         return torch.stack(list(losses.values())).sum(), metrics
 
@@ -147,6 +160,7 @@ class CopyingHead(ActionHead):
         self, inputs: HeadInputs, choose: Choose = likeliest, read_on: ReadOn | None = None
     ) -> torch.Tensor:
         """Point at an object and at a place, then bring the centre of the one to the other."""
+        inputs = self.with_free_points(inputs)
         pick = choose(self.pick(inputs))
         place = choose(self.place(inputs, pick))
         offset, yaw_scores = self.relate(inputs, pick, place)
@@ -170,7 +184,7 @@ class CopyingHead(ActionHead):
         kept = _recollection(inputs)
         value = _of_candidate(
             self.values[0](at(inputs.objects_BTND, place_BT.clamp(max=inputs.masks_BTN.shape[-1] - 1))),
-            torch.cat([self.values[1](kept.first.tokens_BKD), self.values[2](kept.scenes.tokens_BKD)], dim=1),
+            _tokens(self.values, kept),
             place_BT - inputs.masks_BTN.shape[-1],
         )
         tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), value]
@@ -187,15 +201,37 @@ class CopyingHead(ActionHead):
         centre = carried_place(actions, at(inputs.positions_BTN2, pick_BT))
         return torch.where(inputs.lifts_BT[..., None], centre, actions[..., 6:8])
 
-    def _right(
-        self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor, goal_BT2: torch.Tensor
-    ) -> torch.Tensor:
-        """Which candidates are right, (B, T, C): at least one where something is picked."""
-        near_BTC = (candidate_positions(inputs) - goal_BT2[:, :, None]).norm(dim=-1) < RIGHT_OFFSET_M
-        right_BTC = near_BTC & candidate_masks(inputs)
-        named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, pick_BT)
-        named_BTC = F.one_hot(named_BT, right_BTC.shape[-1]).bool()
-        return torch.where(right_BTC.any(-1, keepdim=True), right_BTC, named_BTC)
+    def with_free_points(self, inputs: HeadInputs) -> HeadInputs:
+        """Add the free points to what may be copied."""
+        kept = _recollection(inputs)
+        return replace(inputs, recollection=replace(kept, free=self.free(kept.first)))
+
+
+class FreePoints(nn.Module):
+    """Points of a grid on the table, each with a learned token."""
+
+    points_K2: torch.Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        lines = (np.linspace(*line) for line in (_FREE_X_M, _FREE_Y_M))
+        points = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2)
+        # A constant has a device of its own, so that a network without weights has it, too.
+        constant = torch.tensor(points, dtype=torch.float32, device="cpu")
+        self.register_buffer("points_K2", constant, persistent=False)
+        self.tokens = nn.Parameter(torch.randn(len(points), width) * 0.1)
+
+    def forward(self, like: Remembered) -> Remembered:
+        """Return them for every episode of a batch of memories."""
+        batch, count = len(like.masks_BK), len(self.points_K2)
+        numbers_BK = torch.zeros(batch, count, dtype=torch.int64, device=self.points_K2.device)
+        return Remembered(
+            self.tokens.expand(batch, -1, -1),
+            torch.ones_like(numbers_BK, dtype=torch.bool),
+            like.appearance_BKA.new_zeros(batch, count, like.appearance_BKA.shape[-1]),
+            self.points_K2.to(like.positions_BK2.dtype).expand(batch, -1, -1),
+            numbers_BK,
+        )
 
 
 class ShownTurn(nn.Module):
@@ -237,7 +273,7 @@ class PlacePointer(nn.Module):
         self.alike, self.asked, self.kind = (nn.Linear(width, len(KINDS)) for _ in range(3))
         self.geometry = nn.Linear(width, _NUM_GEOMETRY)
         self.same = nn.Linear(width, 1)  # how much the place wants to be that of the picked object itself
-        for layer, bias in ((self.alike, (0.0, 5.0, 5.0)), (self.asked, (10.0, 0.0, 0.0))):
+        for layer, bias in ((self.alike, (0.0, 5.0, 5.0, 0.0)), (self.asked, (10.0, 0.0, 0.0, 0.0))):
             nn.init.zeros_(layer.weight)
             with torch.no_grad():
                 layer.bias.copy_(torch.tensor(bias))
@@ -251,10 +287,8 @@ class PlacePointer(nn.Module):
         context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
         context_BTD = torch.relu(context_BTD + self.steps(kept.steps_T.clamp(max=last)))
         query_BTD = self.query(context_BTD) * scale
-        scenes_BKD = self.keys[2](kept.scenes.tokens_BKD) + self.images(
-            kept.scenes.numbers_BK.clamp(max=last)
-        )
-        kept_BKD = torch.cat([self.keys[1](kept.first.tokens_BKD), scenes_BKD], dim=1)
+        numbers_BK = torch.cat([part.numbers_BK for part in kept.parts], dim=1)
+        kept_BKD = _tokens(self.keys, kept) + self.images(numbers_BK.clamp(max=last))
         keys_BTND = self.keys[0](inputs.objects_BTND)
         scores_BTC = _with_candidates(query_BTD, keys_BTND, kept_BKD)
         alike_BTC, asked_BTC = self._likeness(inputs, pick_BT, context_BTD, scale)
@@ -272,8 +306,7 @@ class PlacePointer(nn.Module):
         self, inputs: HeadInputs, pick_BT: torch.Tensor, context_BTD: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """How much candidates look like the picked object and like what is asked for, both (B, T, C)."""
-        kept = _recollection(inputs)
-        kept_BKA = torch.cat([kept.first.appearance_BKA, kept.scenes.appearance_BKA], dim=1)
+        kept_BKA = torch.cat([part.appearance_BKA for part in _recollection(inputs).parts], dim=1)
         picked_BTA = at(inputs.appearance_BTNA, pick_BT)
         asked_BTA = torch.zeros_like(picked_BTA)
         if inputs.prompt_BMD.shape[1]:
@@ -285,22 +318,50 @@ class PlacePointer(nn.Module):
         return alike_BTC, _with_candidates(asked_BTA, inputs.appearance_BTNA, kept_BKA)
 
 
+def right_candidates(
+    inputs: HeadInputs, targets: ActionTargets, goal_BT2: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tell which candidates are right.
+
+    Args:
+        inputs: What is known, with the free points.
+        targets: What the demonstrator did.
+        goal_BT2: Where the centre of the picked object goes, metres.
+
+    Returns:
+        Which candidates are right, (B, T, C), at least one; and whether that follows from what is known,
+        (B, T): a free point is one of many that would do.
+    """
+    kept = _recollection(inputs)
+    assert kept.free is not None  # the head has added them
+    exist_BTC, num_free = candidate_masks(inputs), kept.free.masks_BK.shape[1]
+    distance_BTC = (candidate_positions(inputs) - goal_BT2[:, :, None]).norm(dim=-1)
+    is_free_C = torch.arange(exist_BTC.shape[-1], device=exist_BTC.device) >= exist_BTC.shape[-1] - num_free
+    near_BTC = (distance_BTC < COPIED_WITHIN_M) & exist_BTC & ~is_free_C
+    nearest_BT = distance_BTC.masked_fill(~is_free_C, torch.inf).argmin(-1)
+    named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, nearest_BT)
+    named_BTC = F.one_hot(named_BT, exist_BTC.shape[-1]).bool()
+    is_copied_BT = near_BTC.any(-1)
+    right_BTC = torch.where(is_copied_BT[..., None], near_BTC, named_BTC)
+    return right_BTC, is_copied_BT | (targets.place_BT >= 0)
+
+
 def candidate_masks(inputs: HeadInputs) -> torch.Tensor:
     """Which candidates exist, shape (B, T, C)."""
-    kept = _recollection(inputs)
-    masks_BTK = torch.cat([kept.first.masks_BK, kept.scenes.masks_BK], dim=1)[:, None]
+    masks_BTK = torch.cat([part.masks_BK for part in _recollection(inputs).parts], dim=1)[:, None]
     return torch.cat([inputs.masks_BTN, masks_BTK.expand(-1, inputs.masks_BTN.shape[1], -1)], dim=2)
 
 
 def candidate_positions(inputs: HeadInputs) -> torch.Tensor:
     """Where they lie, shape (B, T, C, 2), metres."""
-    kept_BTK2 = _kept_positions(inputs)[:, None].expand(-1, inputs.masks_BTN.shape[1], -1, -1)
-    return torch.cat([inputs.positions_BTN2, kept_BTK2], dim=2)
+    kept_BTK2 = torch.cat([part.positions_BK2 for part in _recollection(inputs).parts], dim=1)[:, None]
+    return torch.cat([inputs.positions_BTN2, kept_BTK2.expand(-1, inputs.masks_BTN.shape[1], -1, -1)], dim=2)
 
 
-def _kept_positions(inputs: HeadInputs) -> torch.Tensor:
-    kept = _recollection(inputs)
-    return torch.cat([kept.first.positions_BK2, kept.scenes.positions_BK2], dim=1)
+def _tokens(layers: nn.ModuleList, kept: Recollection) -> torch.Tensor:
+    """What is known of the remembered candidates, (B, K, D), each kind through its own layer."""
+    parts = zip(layers[1:], kept.parts, strict=False)  # there may be no free points
+    return torch.cat([layer(part.tokens_BKD) for layer, part in parts], dim=1)
 
 
 def _positions_at(inputs: HeadInputs, place_BT: torch.Tensor) -> torch.Tensor:
@@ -309,18 +370,35 @@ def _positions_at(inputs: HeadInputs, place_BT: torch.Tensor) -> torch.Tensor:
 
 
 def _geometry(inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
-    """How candidates lie to the picked object, (B, T, C, G): x, y and distance apart, and whether there."""
-    apart_BTC2 = candidate_positions(inputs) - at(inputs.positions_BTN2, pick_BT)[:, :, None]
+    """How candidates lie, (B, T, C, G).
+
+    It is x, y and distance from the picked object, and whether they are there; whether another object in view
+    is near, and whether a place of the prompt is.
+    """
+    places_BTC2, scenes = candidate_positions(inputs), _recollection(inputs).scenes
+    apart_BTC2 = places_BTC2 - at(inputs.positions_BTN2, pick_BT)[:, :, None]
     distance_BTC1 = apart_BTC2.norm(dim=-1, keepdim=True)
     here_BTC1 = torch.exp(-(distance_BTC1 / _HERE_M).square())
-    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1], dim=-1)
+    others_BTN = inputs.masks_BTN & ~F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).bool()
+    beside = [
+        _beside(places_BTC2, inputs.positions_BTN2, others_BTN),
+        _beside(places_BTC2, scenes.positions_BK2[:, None], scenes.masks_BK[:, None]),
+    ]
+    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1, *beside], dim=-1)
+
+
+def _beside(places_BTC2: torch.Tensor, others_BTK2: torch.Tensor, masks_BTK: torch.Tensor) -> torch.Tensor:
+    """How near other places are to each one, (B, T, C, 1): 1 for the same place, 0 for none near."""
+    apart_BTCK = (places_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
+    near_BTCK = torch.exp(-(apart_BTCK / _BESIDE_M).square()) * masks_BTK[:, :, None]
+    return F.pad(near_BTCK, (0, 1)).amax(dim=-1, keepdim=True)  # there may be none
 
 
 def _kinds(inputs: HeadInputs) -> torch.Tensor:
     """Where each candidate comes from, as a number of `KINDS`, shape (C,), int64."""
-    kept, device = _recollection(inputs), inputs.masks_BTN.device
-    counts = (inputs.masks_BTN.shape[2], kept.first.masks_BK.shape[1], kept.scenes.masks_BK.shape[1])
-    return torch.repeat_interleave(torch.arange(len(KINDS)), torch.tensor(counts)).to(device)
+    kept = [part.masks_BK.shape[1] for part in _recollection(inputs).parts]
+    counts = torch.tensor([inputs.masks_BTN.shape[2], *kept])
+    return torch.arange(len(counts)).repeat_interleave(counts).to(inputs.masks_BTN.device)
 
 
 def _with_candidates(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
