@@ -228,9 +228,9 @@ def _zero_vectors_beyond(network: PolicyNetwork, counts: Sequence[int]) -> Itera
     observe = network.observe
 
     def observe_and_clear(
-        history: HistoryBatch, features_BTVNF: torch.Tensor
+        history: HistoryBatch, *others: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        slots_BTQD, mask_BTQ, read_BT = observe(history, features_BTVNF)
+        slots_BTQD, mask_BTQ, read_BT = observe(history, *others)
         own_TN = torch.arange(history.masks_BTVN.shape[-1]) < torch.tensor(counts)[:, None]
         own_TQ = own_TN.repeat(1, len(VIEWS))
         return slots_BTQD * own_TQ[..., None], mask_BTQ, read_BT

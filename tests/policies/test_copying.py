@@ -9,13 +9,12 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.heads.base import ActionTargets, HeadInputs, Recollection, Remembered  # noqa: E402
-from openvima.policies.heads.copying import (  # noqa: E402
-    CopyingConfig,
-    CopyingHead,
+from openvima.policies.heads.candidates import (  # noqa: E402
     candidate_masks,
     candidate_positions,
     right_candidates,
 )
+from openvima.policies.heads.copying import CopyingConfig, CopyingHead  # noqa: E402
 from openvima.policies.heads.pointing import at, turn_of, turned  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5

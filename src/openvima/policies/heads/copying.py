@@ -10,7 +10,6 @@ of turns.
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -22,12 +21,25 @@ from openvima.policies.heads.base import (
     Choose,
     HeadInputs,
     ReadOn,
-    Recollection,
     Remembered,
     from_unit_range,
     likeliest,
     masked_mean,
     to_unit_range,
+)
+from openvima.policies.heads.candidates import (
+    KINDS,
+    NUM_GEOMETRY,
+    FreePoints,
+    candidate_masks,
+    chosen,
+    geometry_of,
+    kinds_of,
+    positions_at,
+    products,
+    recollection_of,
+    right_candidates,
+    tokens_of_remembered,
 )
 from openvima.policies.heads.pointing import (
     OFFSET_UNIT_M,
@@ -43,14 +55,6 @@ from openvima.policies.heads.pointing import (
 )
 from openvima.policies.layers.mlp import mlp
 
-KINDS = ("in view", "at first", "in the prompt", "free")  # where candidates come from
-# A candidate this near to the demonstrated place is right. Boxes of turned objects have their centres up to
-# 36 mm from where the old centre goes; in 500 demonstrations nothing else lay nearer than 60 mm.
-COPIED_WITHIN_M = 0.04
-_HERE_M = 0.03  # a candidate this near to the picked object is, more or less, where that is
-_BESIDE_M = 0.1  # objects that are this near to a candidate are beside it
-_NUM_GEOMETRY = 6
-_FREE_X_M, _FREE_Y_M = (0.3, 0.7, 4), (-0.42, 0.42, 8)  # first and last line of the points, and how many
 _SURE = 5.0  # score of a turn that is seen without doubt, before the network learns how much it counts
 
 
@@ -130,7 +134,7 @@ class CopyingHead(ActionHead):
         right_scores = place_scores.masked_fill(~right_BTC, torch.finfo(place_scores.dtype).min)
         copied = right_scores.argmax(-1)  # the right one that is chosen first
         offset, yaw_scores = self.relate(inputs, pick, copied)
-        true_offset = goal - _positions_at(inputs, copied)
+        true_offset = goal - positions_at(inputs, copied)
         yaw = yaw_bin(turn_of(targets.actions_BTC), self.config.num_yaw_bins)
         huber = F.smooth_l1_loss(
             offset / OFFSET_UNIT_M, true_offset / OFFSET_UNIT_M, reduction="none", beta=0.1
@@ -167,7 +171,7 @@ class CopyingHead(ActionHead):
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
         zero, one = torch.zeros_like(turn), torch.ones_like(turn)
-        grasp, goal = at(inputs.grasps_BTN2, pick), _positions_at(inputs, place) + offset
+        grasp, goal = at(inputs.grasps_BTN2, pick), positions_at(inputs, place) + offset
         held = turned(grasp - at(inputs.positions_BTN2, pick), turn)
         pose1 = [torch.where(inputs.lifts_BT[..., None], goal + held, goal)]
         pose1.append(torch.stack([zero, zero, torch.sin(turn / 2), torch.cos(turn / 2)], dim=-1))
@@ -179,12 +183,12 @@ class CopyingHead(ActionHead):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Offset from the candidate in metres, (B, T, 2), and scores of yaw bins, (B, T, bins)."""
         grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
-        goal = _positions_at(inputs, place_BT)
+        goal = positions_at(inputs, place_BT)
         metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
-        kept = _recollection(inputs)
-        value = _of_candidate(
+        kept = recollection_of(inputs)
+        value = chosen(
             self.values[0](at(inputs.objects_BTND, place_BT.clamp(max=inputs.masks_BTN.shape[-1] - 1))),
-            _tokens(self.values, kept),
+            tokens_of_remembered(self.values, kept),
             place_BT - inputs.masks_BTN.shape[-1],
         )
         tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), value]
@@ -203,35 +207,8 @@ class CopyingHead(ActionHead):
 
     def with_free_points(self, inputs: HeadInputs) -> HeadInputs:
         """Add the free points to what may be copied."""
-        kept = _recollection(inputs)
+        kept = recollection_of(inputs)
         return replace(inputs, recollection=replace(kept, free=self.free(kept.first)))
-
-
-class FreePoints(nn.Module):
-    """Points of a grid on the table, each with a learned token."""
-
-    points_K2: torch.Tensor
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        lines = (np.linspace(*line) for line in (_FREE_X_M, _FREE_Y_M))
-        points = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2)
-        # A constant has a device of its own, so that a network without weights has it, too.
-        constant = torch.tensor(points, dtype=torch.float32, device="cpu")
-        self.register_buffer("points_K2", constant, persistent=False)
-        self.tokens = nn.Parameter(torch.randn(len(points), width) * 0.1)
-
-    def forward(self, like: Remembered) -> Remembered:
-        """Return them for every episode of a batch of memories."""
-        batch, count = len(like.masks_BK), len(self.points_K2)
-        numbers_BK = torch.zeros(batch, count, dtype=torch.int64, device=self.points_K2.device)
-        return Remembered(
-            self.tokens.expand(batch, -1, -1),
-            torch.ones_like(numbers_BK, dtype=torch.bool),
-            like.appearance_BKA.new_zeros(batch, count, like.appearance_BKA.shape[-1]),
-            self.points_K2.to(like.positions_BK2.dtype).expand(batch, -1, -1),
-            numbers_BK,
-        )
 
 
 class ShownTurn(nn.Module):
@@ -271,7 +248,7 @@ class PlacePointer(nn.Module):
         self.prompt_key = nn.Linear(width, width)
         # For each kind of candidate: how much either likeness counts, and how much the kind is wanted.
         self.alike, self.asked, self.kind = (nn.Linear(width, len(KINDS)) for _ in range(3))
-        self.geometry = nn.Linear(width, _NUM_GEOMETRY)
+        self.geometry = nn.Linear(width, NUM_GEOMETRY)
         self.same = nn.Linear(width, 1)  # how much the place wants to be that of the picked object itself
         for layer, bias in ((self.alike, (0.0, 5.0, 5.0, 0.0)), (self.asked, (10.0, 0.0, 0.0, 0.0))):
             nn.init.zeros_(layer.weight)
@@ -282,21 +259,21 @@ class PlacePointer(nn.Module):
 
     def forward(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Return scores, shape (B, T, C); candidates that do not exist score the most negative number."""
-        kept, last = _recollection(inputs), self.steps.num_embeddings - 1
+        kept, last = recollection_of(inputs), self.steps.num_embeddings - 1
         picked_BTD, scale = at(inputs.objects_BTND, pick_BT), inputs.query_BTD.shape[-1] ** -0.5
         context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
         context_BTD = torch.relu(context_BTD + self.steps(kept.steps_T.clamp(max=last)))
         query_BTD = self.query(context_BTD) * scale
         numbers_BK = torch.cat([part.numbers_BK for part in kept.parts], dim=1)
-        kept_BKD = _tokens(self.keys, kept) + self.images(numbers_BK.clamp(max=last))
+        kept_BKD = tokens_of_remembered(self.keys, kept) + self.images(numbers_BK.clamp(max=last))
         keys_BTND = self.keys[0](inputs.objects_BTND)
-        scores_BTC = _with_candidates(query_BTD, keys_BTND, kept_BKD)
+        scores_BTC = products(query_BTD, keys_BTND, kept_BKD)
         alike_BTC, asked_BTC = self._likeness(inputs, pick_BT, context_BTD, scale)
-        kinds_C = _kinds(inputs)
+        kinds_C = kinds_of(inputs)
         scores_BTC = scores_BTC + F.softplus(self.alike(context_BTD))[..., kinds_C] * alike_BTC
         scores_BTC = scores_BTC + F.softplus(self.asked(context_BTD))[..., kinds_C] * asked_BTC
         scores_BTC = scores_BTC + self.kind(context_BTD)[..., kinds_C]
-        lies_BTCG = _geometry(inputs, pick_BT).to(scores_BTC.dtype)
+        lies_BTCG = geometry_of(inputs, pick_BT).to(scores_BTC.dtype)
         scores_BTC = scores_BTC + torch.einsum("btg,btcg->btc", self.geometry(context_BTD), lies_BTCG)
         picked_BTC = F.one_hot(pick_BT, scores_BTC.shape[-1]).to(scores_BTC.dtype)
         scores_BTC = scores_BTC + self.same(context_BTD) * picked_BTC
@@ -306,7 +283,7 @@ class PlacePointer(nn.Module):
         self, inputs: HeadInputs, pick_BT: torch.Tensor, context_BTD: torch.Tensor, scale: float
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """How much candidates look like the picked object and like what is asked for, both (B, T, C)."""
-        kept_BKA = torch.cat([part.appearance_BKA for part in _recollection(inputs).parts], dim=1)
+        kept_BKA = torch.cat([part.appearance_BKA for part in recollection_of(inputs).parts], dim=1)
         picked_BTA = at(inputs.appearance_BTNA, pick_BT)
         asked_BTA = torch.zeros_like(picked_BTA)
         if inputs.prompt_BMD.shape[1]:
@@ -314,105 +291,5 @@ class PlacePointer(nn.Module):
             hidden = torch.finfo(asked_BTM.dtype).min
             asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
             asked_BTA = asked_BTM @ inputs.prompt_appearance_BMA
-        alike_BTC = _with_candidates(picked_BTA, inputs.appearance_BTNA, kept_BKA)
-        return alike_BTC, _with_candidates(asked_BTA, inputs.appearance_BTNA, kept_BKA)
-
-
-def right_candidates(
-    inputs: HeadInputs, targets: ActionTargets, goal_BT2: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Tell which candidates are right.
-
-    Args:
-        inputs: What is known, with the free points.
-        targets: What the demonstrator did.
-        goal_BT2: Where the centre of the picked object goes, metres.
-
-    Returns:
-        Which candidates are right, (B, T, C), at least one; and whether that follows from what is known,
-        (B, T): a free point is one of many that would do.
-    """
-    kept = _recollection(inputs)
-    assert kept.free is not None  # the head has added them
-    exist_BTC, num_free = candidate_masks(inputs), kept.free.masks_BK.shape[1]
-    distance_BTC = (candidate_positions(inputs) - goal_BT2[:, :, None]).norm(dim=-1)
-    is_free_C = torch.arange(exist_BTC.shape[-1], device=exist_BTC.device) >= exist_BTC.shape[-1] - num_free
-    near_BTC = (distance_BTC < COPIED_WITHIN_M) & exist_BTC & ~is_free_C
-    nearest_BT = distance_BTC.masked_fill(~is_free_C, torch.inf).argmin(-1)
-    named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, nearest_BT)
-    named_BTC = F.one_hot(named_BT, exist_BTC.shape[-1]).bool()
-    is_copied_BT = near_BTC.any(-1)
-    right_BTC = torch.where(is_copied_BT[..., None], near_BTC, named_BTC)
-    return right_BTC, is_copied_BT | (targets.place_BT >= 0)
-
-
-def candidate_masks(inputs: HeadInputs) -> torch.Tensor:
-    """Which candidates exist, shape (B, T, C)."""
-    masks_BTK = torch.cat([part.masks_BK for part in _recollection(inputs).parts], dim=1)[:, None]
-    return torch.cat([inputs.masks_BTN, masks_BTK.expand(-1, inputs.masks_BTN.shape[1], -1)], dim=2)
-
-
-def candidate_positions(inputs: HeadInputs) -> torch.Tensor:
-    """Where they lie, shape (B, T, C, 2), metres."""
-    kept_BTK2 = torch.cat([part.positions_BK2 for part in _recollection(inputs).parts], dim=1)[:, None]
-    return torch.cat([inputs.positions_BTN2, kept_BTK2.expand(-1, inputs.masks_BTN.shape[1], -1, -1)], dim=2)
-
-
-def _tokens(layers: nn.ModuleList, kept: Recollection) -> torch.Tensor:
-    """What is known of the remembered candidates, (B, K, D), each kind through its own layer."""
-    parts = zip(layers[1:], kept.parts, strict=False)  # there may be no free points
-    return torch.cat([layer(part.tokens_BKD) for layer, part in parts], dim=1)
-
-
-def _positions_at(inputs: HeadInputs, place_BT: torch.Tensor) -> torch.Tensor:
-    """Where the chosen candidate lies, (B, T, 2), metres."""
-    return at(candidate_positions(inputs), place_BT)
-
-
-def _geometry(inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
-    """How candidates lie, (B, T, C, G).
-
-    It is x, y and distance from the picked object, and whether they are there; whether another object in view
-    is near, and whether a place of the prompt is.
-    """
-    places_BTC2, scenes = candidate_positions(inputs), _recollection(inputs).scenes
-    apart_BTC2 = places_BTC2 - at(inputs.positions_BTN2, pick_BT)[:, :, None]
-    distance_BTC1 = apart_BTC2.norm(dim=-1, keepdim=True)
-    here_BTC1 = torch.exp(-(distance_BTC1 / _HERE_M).square())
-    others_BTN = inputs.masks_BTN & ~F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).bool()
-    beside = [
-        _beside(places_BTC2, inputs.positions_BTN2, others_BTN),
-        _beside(places_BTC2, scenes.positions_BK2[:, None], scenes.masks_BK[:, None]),
-    ]
-    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1, *beside], dim=-1)
-
-
-def _beside(places_BTC2: torch.Tensor, others_BTK2: torch.Tensor, masks_BTK: torch.Tensor) -> torch.Tensor:
-    """How near other places are to each one, (B, T, C, 1): 1 for the same place, 0 for none near."""
-    apart_BTCK = (places_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
-    near_BTCK = torch.exp(-(apart_BTCK / _BESIDE_M).square()) * masks_BTK[:, :, None]
-    return F.pad(near_BTCK, (0, 1)).amax(dim=-1, keepdim=True)  # there may be none
-
-
-def _kinds(inputs: HeadInputs) -> torch.Tensor:
-    """Where each candidate comes from, as a number of `KINDS`, shape (C,), int64."""
-    kept = [part.masks_BK.shape[1] for part in _recollection(inputs).parts]
-    counts = torch.tensor([inputs.masks_BTN.shape[2], *kept])
-    return torch.arange(len(counts)).repeat_interleave(counts).to(inputs.masks_BTN.device)
-
-
-def _with_candidates(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
-    """Products of a vector at each step with those of the candidates, (B, T, C)."""
-    now_BTN = torch.einsum("btx,btnx->btn", query_BTX, now_BTNX)
-    return torch.cat([now_BTN, query_BTX @ kept_BKX.mT], dim=2)
-
-
-def _of_candidate(now_BTX: torch.Tensor, kept_BKX: torch.Tensor, place_BT: torch.Tensor) -> torch.Tensor:
-    """Take the row of a remembered object, or what is given for one in view where the number is negative."""
-    index_BTX = place_BT.clamp(min=0)[..., None].expand(*place_BT.shape, kept_BKX.shape[-1])
-    return torch.where((place_BT < 0)[..., None], now_BTX, kept_BKX.gather(1, index_BTX))
-
-
-def _recollection(inputs: HeadInputs) -> Recollection:
-    assert inputs.recollection is not None  # the network gives it to heads that copy
-    return inputs.recollection
+        alike_BTC = products(picked_BTA, inputs.appearance_BTNA, kept_BKA)
+        return alike_BTC, products(asked_BTA, inputs.appearance_BTNA, kept_BKA)
