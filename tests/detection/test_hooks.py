@@ -16,32 +16,13 @@ from openvima.env import TabletopEnv
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
 
-FINDERS = """
-from openvima.perception.objects import GROUND_TRUTH, see_nothing
-
-def truth():
-    return GROUND_TRUTH
-
-class Blind:
-    def in_observation(self, observation):
-        return see_nothing()
-
-    def in_prompt_image(self, image):
-        return see_nothing(2)
-"""
+FINDERS = Path(__file__).parents[1] / "plugged_finders.py"
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "finders.py"
-    path.write_text(FINDERS)
-    return path
-
-
-def test_a_detector_of_a_module_is_found_by_name(file, monkeypatch):
-    monkeypatch.syspath_prepend(str(file.parent))
-    finder = plugged_finder("finders:truth")
-    sys.modules.pop("finders")
+def test_a_detector_of_a_module_is_found_by_name(monkeypatch):
+    monkeypatch.syspath_prepend(str(FINDERS.parent))
+    finder = plugged_finder("plugged_finders:truth")
+    sys.modules.pop("plugged_finders")
     assert finder.finder == GROUND_TRUTH
 
 
@@ -78,8 +59,8 @@ def test_a_trained_detector_is_found_by_its_folder(tmp_path):
         plugged_finder(f"detector={tmp_path}")
 
 
-def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothing(file):
-    finder = plugged_finder(f"{file}:Blind")
+def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothing():
+    finder = plugged_finder(f"{FINDERS}:Blind")
     env = TabletopEnv("rotate", level="L1")
     observation, _ = env.reset(seed=0)
     found = finder.in_observation(observation)
@@ -88,12 +69,12 @@ def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothin
     assert len(finder.in_prompt_image(next(iter(env.prompt.images.values())))) == 0
 
 
-def test_the_name_of_a_function_follows_from_its_file(file, tmp_path):
-    names = {plugged_boxes(f"{file}:{function}").name for function in ("truth", "truth", "Blind")}
+def test_the_name_of_a_function_follows_from_its_file(tmp_path):
+    names = {plugged_boxes(f"{FINDERS}:{function}").name for function in ("truth", "truth", "Blind")}
     assert sorted(name.partition("-")[0] for name in names) == ["Blind", "truth"]
-    elsewhere = shutil.copy(file, tmp_path / "copy.py")
+    elsewhere = shutil.copy(FINDERS, tmp_path / "copy.py")
     assert plugged_boxes(f"{elsewhere}:truth").name in names
-    Path(elsewhere).write_text(FINDERS + "\n")
+    Path(elsewhere).write_text(FINDERS.read_text() + "\n")
     assert plugged_boxes(f"{elsewhere}:truth").name not in names
 
 

@@ -8,6 +8,7 @@ import pytest
 from openvima.errors import ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 
+FINDERS = Path(__file__).parents[1] / "plugged_finders.py"
 CONFIG = EvaluationConfig(
     ("untrained",),
     ("visual_manipulation",),
@@ -17,26 +18,6 @@ CONFIG = EvaluationConfig(
     controls=("detected_boxes",),
     boxes="x:y",
 )
-FINDERS = """
-from openvima.perception.objects import GROUND_TRUTH, see_nothing
-
-def truth():
-    return GROUND_TRUTH
-
-class Blind:
-    def in_observation(self, observation):
-        return see_nothing()
-
-    def in_prompt_image(self, image):
-        return see_nothing()
-"""
-
-
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "finders.py"
-    path.write_text(FINDERS)
-    return path
 
 
 @pytest.fixture
@@ -51,13 +32,13 @@ def rows(tmp_path: Path):
     return played
 
 
-def test_a_detector_that_finds_what_the_segmentation_says_changes_nothing(file, rows):
-    plain, detected = rows(f"{file}:truth")
+def test_a_detector_that_finds_what_the_segmentation_says_changes_nothing(rows):
+    plain, detected = rows(f"{FINDERS}:truth")
     assert detected == plain
 
 
-def test_a_detector_that_finds_nothing_fails_its_episodes_and_stops_nobody(file, rows):
-    _, detected = rows(f"{file}:Blind")
+def test_a_detector_that_finds_nothing_fails_its_episodes_and_stops_nobody(rows):
+    _, detected = rows(f"{FINDERS}:Blind")
     assert [outcome.success for outcome in detected] == [False, False]
 
 

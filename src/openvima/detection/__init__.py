@@ -22,11 +22,9 @@ def detector_folder(folder: str | Path | None = None) -> Path:
     path = PACKAGED if folder is None else Path(folder)
     if path.is_dir():
         return path
-    missing = (
-        "this version comes without a trained detector" if folder is None else f"there is no folder {path}"
-    )
     raise CheckpointError(
-        f"{missing}; `openvima detector train --data DIR --out RUN` makes one. Give its folder."
+        f"there is no folder {path}; `openvima detector train --data DIR --out RUN` makes one. Give its "
+        "folder."
     )
 
 

@@ -1,6 +1,5 @@
 """The training loop: stages one after the other, checkpoints, and going on where a run stopped."""
 
-import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -13,7 +12,6 @@ import torch
 from torch import nn
 
 from openvima.catalog.packs import load_assets
-from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.data.tokens.cache import Boxes, TokenCache, open_tokens
 from openvima.detection.hooks import detected_tokens, plugged_boxes
@@ -25,6 +23,7 @@ from openvima.training.config import TrainingConfig
 from openvima.training.inverse_dynamics import MOTION_TEXT
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.lengths import check_lengths
+from openvima.training.optimizer_state import load_named_state, named_state
 from openvima.training.parallel import (
     Parallel,
     compile_layers,
@@ -33,7 +32,7 @@ from openvima.training.parallel import (
     whole_state,
 )
 from openvima.training.pretrain import Variety, render_pairs
-from openvima.training.provenance import provenance
+from openvima.training.provenance import index_hash, provenance
 from openvima.training.run_folder import (
     METRICS_FILE,
     SESSIONS_FILE,
@@ -262,19 +261,14 @@ class _Trainer:
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
         if self.parallel.is_sharded:
             return TrainedState(*whole_state(self.learner, optimizer))
-        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
-        optimizer_state = {names[id(parameter)]: values for parameter, values in optimizer.state.items()}
-        return TrainedState(self.learner.state_dict(), optimizer_state)
+        return TrainedState(self.learner.state_dict(), named_state(self.learner, optimizer))
 
     def _load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
         state = self.run.optimizer_state()
         if self.parallel.is_sharded:
             set_whole_state(self.learner, optimizer, state)
-            return
-        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
-        ordered = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
-        values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
-        optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
+        else:
+            load_named_state(self.learner, optimizer, state)
 
     @cached_property
     def _tokens(self) -> list[TokenCache]:
@@ -377,9 +371,12 @@ def _settings(
     config: TrainingConfig, dataset: Dataset, learner: Learner, boxes: Boxes | None
 ) -> dict[str, Any]:  # Any: YAML
     """Everything that decides the weights: settings, network sizes, and which demonstrations there are."""
-    index = hashlib.blake2b((config.data / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
     values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
-    demonstrations = {"episodes": len(dataset), "index": index, **({"boxes": boxes.name} if boxes else {})}
+    demonstrations = {
+        "episodes": len(dataset),
+        "index": index_hash(config.data),
+        **({"boxes": boxes.name} if boxes else {}),
+    }
     return {"training": values, "demonstrations": demonstrations, "policy": learner.description()}
 
 

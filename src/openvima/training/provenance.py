@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import openvima
-from openvima.data.manifest import MANIFEST_NAME
+from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
 
 _PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
@@ -25,6 +25,11 @@ def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
             "counts": dataset.manifest["counts"],
         },
     }
+
+
+def index_hash(folder: Path) -> str:
+    """Return a hash of which demonstrations a folder holds."""
+    return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON

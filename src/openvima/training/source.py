@@ -1,6 +1,5 @@
 """The demonstrations of a run, out of the token cache: those to learn from, and those kept for validation."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +13,7 @@ from openvima.errors import ConfigError, DatasetError
 from openvima.policies.inputs import Reader
 from openvima.training.dataset import Example
 from openvima.training.learner import Collate
+from openvima.training.lots import lots_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,9 +110,7 @@ def split_examples(
     Raises:
         DatasetError: There is none to learn from.
     """
-    index = cache.dataset.index
-    names = zip(index.column("task").to_pylist(), index.column("seed").to_pylist(), strict=True)
-    lots = np.array([_lot(f"{task}/{seed}") for task, seed in names], np.float64)
+    lots = lots_of(cache.dataset)
     counts = cache.image_counts()
     bases = np.cumsum(counts) - counts
     lengths = cache.lengths()
@@ -182,8 +180,3 @@ def by_length(examples: Sequence[Example]) -> list[list[Example]]:
     for example in examples:
         groups.setdefault(min(2, example.tokens.num_steps // 2), []).append(example)
     return [groups[key] for key in sorted(groups)]
-
-
-def _lot(name: str) -> float:
-    digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") / 2**64

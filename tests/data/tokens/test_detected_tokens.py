@@ -1,7 +1,6 @@
 """Tokens of objects that a detector finds: what they say, where they lie, and that they are made once."""
 
 import pickle
-import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 
 from clumsy_finder import HOOK, Clumsy
 from openvima.cli.main import main
-from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data import Dataset
 from openvima.data.tokens.cache import Boxes, TokenCache, open_tokens
 from openvima.data.tokens.episode import COUNT, ID, PICK, PLACE, tokens_of
 from openvima.data.tokens.token_file import write_tokens
@@ -20,20 +19,7 @@ from openvima.errors import DatasetError, WorkerError
 from openvima.perception.objects import GROUND_TRUTH, observe
 from openvima.perception.overlap import overlaps
 
-TASKS = ("rotate", "rearrange_then_restore")
 CLUMSY = Boxes("clumsy-1", Clumsy)
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("tokens") / "demos"
-    return generate(GenerateConfig(out=out, tasks=TASKS, episodes=5, shard_size=2))
-
-
-@pytest.fixture
-def copy(demos: Path, tmp_path: Path) -> Path:
-    shutil.copytree(demos, tmp_path / "demos", ignore=shutil.ignore_patterns("tokens"))
-    return tmp_path / "demos"
 
 
 def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import shutil
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,18 +16,6 @@ from openvima.data.tokens.token_file import TokenFile
 from openvima.errors import DatasetError, ShardError
 
 TASKS = ("rotate", "rearrange_then_restore")
-
-
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("tokens") / "demos"
-    return generate(GenerateConfig(out=out, tasks=TASKS, episodes=5, shard_size=2))
-
-
-@pytest.fixture
-def copy(demos: Path, tmp_path: Path) -> Path:
-    shutil.copytree(demos, tmp_path / "demos", ignore=shutil.ignore_patterns("tokens"))
-    return tmp_path / "demos"
 
 
 def assert_equal(a: TokenEpisode, b: TokenEpisode) -> None:

@@ -1,6 +1,5 @@
 """The training loop of detectors: frames out of the shards, checkpoints, going on where a run stopped."""
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,6 @@ import torch
 from torch import nn
 
 from openvima.data.batching import BatchOrder
-from openvima.data.manifest import INDEX_NAME
 from openvima.data.reader import Dataset
 from openvima.detection.augment import augmented
 from openvima.detection.checkpoint import load_network
@@ -26,7 +24,8 @@ from openvima.policies.devices import torch_threads, usable_device
 from openvima.training.detector.config import DetectorTrainingConfig
 from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes
-from openvima.training.provenance import provenance
+from openvima.training.optimizer_state import load_named_state, named_state
+from openvima.training.provenance import index_hash, provenance
 from openvima.training.run_folder import METRICS_FILE, SESSIONS_FILE, TIMINGS_FILE, RunFolder, TrainedState
 from openvima.training.schedule import learning_rate_at, step_generator, step_seed
 
@@ -94,7 +93,7 @@ class _Trainer:
         learner.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
         self.optimizer = _optimizer(learner, config)
         if self.progress.step:
-            self._load_optimizer()
+            load_named_state(learner, self.optimizer, run.optimizer_state())
         run.go_back_to(self.progress)
         run.append(SESSIONS_FILE, {"step": self.progress.step, **provenance(source.dataset)})
 
@@ -161,16 +160,8 @@ class _Trainer:
         score, best = -metrics["loss"], self.progress.best_score
         if best is None or score >= best:
             self.progress = replace(self.progress, best_score=score, best_checkpoint=name)
-        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
-        optimizer = {names[id(parameter)]: values for parameter, values in self.optimizer.state.items()}
-        self.run.save(name, self.learner, TrainedState(self.learner.state_dict(), optimizer), self.progress)
-
-    def _load_optimizer(self) -> None:
-        state = self.run.optimizer_state()
-        names = {id(parameter): name for name, parameter in self.learner.named_parameters()}
-        ordered = [names[id(p)] for group in self.optimizer.param_groups for p in group["params"]]
-        values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": values})
+        state = TrainedState(self.learner.state_dict(), named_state(self.learner, self.optimizer))
+        self.run.save(name, self.learner, state, self.progress)
 
     def _log(self, metrics: Metrics) -> None:
         self.run.append(METRICS_FILE, {**self._place(), **metrics})
@@ -207,8 +198,8 @@ def _settings(config: DetectorTrainingConfig, learner: DetectorLearner) -> dict[
     values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
     if config.init is not None:
         values["init"] = str(config.init)
-    index = hashlib.blake2b((config.data / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
-    return {"training": values, "demonstrations": {"index": index}, "detector": learner.description()}
+    demonstrations = {"index": index_hash(config.data)}
+    return {"training": values, "demonstrations": demonstrations, "detector": learner.description()}
 
 
 def _device(name: str) -> torch.device:
