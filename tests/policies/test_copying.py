@@ -63,6 +63,7 @@ def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
         prompt_masks_BM=torch.ones(batch, M, dtype=torch.bool),
         prompt_appearance_BMA=looks(batch, M),
         recollection=Recollection(remembered(NUM_FIRST), remembered(NUM_SCENE), torch.arange(T)),
+        previous_BTC=drawn(batch, T, 12) * (torch.arange(T) > 0)[:, None],
     )
 
 

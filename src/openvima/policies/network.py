@@ -262,7 +262,8 @@ class PolicyNetwork(nn.Module):
             PolicyError: Prompt or history is longer than the trunk takes.
         """
         previous = self._action_places(previous_BTC, has_previous_BT, features_KF.dtype)
-        return self._read_steps(memory, state, history, features_KF, before=previous)
+        inputs, state = self._read_steps(memory, state, history, features_KF, before=previous)
+        return replace(inputs, previous_BTC=previous_BTC * has_previous_BT[..., None]), state
 
     def decide(self, inputs: HeadInputs, state: HistoryState, choose: Choose = likeliest) -> torch.Tensor:
         """Decide on the action of the step that was read last.

@@ -24,7 +24,7 @@ from openvima.training.turning import joint_loss, mirrored, shifted, turn_accura
 
 Metrics = dict[str, float]
 CHUNK = 64  # demonstrations whose images are encoded together
-MAX_FEATURES = 500_000  # images that are encoded once and kept, rather than in every step
+MAX_FEATURES = 2_000_000  # images that are encoded once and kept, rather than in every step
 
 
 class Stage(Protocol):

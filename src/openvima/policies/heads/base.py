@@ -112,6 +112,8 @@ class HeadInputs:
         components_BTCD: Output of the decoder from which each component of the step's action is told, given
             those before it. Only with a token for each component, and where whole histories are read.
         recollection: What was seen elsewhere and before. Only with a head that copies places.
+        previous_BTC: The action before each step, metres and quaternions; zero where there was none. Not with
+            a token for each component.
     """
 
     query_BTD: torch.Tensor
@@ -126,6 +128,7 @@ class HeadInputs:
     prompt_appearance_BMA: torch.Tensor
     components_BTCD: torch.Tensor | None = None
     recollection: Recollection | None = None
+    previous_BTC: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

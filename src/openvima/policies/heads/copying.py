@@ -55,6 +55,7 @@ from openvima.policies.heads.pointing import (
 )
 from openvima.policies.layers.mlp import mlp
 
+_FAR = 10.0  # in units of offsets; beyond it, distances count as this
 _SURE = 5.0  # score of a turn that is seen without doubt, before the network learns how much it counts
 
 
@@ -106,7 +107,7 @@ class CopyingHead(ActionHead):
         super().__init__()
         self.config = config
         self.shown_turn = ShownTurn(width) if turn_bins == config.num_yaw_bins else None
-        self.pick = Pointer(width)
+        self.pick = PickPointer(config, width)
         self.place = PlacePointer(config, width)
         self.free = FreePoints(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
@@ -209,6 +210,31 @@ class CopyingHead(ActionHead):
         """Add the free points to what may be copied."""
         kept = recollection_of(inputs)
         return replace(inputs, recollection=replace(kept, free=self.free(kept.first)))
+
+
+class PickPointer(Pointer):
+    """A pointer that also knows how objects lie to where the last one was picked, and put.
+
+    "… then put the object that was previously at its {direction} into the same {container}."
+    """
+
+    def __init__(self, config: CopyingConfig, width: int) -> None:
+        super().__init__(width)
+        self.lying = mlp((7, config.hidden_width, width))
+
+    def keys(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return what is known of the objects and of how they lie, (B, T, N, D)."""
+        keys_BTND, previous_BTC = super().keys(inputs), inputs.previous_BTC
+        assert previous_BTC is not None  # the network tells heads that copy
+        has_previous_BT1 = (previous_BTC != 0).any(dim=-1)[..., None, None]
+        apart = []
+        for start in (0, 6):
+            vector_BTN2 = inputs.positions_BTN2 - previous_BTC[..., None, start : start + 2]
+            vector_BTN2 = (vector_BTN2 / OFFSET_UNIT_M).clamp(-_FAR, _FAR)
+            apart += [vector_BTN2, vector_BTN2.norm(dim=-1, keepdim=True)]
+        is_there_BTN1 = torch.ones_like(apart[1])
+        lies_BTNG = torch.cat([*apart, is_there_BTN1], dim=-1) * has_previous_BT1
+        return keys_BTND + self.lying(lies_BTNG.to(keys_BTND.dtype))
 
 
 class ShownTurn(nn.Module):

@@ -155,8 +155,8 @@ class Pointer(nn.Module):
     def forward(self, inputs: HeadInputs) -> torch.Tensor:
         """Return scores, shape (B, T, N); objects that do not exist score the most negative number."""
         scale = inputs.query_BTD.shape[-1] ** -0.5
-        query_BTD, key_BTND = self.query(inputs.query_BTD), self.key(inputs.objects_BTND)
-        scores_BTN = torch.einsum("btd,btnd->btn", query_BTD, key_BTND) * scale
+        query_BTD = self.query(inputs.query_BTD)
+        scores_BTN = torch.einsum("btd,btnd->btn", query_BTD, self.keys(inputs)) * scale
         hidden = torch.finfo(scores_BTN.dtype).min
         if inputs.prompt_BMD.shape[1]:
             asked_BTM = self.prompt_query(inputs.query_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
@@ -165,6 +165,10 @@ class Pointer(nn.Module):
             similarity_BTN = torch.einsum("btna,bta->btn", inputs.appearance_BTNA, look_BTA)
             scores_BTN = scores_BTN + F.softplus(self.sharpness(inputs.query_BTD)) * similarity_BTN
         return scores_BTN.masked_fill(~inputs.masks_BTN, hidden)
+
+    def keys(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return what the query is compared with, (B, T, N, D)."""
+        return self.key(inputs.objects_BTND)
 
 
 def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
