@@ -1,0 +1,185 @@
+"""What the parts of the preset `small` are worth, and what more demonstrations are.
+
+    python benchmarks/small_ablations.py --data train400 --crops crops --out ablations --only full,no-comparison
+
+Every variant is trained with the same number of steps, then plays the same evaluation episodes. Those that match
+looks begin with the crop encoder of the run `--crops`, which stays as it is; so differences are those of cloning.
+Repeating a command continues it.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load_file
+
+from openvima.cli.progress import progress_bar
+from openvima.data import Dataset
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.files import write_whole
+from openvima.policies.base import WEIGHTS_FILE, find_checkpoint
+from openvima.policies.checkpoint import save_checkpoint
+from openvima.policies.config import PolicyConfig
+from openvima.policies.families.common import SIZES
+from openvima.policies.families.vima import vima
+from openvima.policies.heads.pointing import PointingConfig
+from openvima.policies.layers.object_encoder import ObjectEncoderConfig
+from openvima.policies.layers.text_encoder import TextEncoderConfig
+from openvima.policies.network import build_network
+from openvima.policies.presets import PRESETS, small
+from openvima.training import TrainingConfig, train
+
+_CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
+_SETTINGS = {
+    "learning_rate": 7e-4,
+    "warmup_steps": 100,
+    "motion_share": 0.12,
+    "validation_share": 0.02,
+    "validation_episodes": 500,
+    "tensorboard": False,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A network and how it is trained.
+
+    Args:
+        what: In a few words.
+        sizes: Makes the network's sizes.
+        settings: Settings of training that differ.
+        crops: Whether it begins with crops that have been matched.
+    """
+
+    what: str
+    sizes: Callable[[], PolicyConfig] = small
+    settings: dict[str, Any] = field(default_factory=dict)  # Any: as in `TrainingConfig`
+    crops: bool = True
+
+
+def _without_turns() -> PolicyConfig:
+    config = small()
+    assert isinstance(config.images, ObjectEncoderConfig)
+    return replace(config, images=replace(config.images, turn_bins=0))
+
+
+def _with_dropout(share: float) -> PolicyConfig:
+    config = small()
+    assert isinstance(config.images, ObjectEncoderConfig)
+    return replace(config, images=replace(config.images, crop_dropout=share))
+
+
+def _vima() -> PolicyConfig:
+    """VIMA with as many parameters as `small`, and its text encoder."""
+    text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
+    nano = SIZES["nano"]
+    prompt = replace(nano.prompt, text=text, image_width=192)
+    return vima(
+        replace(nano, width=192, num_layers=4, num_heads=6, image_width=160, image_heads=5, prompt=prompt)
+    )
+
+
+VARIANTS = {
+    "full": Variant("the preset as it is"),
+    "pointing": Variant(
+        "pointing head: places only beside objects in view",
+        lambda: replace(small(), head=PointingConfig()),
+    ),
+    "no-comparison": Variant(
+        "objects are not compared with those of the prompt, nor with each other",
+        lambda: replace(small(), comparison=None),
+    ),
+    "no-turns": Variant("turns between two images are not estimated", _without_turns),
+    "no-motions": Variant("no demonstrations as motions", settings={"motion_share": 0.0}),
+    "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
+    "vima": Variant(
+        "VIMA's architecture, table bins, vision transformer trained along",
+        _vima,
+        {"learning_rate": 5e-4, "motion_share": 0.0},
+        crops=False,
+    ),
+}
+
+
+def main() -> int:
+    """Train and score what is asked for, one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
+    parser.add_argument("--crops", type=Path, required=True, help="run of `small` that has matched looks")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", default=",".join(VARIANTS), help="variants, with commas in between")
+    parser.add_argument("--name", default="", help="name in the table, instead of the variant's")
+    parser.add_argument("--what", default="", help="what it is, in a few words, instead of the variant's")
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--episodes", type=int, default=40, help="for each task and level")
+    parser.add_argument("--levels", default="L1,L3,L4")
+    given = parser.parse_args()
+    for name in given.only.split(","):
+        if name not in VARIANTS:
+            parser.error(f"there is no variant {name!r}; allowed: {', '.join(VARIANTS)}.")
+    for name in given.only.split(","):
+        row = _measure(given, name)
+        write_whole(given.out / f"{row['name']}.json", json.dumps(row, indent=2) + "\n")
+        print(row)
+    return 0
+
+
+def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: plain JSON values
+    variant, folder = VARIANTS[name], given.out / (given.name or name)
+    preset = f"small-{name}"
+    PRESETS[preset] = variant.sizes
+    settings = {**_SETTINGS, **variant.settings}
+    if variant.crops:
+        settings |= {"init": str(_begin(variant.sizes(), given.crops, folder / "init"))}
+    else:
+        settings |= {"pretraining_steps": 0}
+    config = TrainingConfig(
+        data=given.data,
+        out=folder / "run",
+        preset=preset,
+        steps=given.steps,
+        checkpoint_every=min(200, given.steps),
+        **settings,
+    )
+    started = time.process_time()
+    with progress_bar(f"training {name}") as report:
+        run = train(config, report)
+    minutes = (time.process_time() - started) / 60
+    evaluation = EvaluationConfig(
+        policies=(f"{given.name or name}={run}",),
+        levels=tuple(given.levels.split(",")),
+        episodes=given.episodes,
+        workers=1,
+        out=folder / "evaluation",
+        report=False,
+    )
+    with progress_bar(f"evaluation of {name}") as report:
+        evaluate(evaluation, report)
+    return {
+        "name": given.name or name,
+        "what": given.what or variant.what,
+        "demonstrations": len(Dataset(given.data)),
+        "steps": given.steps,
+        "parameters": sum(p.numel() for p in build_network(variant.sizes(), seed=0).parameters()),
+        "minutes": round(minutes, 1),
+        "evaluation": os.fspath(folder / "evaluation" / "results.json"),
+    }
+
+
+def _begin(sizes: PolicyConfig, crops: Path, folder: Path) -> Path:
+    """Write fresh weights with the crop encoder of another run, to begin with."""
+    network = build_network(sizes, seed=0)
+    own, other = network.state_dict(), load_file(find_checkpoint(str(crops)) / WEIGHTS_FILE)
+    matched = {name: other[name] for name in own if name.startswith(_CROPS)}
+    network.load_state_dict({**own, **matched})
+    save_checkpoint(network, folder)
+    return folder
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
