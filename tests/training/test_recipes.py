@@ -1,5 +1,6 @@
 """Named settings, files of settings, and what the command line makes of them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ pytest.importorskip("torch")
 from openvima.cli.main import main
 from openvima.errors import ConfigError
 from openvima.training import TrainingConfig
+from openvima.training.building import resolved
 from openvima.training.recipes import (
     RECIPES,
     default_recipe,
@@ -44,8 +46,9 @@ def test_the_paper_recipe_is_that_of_the_paper() -> None:
     assert (config.batch, config.epochs, config.spurious_probability) == (128, 10, 0.05)
 
 
-def test_small_presets_and_own_learners_have_the_small_recipe() -> None:
+def test_nano_presets_and_own_learners_have_the_recipe_of_minutes() -> None:
     assert default_recipe("vima-nano") == default_recipe("mine:learner") == "nano"
+    assert default_recipe("small:learner") == default_recipe("nano-bins") == "nano"
     assert default_recipe("vima-20m") == default_recipe(None) == "paper"
     with pytest.raises(ConfigError, match="Did you mean 'paper'"):
         recipe_settings("papper")
@@ -68,6 +71,36 @@ def test_the_preset_decides_on_the_recipe(trained) -> None:
     assert [config.preset for config in trained] == ["nano", "vima-20m"]
     assert main(["train", "--data", "demos", "--out", "run"]) == 0
     assert trained[-1] == trained[0]
+
+
+def test_the_small_policy_is_trained_by_one_command(trained) -> None:
+    assert default_recipe("small") == "small"
+    for words in (["--preset", "small"], ["--recipe", "small"], ["--recipe", "small", "--steps", "9"]):
+        assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
+    first, second, third = (resolved(config) for config in trained)
+    assert first == second == replace(third, steps=first.steps)
+    assert (first.preset, first.pretraining_steps, first.steps, third.steps) == ("small", 3000, 4000, 9)
+
+
+def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for(trained, tmp_path) -> None:
+    of_a_run, of_its_own = tmp_path / "config.yaml", tmp_path / "mine.yaml"
+    of_a_run.write_text("{training: {preset: small, pretraining_steps: 3000}}")
+    of_its_own.write_text("{preset: small, init: other, pretraining_steps: 7}")
+    without = tmp_path / "without.yaml"
+    without.write_text("{preset: small, init: other}")
+    init = ["--init", "other"]
+    for words, expected in (
+        (["--preset", "small", *init], 0),
+        (["--preset", "nano", *init], 0),
+        (["--preset", "small", *init, "--pretraining-steps", "5"], 5),
+        (["--config", str(of_a_run), *init], 0),
+        (["--config", str(of_its_own)], 7),
+        (["--config", str(of_its_own), *init], 0),
+        (["--config", str(without)], 0),
+        (["--preset", "small", "--init", "None"], 3000),
+    ):
+        assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
+        assert resolved(trained[-1]).pretraining_steps == expected, words
 
 
 def test_the_settings_of_another_run_can_be_taken(trained, tmp_path) -> None:

@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """Train a policy on demonstrations, or go on with a run that was interrupted.
 
-The whole policy learns by behaviour cloning. Before that, with nano and nano-bins, the crop encoder learns to
-match objects in prompt images with objects in scenes drawn for that. The same command continues an
+The whole policy learns by behaviour cloning. Before that, with nano, nano-bins and small, the crop encoder
+learns to match objects in prompt images with objects in scenes drawn for that. The same command continues an
 interrupted run exactly where its last checkpoint stands.
 
 Example: openvima train --data demos --preset nano --out run
 
 --recipe names settings to begin with: "paper" trains as the VIMA paper does, "workstation" on one GPU with
-less data, "nano" on a few cores; by default "nano" for small presets and "paper" for the published sizes.
+less data, "nano" for minutes on a few cores, "small" as the policy of the package was trained. By default it
+is "small" for the preset of that name, "nano" for nano presets and learners of your own, else "paper". With
+--init no recipe or file brings pretraining; --pretraining-steps does.
 --config takes a YAML file of settings, such as the config.yaml of another run. What is given here counts
 most. The defaults below are those of the recipe and file that were chosen.
 
@@ -50,7 +52,7 @@ def run(words: Sequence[str]) -> int:
     basis.add_argument("--config", type=Path)
     begun, rest = basis.parse_known_args(list(words))
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("--preset", "--steps", "--epochs"):
+    for name in ("--preset", "--init", "--steps", "--epochs"):
         peek.add_argument(name)
     known, _ = peek.parse_known_args(rest)
     file = read_settings(begun.config) if begun.config else {}
@@ -59,6 +61,8 @@ def run(words: Sequence[str]) -> int:
     settings = overridden(recipe_settings(recipe), file)
     if known.steps and not known.epochs:
         settings["epochs"] = None
+    if known.init not in (None, "None"):
+        settings = overridden(settings, {"init": known.init})
     given = {name: settings.get(name, tyro.MISSING) for name in ("data", "out")}
     others = {name: value for name, value in settings.items() if name not in given}
     if preset:

@@ -61,14 +61,35 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
+        # What made the policy that comes with the package; docs/training.md has its cost.
+        "small": {
+            "preset": "small",
+            "pretraining_steps": 3000,
+            "pretraining_scenes": 6000,
+            "pretraining_random_looks": 0.4,
+            "pretraining_twins": 0.4,
+            "pretraining_box_shift": 1.0,
+            "steps": 4000,
+            "learning_rate": 7e-4,
+            "warmup_steps": 100,
+            "motion_share": 0.12,
+            "validation_share": 0.02,
+            "validation_episodes": 500,
+            "checkpoint_every": 250,
+        },
     }
 )
-_SMALL = ("nano", "small")  # parts of the names of the small presets
 
 
 def default_recipe(preset: str | None) -> str:
-    """Return the recipe for a preset: "nano" for small networks and those of your own, else "paper"."""
-    return "nano" if preset and any(part in preset for part in (*_SMALL, ":")) else "paper"
+    """Return the recipe for a preset.
+
+    Returns:
+        "small" for "small", "nano" for all nano networks and those of your own, else "paper".
+    """
+    if preset == "small":
+        return preset
+    return "nano" if preset and any(part in preset for part in ("nano", ":")) else "paper"
 
 
 def recipe_settings(name: str) -> dict[str, Any]:
@@ -110,9 +131,14 @@ def read_settings(file: Path) -> dict[str, Any]:
 
 
 def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Put other settings over some; steps among them replace the epochs of a recipe."""
+    """Put other settings over some.
+
+    Steps among them replace the epochs of a recipe; and weights to begin with bring a crop encoder along, so
+    that pretraining is left to the preset, which then has none, unless they set it as well.
+    """
     length = {"epochs": None} if "steps" in others else {}
-    return {**settings, **length, **others}
+    matching = {"pretraining_steps": None} if others.get("init") else {}
+    return {**settings, **length, **matching, **others}
 
 
 def _converted(value: Any, kinds: tuple[Any, ...]) -> Any:  # Any: what YAML holds, and types
