@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +25,7 @@ def info(
     details: bool = False,
     html: Path | None = None,
     samples: int = 3,
+    looks: Path | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Show what a folder of demonstrations holds: counts, sizes, histograms, and what made it.
@@ -35,6 +37,8 @@ def info(
         details: Count objects, textures and prompt images too, for which every file is read.
         html: Write a page with all of this and episodes to look at; it needs nothing else.
         samples: Episodes of each task on that page.
+        looks: Write which objects are shown in which textures, by task and role, to this JSON file, and say
+            whether that goes beyond the training partition; every file is read.
         as_json: Print everything for machines.
 
     Returns:
@@ -47,13 +51,15 @@ def info(
         raise ConfigError(f"--html is {str(html)!r}; give the name of an HTML file, such as demos.html.")
     with progress_bar("files") if details or html else contextlib.nullcontext() as report:
         overview = look_at(folder, details=details or html is not None, report=report)
-    if html is not None:
-        if isinstance(overview, Unfinished):
-            raise DatasetError(f"{folder} is not finished; repeat the command that writes it.")
+    if isinstance(overview, Unfinished) and (html is not None or looks is not None):
+        raise DatasetError(f"{folder} is not finished; repeat the command that writes it.")
+    if html is not None and not isinstance(overview, Unfinished):
         from openvima.data.page import write_page
 
         with progress_bar("episodes") as report:
             write_page(overview, html, num_samples=samples, report=report)
+    if looks is not None:
+        _write_looks(folder, looks)
     if as_json:
         print(json.dumps(overview.to_record(), indent=2, ensure_ascii=False))
     elif isinstance(overview, Unfinished):
@@ -61,6 +67,25 @@ def info(
     else:
         print("\n".join([*_summary(overview), *_hints(details or html is not None, html)]))
     return 0
+
+
+def _write_looks(folder: Path, file: Path) -> None:
+    """Write which looks there are, and say on standard error whether training may show them."""
+    from openvima.data.looks import looks_record, looks_text
+    from openvima.data.reader import Dataset
+    from openvima.data.unseen import beyond_training
+    from openvima.files import write_whole
+
+    with progress_bar("files") as report:
+        record = looks_record(Dataset(folder), report)
+    write_whole(file, looks_text(record))
+    problems = beyond_training(record)
+    for problem in problems[:_NUM_AT_END]:
+        print(f"beyond the training partition: {problem}", file=sys.stderr)
+    if len(problems) > _NUM_AT_END:
+        print(f"… and {len(problems) - _NUM_AT_END:,} more", file=sys.stderr)
+    if not problems:
+        print(f"{file}: nothing is beyond the training partition", file=sys.stderr)
 
 
 def _summary(overview: "Overview") -> Iterator[str]:
