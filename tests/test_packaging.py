@@ -9,30 +9,35 @@ import pytest
 import openvima
 
 ROOT = Path(__file__).parents[1]
+POLICY_FILES = {"model.safetensors", "config.yaml", "MODEL_CARD.md", "training_data.json"}
+TRAINED = {
+    *(f"openvima/detection/trained/{name}" for name in ("model.safetensors", "config.yaml")),
+    *(f"openvima/policies/trained/openvima-small/{name}" for name in POLICY_FILES),
+}
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """The project with little code, and with a trained detector in it."""
+    """The project with little code, and with a trained detector and a trained policy in it."""
     pytest.importorskip("hatchling", reason="hatchling builds the wheels")
     for name in ("pyproject.toml", "README.md", "LICENSE", ".gitignore"):
         shutil.copy(ROOT / name, tmp_path / name)
-    package, trained = tmp_path / "src" / "openvima", tmp_path / "src" / "openvima" / "detection" / "trained"
-    trained.mkdir(parents=True)
+    package = tmp_path / "src" / "openvima"
+    for file in TRAINED:
+        path = package.parent / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("weights")
     shutil.copy(Path(openvima.__file__), package)
-    for name in ("model.safetensors", "config.yaml"):
-        (trained / name).write_text("weights")
     return tmp_path
 
 
-def test_a_wheel_holds_the_trained_detector(project: Path, tmp_path: Path) -> None:
+def test_a_wheel_holds_the_trained_detector_and_policy(project: Path, tmp_path: Path) -> None:
     from hatchling.builders.wheel import WheelBuilder
 
     (wheel,) = WheelBuilder(str(project)).build(directory=str(tmp_path / "dist"), versions=["standard"])
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    trained = {f"openvima/detection/trained/{name}" for name in ("model.safetensors", "config.yaml")}
-    assert trained <= names
+    assert names >= TRAINED
 
 
 def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
@@ -42,3 +47,14 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
     assert {file.name for file in PACKAGED.iterdir()} == {"model.safetensors", "config.yaml"}
     assert sum(file.stat().st_size for file in PACKAGED.iterdir()) <= 8e6
     assert load_detector().network.config
+
+
+def test_the_policy_in_the_package_is_small_and_whole() -> None:
+    from openvima.policies.packaged import PACKAGED, SMALL
+
+    policy = PACKAGED[SMALL]
+    if not policy.is_here:
+        pytest.skip(f"{policy.folder} holds no weights yet")
+    assert {file.name for file in policy.folder.iterdir()} == POLICY_FILES
+    assert sum(file.stat().st_size for file in policy.folder.iterdir()) <= 20e6
+    assert "TODO" not in policy.model_card.read_text(encoding="utf-8")

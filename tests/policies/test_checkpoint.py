@@ -104,9 +104,36 @@ def test_weights_are_stored_in_float32_unless_asked(dtype, small_sizes, tmp_path
         assert torch.equal(plain.state_dict()[name], tensor.float())
 
 
+def test_float16_is_for_files_only_and_read_as_float32(small_sizes, tmp_path) -> None:
+    model = build_network(small_sizes, seed=0)
+    save_checkpoint(model, tmp_path / "half", dtype=torch.float16)
+    stored = load_file(tmp_path / "half" / WEIGHTS_FILE)
+    assert {tensor.dtype for tensor in stored.values()} == {torch.float16}
+    loaded = load_checkpoint(tmp_path / "half")
+    assert {tensor.dtype for tensor in [*loaded.parameters(), *loaded.buffers()]} == {torch.float32}
+    for name, tensor in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor.half().float())
+    constants = dict(loaded.named_buffers())  # those that no file holds are not rounded
+    assert all(
+        torch.equal(constants[name], buffer) for name, buffer in model.named_buffers() if name not in stored
+    )
+
+
+def test_weights_beyond_the_range_of_float16_are_not_written(small_sizes, tmp_path) -> None:
+    model = build_network(small_sizes, seed=0)
+    with torch.no_grad():
+        model.observation_out.weight[0, 0] = -7e4
+    with pytest.raises(
+        CheckpointError, match=r"beyond 6\.55e\+04, the most that float16 holds: observation_out"
+    ):
+        save_checkpoint(model, tmp_path / "checkpoint", dtype=torch.float16)
+    assert not list(tmp_path.iterdir())
+    save_checkpoint(model, tmp_path / "checkpoint")
+
+
 def test_a_precision_that_is_not_read_is_not_written(small_sizes, tmp_path) -> None:
-    with pytest.raises(CheckpointError, match="in float16; allowed: float32, bfloat16, float64"):
-        save_checkpoint(build_network(small_sizes, seed=0), tmp_path / "checkpoint", dtype=torch.float16)
+    with pytest.raises(CheckpointError, match="in float8_e5m2; allowed: float32, bfloat16, float16, float64"):
+        save_checkpoint(build_network(small_sizes, seed=0), tmp_path / "checkpoint", dtype=torch.float8_e5m2)
     assert not list(tmp_path.iterdir())
 
 

@@ -52,9 +52,10 @@ def main(
     Example: openvima evaluate --policy mine=runs/first --controls all --levels L1,L2 --workers 2
 
     Args:
-        policy: One or more of oracle, random, untrained, presets, folders of training runs, published files,
-            ids on the Hugging Face Hub and policy servers (ws://HOST:PORT, see `openvima serve`), with commas
-            in between; NAME=FOLDER and NAME=ws://… give another name.
+        policy: One or more of openvima-small (trained, comes with the package), oracle, random, untrained,
+            presets, folders of training runs, published files, ids on the Hugging Face Hub and policy servers
+            (ws://HOST:PORT, see `openvima serve`), with commas in between; NAME=FOLDER and NAME=ws://… give
+            another name.
         tasks: Names of tasks with commas in between, or all. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level; 200 as in published tables.

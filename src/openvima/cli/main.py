@@ -16,7 +16,7 @@ VERBS = {
     "generate": "write demonstrations with the oracle",
     "data": "look into demonstrations, check, convert, divide or export them",
     "assets": "show all objects and textures, or import those of the original benchmark",
-    "policies": "list the named networks and their sizes, or convert published files",
+    "policies": "list networks and trained policies, convert or export checkpoints",
     "train": "train a policy on demonstrations",
     "detector": "train and score the detector that finds objects in pixels",
     "evaluate": "score policies on levels L1 to L4",

@@ -1,17 +1,19 @@
-"""`openvima policies`: list the named networks, look at one, and convert published files."""
+"""`openvima policies`: list networks and trained policies, look at one, and convert or export checkpoints."""
 
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
+    from openvima.policies.packaged import PackagedPolicy
     from openvima.policies.sizes import PolicySize
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
+Precision = Literal["float32", "bfloat16", "float16", "float64"]
 FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
@@ -22,7 +24,7 @@ DEFAULT = "list"  # what `openvima policies` does without a further word
 
 
 def list_(*, as_json: Json = False) -> int:
-    """List the named networks with their parameters, part by part.
+    """List the named networks with their parameters, part by part, and the trained policies of the package.
 
     Example: openvima policies
 
@@ -33,16 +35,26 @@ def list_(*, as_json: Json = False) -> int:
         Exit status.
     """
     from openvima.policies.base import require_torch
+    from openvima.policies.packaged import PACKAGED
     from openvima.policies.presets import PRESETS, preset
 
     require_torch("counting parameters")
+    from openvima.policies.checkpoint import read_info
     from openvima.policies.sizes import policy_size
 
     sizes = {name: policy_size(preset(name)) for name in PRESETS}
+    here = {name: policy for name, policy in PACKAGED.items() if policy.is_here}
+    trained = {name: policy_size(read_info(policy.folder).config) for name, policy in here.items()}
     if as_json:
-        print(json.dumps([{"name": name, **_record(size)} for name, size in sizes.items()], indent=1))
-    else:
-        _print_table(sizes)
+        records = [{"name": name, **_record(size)} for name, size in sizes.items()]
+        records += [{"name": name, **_record(trained[name]), **_facts(here[name])} for name in here]
+        print(json.dumps(records, indent=1))
+        return 0
+    _print_table(sizes)
+    for name, policy in here.items():
+        parameters = _millions(trained[name].whole.total)
+        print(f"\n{name}, a trained policy that comes with the package, {parameters} M parameters")
+        _print_facts(policy)
     return 0
 
 
@@ -54,27 +66,31 @@ def show(
     Example: openvima policies show vima-200m
 
     Args:
-        policy: Name of a preset, a run folder or checkpoint folder, a published file, or an id on the Hugging
-            Face Hub.
+        policy: Name of a preset or of a trained policy of the package, a run folder or checkpoint folder, a
+            published file, or an id on the Hugging Face Hub.
         as_json: Print JSON.
 
     Returns:
         Exit status.
     """
     from openvima.policies.base import require_torch
+    from openvima.policies.packaged import PACKAGED
 
     require_torch("counting parameters")
     from openvima.policies.sizes import policy_size
 
-    config = _config(policy)
+    config, packaged = _config(policy), PACKAGED.get(policy)
     size = policy_size(config)
     if as_json:
-        print(json.dumps({"name": policy, **_record(size), "config": config.to_dict()}, indent=1))
+        facts = _facts(packaged) if packaged else {}
+        print(json.dumps({"name": policy, **_record(size), **facts, "config": config.to_dict()}, indent=1))
         return 0
     import yaml
 
-    print(f"{policy}: {_summary(size)}\n")
-    print(f"{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
+    print(f"{policy}: {_summary(size)}")
+    if packaged:
+        _print_facts(packaged)
+    print(f"\n{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
     for part, count in {**size.parts, "total": size.whole}.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
     print(f"\n{yaml.safe_dump(config.to_dict(), sort_keys=False)}", end="")
@@ -82,22 +98,28 @@ def show(
 
 
 def convert(
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")],
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="IN")],
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")],
     *,
     tokenizer: str | None = None,
+    precision: Precision = "float32",
     force: bool = False,
 ) -> int:
-    """Convert a published .ckpt file into a checkpoint folder; nothing in the file is executed.
+    """Convert a published .ckpt file, or export the best checkpoint of a run, into a checkpoint folder.
 
-    With a folder instead of a file, add a tokenizer to a checkpoint.
+    Nothing in a file is executed. With a checkpoint folder as IN, add a tokenizer, or change the precision of
+    the stored weights.
 
-    Example: openvima policies convert 200M.ckpt published-200m --tokenizer t5-base
+    Examples: openvima policies convert 200M.ckpt published-200m --tokenizer t5-base;
+    openvima policies convert runs/first mine --precision float16
 
     Args:
-        source: Published file, such as 200M.ckpt, or a checkpoint folder.
+        source: Published file, such as 200M.ckpt, a run folder, of which the best checkpoint is taken, a
+            checkpoint folder, or a trained policy of the package.
         out: Folder to write to; every `--policy` takes it.
         tokenizer: Folder of the tokenizer of T5, or its id on the Hugging Face Hub; stored with the policy.
+        precision: Of the stored weights, whatever the policy computes in later. float16 halves a file of
+            float32 and rounds weights by a part in 2,000; it is computed with in float64 or float32.
         force: Replace a checkpoint that is there.
 
     Returns:
@@ -116,7 +138,9 @@ def convert(
     network, stored = load_network(source)
     found = tokenizer or stored
     reader = tokenizer_for(network.config.prompt, found) if found else None
-    save_checkpoint(network, out, reader)
+    import torch
+
+    save_checkpoint(network, out, reader, dtype=getattr(torch, precision))
     print(f"{source}: {_summary(policy_size(network.config))}")
     print(out)
     if network.config.prompt.tokenizer == "t5" and not found:
@@ -132,14 +156,12 @@ def _config(policy: str) -> "PolicyConfig":
 
     if policy in PRESETS:
         return preset(policy)
-    from openvima.errors import UnknownPolicyError, unknown_name
-    from openvima.policies.base import find_checkpoint
+    from openvima.errors import UnknownPolicyError
+    from openvima.policies.base import find_checkpoint, is_policy_source, unknown_policy
     from openvima.policies.checkpoint import load_network, read_info
-    from openvima.policies.hub import is_hub_id
 
-    if not (Path(policy).exists() or is_hub_id(policy)):
-        hint = "`openvima policies` lists all of them; folders of training runs can be shown, too."
-        raise UnknownPolicyError(unknown_name("policy", policy, PRESETS, hint))
+    if not is_policy_source(policy):
+        raise UnknownPolicyError(unknown_policy(policy, ()))
     found = find_checkpoint(policy)
     return read_info(found).config if found.is_dir() else load_network(found)[0].config
 
@@ -151,6 +173,20 @@ def _summary(size: "PolicySize") -> str:
         f"{size.family}, width {size.width}, {layers}, {size.num_heads} heads; "
         f"{_millions(whole.total)} M parameters, of which {_millions(whole.trainable)} M are trained"
     )
+
+
+def _facts(policy: "PackagedPolicy") -> dict[str, object]:
+    return {
+        "bytes": policy.weights.stat().st_size,
+        "trained_on": policy.trained_on,
+        "model_card": str(policy.model_card),
+    }
+
+
+def _print_facts(policy: "PackagedPolicy") -> None:
+    print(f"  weights:     {policy.weights.stat().st_size / 1e6:.1f} MB")
+    print(f"  trained on:  {policy.trained_on}")
+    print(f"  model card:  {policy.model_card}")
 
 
 def _record(size: "PolicySize") -> dict[str, object]:

@@ -30,8 +30,8 @@ def main(
     Example: openvima serve runs/first --port 8000
 
     Args:
-        policy: The folder of a training run, a published file, an id on the Hugging Face Hub, a preset,
-            random or untrained.
+        policy: openvima-small (trained, comes with the package), the folder of a training run, a published
+            file, an id on the Hugging Face Hub, a preset, random or untrained.
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token.
         token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,

@@ -19,6 +19,7 @@ from openvima.evaluation.protocol import (
 )
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import PolicySource
+from openvima.policies.packaged import PACKAGED
 from openvima.processes import in_processes
 
 REPORT_NAME = "report.html"
@@ -199,6 +200,8 @@ def command_of(config: EvaluationConfig) -> str:
 def find_metrics(sources: Sequence[PolicySource]) -> Path | None:
     """The training record of the first trained policy that has one."""
     for source in sources:
+        if source.source in PACKAGED:  # a name and no place: what lies here is of something else
+            continue
         folder = Path(source.source)
         for candidate in (folder / _METRICS, folder.parent / _METRICS, folder.parent.parent / _METRICS):
             if source.kind == "run" and candidate.is_file():

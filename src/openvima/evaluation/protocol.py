@@ -18,6 +18,7 @@ from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.evaluation.controls import CONTROLS, DETECTED_BOXES, IN_CONTEXT
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
+from openvima.policies.packaged import PACKAGED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
@@ -34,10 +35,10 @@ class EvaluationConfig:
     """What to evaluate, and how.
 
     Args:
-        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: a preset, a run
-            folder, a published file, an id on the Hugging Face Hub; or the address of a policy server such as
-            "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by default it has
-            its own.
+        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
+            preset, a run folder, a published file, an id on the Hugging Face Hub; or the address of a policy
+            server such as "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by
+            default it has its own.
         tasks: Names of tasks, or ("all",) for every task that the level holds.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
@@ -220,7 +221,8 @@ class Batch:
     def with_whole_paths(self) -> "Batch":
         """Return the batch for a process with another working directory."""
         source, assets, boxes = self.source, self.setup.assets, self.boxes
-        if PolicySource(self.policy, source).kind == "run" and Path(source).exists():
+        is_path = PolicySource(self.policy, source).kind == "run" and source not in PACKAGED
+        if is_path and Path(source).exists():
             source = str(Path(source).absolute())
         if assets not in ASSET_PACKS:
             assets = str(Path(assets).expanduser().absolute())

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, unknown_name
-from openvima.policies.base import find_checkpoint
-from openvima.policies.hub import is_hub_id
+from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError
+from openvima.policies.base import find_checkpoint, is_policy_source, unknown_policy
+from openvima.policies.packaged import PACKAGED
 from openvima.policies.presets import PRESETS
 from openvima.serving.client import describe
 from openvima.serving.protocol import is_remote
@@ -27,8 +27,8 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset, what else `load_policy` takes, or the
-            address of a policy server.
+        source: "oracle", "random", "untrained", the name of a preset or of a trained policy of the package,
+            what else `load_policy` takes, or the address of a policy server.
     """
 
     name: str
@@ -48,13 +48,15 @@ class PolicySource:
 
         Raises:
             UnknownPolicyError: There is no such run folder.
-            CheckpointError: The run folder holds no weights.
+            CheckpointError: The run folder, or the package, holds no weights.
+            PolicyError: A folder here is named like a policy of the package and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "run":
-            return {"kind": "run", "sha256": weights_hash(self.source)}
+            where = {"packaged": self.source} if self.source in PACKAGED else {}
+            return {"kind": "run", **where, "sha256": weights_hash(self.source)}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
 
@@ -80,16 +82,14 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
 
 
 def weights_hash(source: str | Path) -> str:
-    """SHA-256 over the weights that a folder, file or id on the Hub stands for, as hexadecimal text.
+    """SHA-256 over the weights that a folder, file, name or id on the Hub stands for, as hexadecimal text.
 
     Raises:
         UnknownPolicyError: There is no such folder or file, and it is not like an id on the Hub.
         CheckpointError: It holds no weights, or the Hub does not give it.
     """
-    if not (Path(source).exists() or is_hub_id(str(source))):
-        known = (*NAMED_POLICIES, *PRESETS)
-        hint = "Give the folder of a training run, a published .ckpt file or a name of `openvima policies`."
-        raise UnknownPolicyError(unknown_name("policy", str(source), known, hint))
+    if not is_policy_source(str(source)):
+        raise UnknownPolicyError(unknown_policy(str(source), NAMED_POLICIES))
     found = find_checkpoint(source)
     files = [found] if found.is_file() else sorted(found.iterdir())
     files = [file for file in files if file.suffix in _WEIGHTS and file.stem != "optimizer"]

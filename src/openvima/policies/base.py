@@ -16,15 +16,17 @@ from openvima.errors import (
     unknown_name,
 )
 from openvima.files import restore_folder
+from openvima.policies.file_names import (
+    BEST_FILE,
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    TOKENIZER_FOLDER,
+    WEIGHTS_FILE,
+)
 from openvima.policies.hub import fetch_from_hub, is_hub_id
+from openvima.policies.packaged import PACKAGED, packaged_folder
 from openvima.policies.presets import PRESETS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
-
-WEIGHTS_FILE = "model.safetensors"
-CONFIG_FILE = "config.yaml"
-TOKENIZER_FOLDER = "tokenizer"
-CHECKPOINTS_FOLDER = "checkpoints"
-BEST_FILE = "best.txt"  # in the checkpoints folder: name of the best one
 
 
 class Policy(Protocol):
@@ -98,9 +100,10 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
     """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
 
     Args:
-        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; a run folder that
-            `openvima train` wrote, of which the best checkpoint is taken; a checkpoint folder; a published
-            `.ckpt` file; or an id on the Hub such as "owner/policy".
+        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; "openvima-small", the
+            trained policy of the package; a run folder that `openvima train` wrote, of which the best
+            checkpoint is taken; a checkpoint folder; a published `.ckpt` file; or an id on the Hub such as
+            "owner/policy".
         seed: Seed of the random policy's draws and of fresh weights.
         **options: Of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy has none
             and leaves them aside.
@@ -112,7 +115,8 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
         UnknownPolicyError: It is neither a name, nor a folder or file, nor like an id on the Hub.
         CheckpointError: The folder or file holds no checkpoint that can be read, or the Hub does not give it.
         PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given; or
-            a preset and a folder have that name.
+            a folder here is named like the preset, or holds a checkpoint and is named like the policy of the
+            package.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
     if name_or_run == "random":
@@ -130,27 +134,49 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
 
         config = preset("nano" if name_or_run == "untrained" else name_or_run)
         return NetworkPolicy(build_network(config, seed=seed), **options)
-    if not (Path(name_or_run).exists() or is_hub_id(name_or_run)):
-        known = ("random", "untrained", *PRESETS)
-        hint = "Give a run folder, a published .ckpt file or a name that `openvima policies` lists."
-        raise UnknownPolicyError(unknown_name("policy", name_or_run, known, hint))
+    if not is_policy_source(name_or_run):
+        raise UnknownPolicyError(unknown_policy(name_or_run, ("random", "untrained")))
     require_torch(f"the policy in {name_or_run}")
     from openvima.policies.checkpoint import load_pretrained
 
     return load_pretrained(name_or_run, **options)
 
 
-def find_checkpoint(path_or_hub_id: str | Path) -> Path:
-    """Find the checkpoint folder, or the published file, that a path or an id on the Hub stands for.
+def is_policy_source(text: str) -> bool:
+    """Whether weights could lie there: a policy of the package, something here, or an id on the Hub."""
+    return text in PACKAGED or Path(text).exists() or is_hub_id(text)
+
+
+def unknown_policy(name: str, others: Sequence[str]) -> str:
+    """Compose the message for something that names no policy.
 
     Args:
-        path_or_hub_id: A run folder, a checkpoint folder, a file, or an id such as "owner/policy"; what is
-            not here but on the Hub is fetched.
+        name: It, as given.
+        others: Names that are allowed besides those of trained policies and presets.
+    """
+    named = (*others, *PACKAGED)
+    hint = (
+        f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
+        "run, a published .ckpt file, or an id owner/name on the Hugging Face Hub."
+    )
+    return unknown_name("policy", name, (*named, *PRESETS), hint)
+
+
+def find_checkpoint(path_or_hub_id: str | Path) -> Path:
+    """Find the checkpoint folder, or the published file, that a path, a name or an id on the Hub stands for.
+
+    Args:
+        path_or_hub_id: A run folder, a checkpoint folder, a file, a trained policy of the package (as text; a
+            `Path` is always a place here), or an id such as "owner/policy"; what is not here but on the Hub
+            is fetched.
 
     Raises:
-        CheckpointError: There is no such path, or the Hub does not give it.
+        CheckpointError: There is no such path, the package lacks the weights, or the Hub does not give them.
+        PolicyError: A folder here is named like a policy of the package and holds a checkpoint, too.
         MissingExtraError: The Hub's client is needed and not installed.
     """
+    if isinstance(path_or_hub_id, str) and path_or_hub_id in PACKAGED:
+        return packaged_folder(path_or_hub_id)
     path, name = Path(path_or_hub_id), str(path_or_hub_id)
     restore_folder(path)
     if path.is_dir():
@@ -160,7 +186,8 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
     if is_hub_id(name):
         return fetch_from_hub(name, (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*"))
     raise CheckpointError(
-        f"there is no checkpoint at {name}; give a folder, a .ckpt file or an id owner/name."
+        f"there is no checkpoint at {name}; give a folder, a .ckpt file, an id owner/name or "
+        f"{', '.join(PACKAGED)}."
     )
 
 

@@ -34,7 +34,13 @@ from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
 _SHOWN = 5  # names of each kind of problem that a message lists
-_PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
+_PRECISIONS = {
+    "float32": torch.float32,
+    "bfloat16": torch.bfloat16,
+    "float16": torch.float16,
+    "float64": torch.float64,
+}
+_READ_AS = {torch.float16: torch.float32}  # float16 is for files only; its range is too narrow to compute in
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +69,13 @@ def save_checkpoint(
         network: The network.
         folder: Where to; it must not exist, be empty, or be a checkpoint.
         tokenizer: Stored beside the weights if it is that of T5.
-        dtype: Precision of the stored weights: float32, bfloat16 or float64, whatever the network computes
-            in.
+        dtype: Precision of the stored weights: float32, bfloat16, float16 or float64, whatever the network
+            computes in. float16 halves a file of float32 and rounds less than bfloat16; such weights are
+            read as float32.
 
     Raises:
-        CheckpointError: The folder holds other files, or there is no such precision.
+        CheckpointError: The folder holds other files, there is no such precision, or a weight is beyond what
+            it can hold.
     """
     folder = Path(folder)
     _refuse_to_delete(folder)
@@ -92,6 +100,7 @@ def write_checkpoint(
         raise CheckpointError(f"weights cannot be stored in {precision}; allowed: {', '.join(_PRECISIONS)}.")
     weights = network.state_dict() if weights is None else weights
     tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
+    _check_range(tensors, weights)
     save_file(tensors, folder / WEIGHTS_FILE)
     values = {
         "policy": _KIND,
@@ -114,7 +123,8 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
         folder: Holds `model.safetensors` and `config.yaml`.
 
     Returns:
-        The network, in the precision of the stored weights and in evaluation mode.
+        The network, in evaluation mode and in the precision of the stored weights, or in float32 if that is
+        float16.
 
     Raises:
         CheckpointError: A file is missing or unreadable, or weights and sizes do not fit.
@@ -125,8 +135,9 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     tensors = _read_weights(folder / WEIGHTS_FILE)
     network = outline_network(info.config)
     _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
-    network.load_state_dict(tensors, assign=True)
-    return network.to(info.dtype).eval()  # constants, too
+    dtype = _READ_AS.get(info.dtype, info.dtype)
+    network.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()}, assign=True)
+    return network.to(dtype).eval()  # constants, too
 
 
 def read_info(folder: Path) -> CheckpointInfo:
@@ -163,8 +174,8 @@ def load_pretrained(
 
     Args:
         path_or_hub_id: A folder that `save_pretrained` or `openvima train` wrote (of a run the best
-            checkpoint is taken), a published `.ckpt` file, or an id on the Hugging Face Hub such as
-            "owner/policy".
+            checkpoint is taken), a published `.ckpt` file, "openvima-small" for the policy of the package, or
+            an id on the Hugging Face Hub such as "owner/policy".
         tokenizer: By default the one that is stored with the policy, or the closed vocabulary where the
             policy was trained with that.
         **options: Of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
@@ -228,6 +239,19 @@ def _check(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
             "Use the config that was written with the weights."
         )
+
+
+def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch.Tensor]) -> None:
+    """Refuse weights that became infinite by being stored; those that were so before are not our business."""
+    beyond = [
+        name
+        for name, tensor in stored.items()
+        if bool((tensor.isinf() & ~weights[name].detach().cpu().isinf()).any())
+    ]
+    if beyond:
+        dtype = stored[beyond[0]].dtype
+        most = f"weights beyond {torch.finfo(dtype).max:.4g}, the most that {described(dtype)} holds"
+        raise CheckpointError(f"{listed(most, beyond, most=_SHOWN)[0]}. Store them in float32.")
 
 
 def _other_size(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:

@@ -102,7 +102,8 @@ def default_command(results: Results) -> str:
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
     """Name a policy for `--policy`; where weights lie is not in the results, so that is left to fill in."""
     kind = what.get("kind")
-    source = what.get("preset") or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
+    named = what.get("preset") or what.get("packaged")
+    source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"
 
 
