@@ -1,15 +1,18 @@
 """How fast the policies decide and learn: on one core, and on a GPU where there is one.
 
-    python benchmarks/policy.py [--quick] [--rounds R] [--json FILE]
+    python benchmarks/policy.py [--quick] [--decisions] [--rounds R] [--json FILE]
 
 Weights are random and words are numbered by a hash; neither changes the time. Observations are those of
-episodes that the oracle plays. The processor computes in float32, as the original does.
+episodes that the oracle plays. The processor computes in float32, as the original does; what one decision of
+a preset takes is measured in float64, too, in which `openvima evaluate` computes.
 
 A decision at history 5 is the fifth of an episode, from images to action. Against it stand reading everything
 anew (the prompt with T5-base, the crops of prompt and all steps, the trunk over all steps), the same with
 equal crops encoded once, and the original's way (prompt and tokens are kept, the trunk reads all steps
 again). None of these three is charged for cutting out crops, which the first one is. Ways take turns; medians
-are reported.
+are reported. Times of one decision are given as processor time as well, which other work on the machine
+lengthens less than that of a clock, and with the 90th percentile over episodes and rounds. `--decisions`
+measures nothing else.
 """
 
 import argparse
@@ -20,6 +23,7 @@ import time
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from copy import deepcopy
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -57,6 +61,7 @@ TRAINING_TASKS = (
 )
 NUM_TRAJECTORIES = 12
 FIRST_SEED = 2_000_000
+DECIDING = ("nano", "small")  # presets, besides the largest, whose single decisions are timed
 PEAK_SIZE = {"cpu": 2048, "cuda": 8192}  # of the square matrices whose product shows what the machine can do
 
 
@@ -245,6 +250,49 @@ def measure_decision(policy: NetworkPolicy, episode: Demonstration, num_rounds: 
     return {f"{name}_s": round(value, 4) for name, value in times.items()} | decision.sizes()
 
 
+def measure_single(
+    name: str, episodes: Sequence[Demonstration], num_rounds: int, precisions: Sequence[torch.dtype]
+) -> dict[str, dict[str, float]]:
+    """Time the fifth decision of every episode, from observation to action; return milliseconds.
+
+    Precisions take turns, decision by decision. The decisions before the fifth warm up.
+    """
+    network = random_network(name)
+    policies = {
+        str(dtype).removeprefix("torch."): NetworkPolicy(
+            deepcopy(network), tokenizer=tokenizer_of(network), dtype=dtype
+        )
+        for dtype in precisions
+    }
+    decisions = [
+        (precision, Decision(policy, episode))
+        for episode in episodes
+        for precision, policy in policies.items()
+    ]
+    times: dict[str, list[tuple[float, float]]] = {precision: [] for precision in policies}
+    for _ in range(num_rounds):
+        for precision, decision in decisions:
+            decision.approach()
+            start, start_process = time.perf_counter(), time.process_time()
+            decision.keeping()
+            taken = time.perf_counter() - start, time.process_time() - start_process
+            times[precision].append(taken)
+    return {precision: _milliseconds(taken) for precision, taken in times.items()}
+
+
+def _milliseconds(taken: Sequence[tuple[float, float]]) -> dict[str, float]:
+    """Median and 90th percentile of pairs of wall time and process time."""
+    median, high = (
+        np.quantile(np.array(taken) * 1000, share, axis=0).round(2).tolist() for share in (0.5, 0.9)
+    )
+    return {
+        "process_ms": median[1],
+        "process_90th_percentile_ms": high[1],
+        "wall_ms": median[0],
+        "wall_90th_percentile_ms": high[0],
+    }
+
+
 def measure_batch(
     policy: NetworkPolicy, episodes: Sequence[Demonstration], num_rounds: int
 ) -> dict[str, float]:
@@ -292,9 +340,23 @@ def measure_training(
     }
 
 
+def measure_decisions(
+    large: str | None, episodes: Sequence[Demonstration], num_rounds: int
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Time single decisions of the own presets, and of a large one in float32."""
+    result = {}
+    for name in (*DECIDING, *([large] if large else [])):
+        precisions = (torch.float32,) if name == large else (torch.float32, torch.float64)
+        result[name] = measure_single(name, episodes, num_rounds, precisions)
+        for precision, values in result[name].items():
+            show(f"{name}, decision at history {HISTORY}", precision, values)
+    return result
+
+
 def measure(large: str, *, quick: bool, num_rounds: int) -> dict[str, Any]:
     """Measure everything; `large` is the preset of the ratios."""
     episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
+    decisions = measure_decisions(large, episodes, num_rounds)
     demos = demonstrations(TRAINING_TASKS, NUM_TRAJECTORIES, min_steps=1)
     trained = ("nano",) if quick else ("vima-2m", "vima-20m")
     acting: dict[str, dict[str, float]] = {}
@@ -309,7 +371,7 @@ def measure(large: str, *, quick: bool, num_rounds: int) -> dict[str, Any]:
         if name == large:
             acting[name] |= measure_decision(policy, episodes[0], num_rounds)
         show(name, "acting", acting[name])
-    return {**ratios(large, acting[large]), "acting": acting, "training": training}
+    return {**ratios(large, acting[large]), "decisions": decisions, "acting": acting, "training": training}
 
 
 def ratios(name: str, times: dict[str, float]) -> dict[str, float]:
@@ -347,6 +409,7 @@ def main() -> None:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--quick", action="store_true", help="smaller presets, to try it out")
+    parser.add_argument("--decisions", action="store_true", help="only decisions of nano and small")
     parser.add_argument(
         "--rounds", type=int, default=3, help="alternating rounds, after a first that warms up"
     )
@@ -356,8 +419,12 @@ def main() -> None:
     where = circumstances() | {"torch": torch.__version__, "threads": 1, "rounds": options.rounds}
     print(", ".join(f"{name}: {value}" for name, value in where.items()))
     large = "vima-2m" if options.quick else "vima-200m"
-    results = measure(large, quick=options.quick, num_rounds=options.rounds)
-    if torch.cuda.is_available() and not options.quick:
+    if options.decisions:
+        episodes = demonstrations(ACTING_TASKS, NUM_ENVS, min_steps=HISTORY - 1)
+        results: dict[str, Any] = {"decisions": measure_decisions(None, episodes, options.rounds)}
+    else:
+        results = measure(large, quick=options.quick, num_rounds=options.rounds)
+    if torch.cuda.is_available() and not (options.quick or options.decisions):
         results["gpu"] = measure_gpu(options.rounds)
     for key, value in results.items():
         if not isinstance(value, dict):

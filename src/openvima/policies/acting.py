@@ -120,7 +120,7 @@ class NetworkPolicy(Policy):
         if self.device.type == "cpu":
             # Crops are convolved with their channels together; kernels in another order would be copied at
             # every call, a third of what a few crops cost.
-            self.network.to(memory_format=torch.channels_last)
+            self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._temperature = temperature
         self._seed = generator.initial_seed() if generator else 0
         self._num_prompts = 0

@@ -6,6 +6,7 @@ width, A width of appearance.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import nn
@@ -193,13 +194,13 @@ class ActionHead(nn.Module):
 
 def to_unit_range(actions: torch.Tensor) -> torch.Tensor:
     """Map actions (..., 12) from metres and quaternion components to 0 … 1."""
-    low, high = _bounds(actions)
+    low, high = _bounds(actions.dtype, actions.device)
     return (actions - low) / (high - low)
 
 
 def from_unit_range(values: torch.Tensor) -> torch.Tensor:
     """Undo `to_unit_range`; values outside 0 … 1 are clipped to the bounds."""
-    low, high = _bounds(values)
+    low, high = _bounds(values.dtype, values.device)
     return torch.minimum(torch.maximum(low + values * (high - low), low), high)
 
 
@@ -209,6 +210,8 @@ def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     return (values * weights).sum() / weights.sum().clamp(min=1)
 
 
-def _bounds(like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    low = torch.tensor(_LOW + _LOW, dtype=like.dtype, device=like.device)
-    return low, torch.tensor(_HIGH + _HIGH, dtype=like.dtype, device=like.device)
+@cache
+def _bounds(dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    with torch.inference_mode(False):  # so that those first used in acting serve for training, too
+        low = torch.tensor(_LOW + _LOW, dtype=dtype, device=device)
+        return low, torch.tensor(_HIGH + _HIGH, dtype=dtype, device=device)

@@ -130,14 +130,17 @@ def geometry_of(inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
 
 def products(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
     """Products of a vector at each step with those of the candidates, (B, T, C)."""
-    now_BTN = torch.einsum("btx,btnx->btn", query_BTX, now_BTNX)
+    now_BTN = (now_BTNX @ query_BTX[..., None]).squeeze(-1)
     return torch.cat([now_BTN, query_BTX @ kept_BKX.mT], dim=2)
 
 
-def chosen(now_BTX: torch.Tensor, kept_BKX: torch.Tensor, place_BT: torch.Tensor) -> torch.Tensor:
-    """Take the row of a remembered object, or what is given for one in view where the number is negative."""
-    index_BTX = place_BT.clamp(min=0)[..., None].expand(*place_BT.shape, kept_BKX.shape[-1])
-    return torch.where((place_BT < 0)[..., None], now_BTX, kept_BKX.gather(1, index_BTX))
+def token_at(inputs: HeadInputs, place_BT: torch.Tensor) -> torch.Tensor:
+    """What is known of the chosen candidate, (B, T, D)."""
+    num_in_view = inputs.masks_BTN.shape[-1]
+    kept_BKD = torch.cat([part.tokens_BKD for part in recollection_of(inputs).parts], dim=1)
+    index_BTD = (place_BT - num_in_view).clamp(min=0)[..., None].expand(-1, -1, kept_BKD.shape[-1])
+    now_BTD = at(inputs.objects_BTND, place_BT.clamp(max=num_in_view - 1))
+    return torch.where((place_BT < num_in_view)[..., None], now_BTD, kept_BKD.gather(1, index_BTD))
 
 
 def recollection_of(inputs: HeadInputs) -> Recollection:

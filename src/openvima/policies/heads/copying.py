@@ -3,8 +3,8 @@
 "Rearrange to this {scene} and then restore." asks for places at which nothing lies now. One of them is where
 the scene shows the object, the other one where it lay at first; both were seen.
 
-Shape suffixes as in `base.py`; C candidates for the place, G features of how they lie, H hidden width, R bins
-of turns.
+Shape suffixes as in `base.py`; C candidates for the place, E kinds of them, G features of how they lie, H
+hidden width, R bins of turns.
 """
 
 import math
@@ -32,13 +32,13 @@ from openvima.policies.heads.candidates import (
     NUM_GEOMETRY,
     FreePoints,
     candidate_masks,
-    chosen,
     geometry_of,
     kinds_of,
     positions_at,
     products,
     recollection_of,
     right_candidates,
+    token_at,
     tokens_of_remembered,
 )
 from openvima.policies.heads.pointing import (
@@ -187,11 +187,9 @@ class CopyingHead(ActionHead):
         goal = positions_at(inputs, place_BT)
         metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
         kept = recollection_of(inputs)
-        value = chosen(
-            self.values[0](at(inputs.objects_BTND, place_BT.clamp(max=inputs.masks_BTN.shape[-1] - 1))),
-            tokens_of_remembered(self.values, kept),
-            place_BT - inputs.masks_BTN.shape[-1],
-        )
+        token_BTD = token_at(inputs, place_BT)
+        by_kind_BTED = torch.stack([layer(token_BTD) for layer in self.values], dim=2)
+        value = at(by_kind_BTED, kinds_of(inputs)[place_BT])
         tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), value]
         metric = metric.to(inputs.query_BTD.dtype)
         hidden_BTH = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))

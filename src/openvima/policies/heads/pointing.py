@@ -156,13 +156,13 @@ class Pointer(nn.Module):
         """Return scores, shape (B, T, N); objects that do not exist score the most negative number."""
         scale = inputs.query_BTD.shape[-1] ** -0.5
         query_BTD = self.query(inputs.query_BTD)
-        scores_BTN = torch.einsum("btd,btnd->btn", query_BTD, self.keys(inputs)) * scale
+        scores_BTN = (self.keys(inputs) @ query_BTD[..., None]).squeeze(-1) * scale
         hidden = torch.finfo(scores_BTN.dtype).min
         if inputs.prompt_BMD.shape[1]:
             asked_BTM = self.prompt_query(inputs.query_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
             asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
             look_BTA = asked_BTM @ inputs.prompt_appearance_BMA
-            similarity_BTN = torch.einsum("btna,bta->btn", inputs.appearance_BTNA, look_BTA)
+            similarity_BTN = (inputs.appearance_BTNA @ look_BTA[..., None]).squeeze(-1)
             scores_BTN = scores_BTN + F.softplus(self.sharpness(inputs.query_BTD)) * similarity_BTN
         return scores_BTN.masked_fill(~inputs.masks_BTN, hidden)
 

@@ -164,9 +164,9 @@ class Comparison(nn.Module):
             dim=-1,
         )
         told_HNX = torch.einsum("...hnm,...nmx->...hnx", weights_HNM, pairs_NMX)
-        seen_HVNF, found_HVN1 = _seen(own, other, weights_HNM)
-        parts = [told_HNX, self._in_views(own, other, weights_HNM, seen_HVNF, found_HVN1)]
-        told = torch.cat(parts, dim=-1).movedim(-3, -2).flatten(-2)  # (..., N, H · X)
+        differ_HVNX, seen_HVNF, found_HVN1 = self._in_views(own, other, weights_HNM)
+        told = torch.cat([told_HNX, differ_HVNX.movedim(-3, -2).flatten(-2)], dim=-1)
+        told = told.movedim(-3, -2).flatten(-2)  # (..., N, H · X)
         if turn_between is None:
             return self.difference(told), None
         turns_NR = _turns(own, seen_HVNF[..., 0, :, :, :], found_HVN1[..., 0, :, :, 0], turn_between)
@@ -194,36 +194,38 @@ class Comparison(nn.Module):
         return weights_HNM * torch.sigmoid(sharpness * found_HN1)
 
     def _in_views(
-        self,
-        own: Sights,
-        other: Sights,
-        weights_HNM: torch.Tensor,
-        seen_HVNF: torch.Tensor,
-        found_HVN1: torch.Tensor,
-    ) -> torch.Tensor:
-        """Differences of crops and boxes in views that show both, (..., H, N, X)."""
-        crops_HVNF = own.features_VNF.unsqueeze(-4) * found_HVN1 - seen_HVNF
+        self, own: Sights, other: Sights, weights_HNM: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Compare crops and boxes in views that show both.
+
+        Returns:
+            Differences of crop features and of boxes, (..., H, V, N, F + 4); crop features of what looks are
+            at, (..., H, V, N, F); and how much they are at something, (..., H, V, N, 1).
+        """
+        own_VNX, other_VMX = _crops_and_boxes(own), _crops_and_boxes(other)
+        weights_HVNM = _in_both(own, other, weights_HNM)
+        seen_HVNX = torch.einsum("...hvnm,...vmx->...hvnx", weights_HVNM, other_VMX)
+        found_HVN1 = weights_HVNM.sum(-1, keepdim=True)
+        differ_HVNX = own_VNX.unsqueeze(-4) * found_HVN1 - seen_HVNX
+        width = own.features_VNF.shape[-1]
         if self.training and self.crop_dropout:
-            shape = (*crops_HVNF.shape[:-4], 1, 1, crops_HVNF.shape[-2], 1)
-            crops_HVNF = crops_HVNF * (torch.rand(shape, device=crops_HVNF.device) >= self.crop_dropout)
-        boxes_VN4, other_VM4 = (each.boxes_VN4.to(crops_HVNF.dtype) / _BOX_UNIT_PX for each in (own, other))
-        seen_HVN4 = torch.einsum("...hvnm,...vmf->...hvnf", _in_both(own, other, weights_HNM), other_VM4)
-        parts = [crops_HVNF, boxes_VN4.unsqueeze(-4) * found_HVN1 - seen_HVN4]
-        return torch.cat(parts, dim=-1).movedim(-3, -2).flatten(-2)  # (..., H, N, V · X)
+            shape = (*differ_HVNX.shape[:-4], 1, 1, differ_HVNX.shape[-2], 1)
+            kept = torch.rand(shape, device=differ_HVNX.device) >= self.crop_dropout
+            crops, boxes = differ_HVNX.split([width, differ_HVNX.shape[-1] - width], dim=-1)
+            differ_HVNX = torch.cat([crops * kept, boxes], dim=-1)
+        return differ_HVNX, seen_HVNX[..., :width], found_HVN1
+
+
+def _crops_and_boxes(sights: Sights) -> torch.Tensor:
+    """Crop features and boxes, (..., V, N, F + 4)."""
+    boxes_VN4 = sights.boxes_VN4.to(sights.features_VNF.dtype) / _BOX_UNIT_PX
+    return torch.cat([sights.features_VNF, boxes_VN4], dim=-1)
 
 
 def _in_both(own: Sights, other: Sights, weights_HNM: torch.Tensor) -> torch.Tensor:
     """Weights of looks, zero in views that do not show both, (..., H, V, N, M)."""
-    dtype = weights_HNM.dtype
-    shown_VN, other_VM = own.masks_VN.to(dtype), other.masks_VN.to(dtype)
-    return weights_HNM.unsqueeze(-3) * shown_VN[..., None, :, :, None] * other_VM[..., None, :, None, :]
-
-
-def _seen(own: Sights, other: Sights, weights_HNM: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Crop features of what looks are at, (..., H, V, N, F), and how much they are at something."""
-    weights_HVNM = _in_both(own, other, weights_HNM)
-    seen_HVNF = torch.einsum("...hvnm,...vmf->...hvnf", weights_HVNM, other.features_VNF)
-    return seen_HVNF, weights_HVNM.sum(-1, keepdim=True)
+    shown_VNM = own.masks_VN[..., :, None] & other.masks_VN[..., None, :]
+    return weights_HNM.unsqueeze(-3) * shown_VNM.unsqueeze(-4)
 
 
 def _turns(

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 # Measured in float32 on one core with AVX-512, at widths of 768: matrices packed for oneDNN take 0.65 of the
 # time of the default kernel with 6 rows, 0.7 with 17, 0.8 with 34 and 0.9 with 90: that kernel rearranges the
@@ -26,10 +27,14 @@ class Linear(nn.Linear):
     _packed: torch.Tensor | None = None
     _packed_version: tuple[int, int] | None = None  # address and version of the weights that were packed
 
+    def __init__(self, in_features: int, out_features: int, bias: bool = True) -> None:
+        super().__init__(in_features, out_features, bias)
+        self._is_large = in_features * out_features >= _MIN_WEIGHTS
+
     def forward(self, input: torch.Tensor) -> torch.Tensor:
         """Map (..., in) to (..., out)."""
-        if not self._has_few_rows(input):
-            return super().forward(input)
+        if not (self._is_large and self._has_few_rows(input)):
+            return F.linear(input, self.weight, self.bias)
         version = (self.weight.data_ptr(), self.weight._version)
         if version != self._packed_version:
             self._packed = torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), _PACKED_FOR_ROWS)
@@ -52,7 +57,6 @@ class Linear(nn.Linear):
             and not torch.compiler.is_compiling()  # the compiler packs by itself
             and torch.is_inference_mode_enabled()
             and self.in_features < x.numel() <= _MAX_ROWS * self.in_features
-            and self.weight.numel() >= _MIN_WEIGHTS
             and x.dtype == self.weight.dtype == torch.float32
             and x.device.type == "cpu"
             and not self.weight.is_inference()  # such tensors have no version
