@@ -27,6 +27,7 @@ from tests.policies.golden import (
 
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, to_unit_range
 from openvima.policies.inputs import WORD, HistoryBatch, Reader, StepInput
+from openvima.policies.layers.places import Places
 from openvima.policies.layers.trunk import Decoder, PrefixTrunk
 from openvima.policies.network import Memory, PolicyNetwork
 from openvima.render.camera import VIEWS
@@ -110,7 +111,7 @@ def _prompt_stages(network: PolicyNetwork, seen: Seen, memory: Memory, inputs: I
         "prompt.mask": memory.mask_BL.numpy(),
     }
     for block in range(len(network.prompt.text.blocks)):
-        tokens_BLW = seen.outputs[f"prompt.text.blocks.{block}"][0]
+        tokens_BLW = Places(within_BL).unpack(seen.outputs[f"prompt.text.blocks.{block}"][0])
         result[f"prompt.t5_block{block}"] = only(tokens_BLW.numpy(), within_BL)
     return result
 

@@ -164,13 +164,15 @@ class Comparison(nn.Module):
             dim=-1,
         )
         told_HNX = torch.einsum("...hnm,...nmx->...hnx", weights_HNM, pairs_NMX)
-        differ_HVNX, seen_HVNF, found_HVN1 = self._in_views(own, other, weights_HNM)
-        told = torch.cat([told_HNX, differ_HVNX.movedim(-3, -2).flatten(-2)], dim=-1)
-        told = told.movedim(-3, -2).flatten(-2)  # (..., N, H · X)
+        differ_HVNX, seen_VNF, found_HVN1 = self._in_views(own, other, weights_HNM)
+        views = differ_HVNX.flatten(-4, -3).unbind(-3)  # (..., N, X) each
+        parts = []
+        for look, told_NX in enumerate(told_HNX.unbind(-3)):
+            parts += [told_NX, *views[NUM_VIEWS * look : NUM_VIEWS * (look + 1)]]
         if turn_between is None:
-            return self.difference(told), None
-        turns_NR = _turns(own, seen_HVNF[..., 0, :, :, :], found_HVN1[..., 0, :, :, 0], turn_between)
-        return self.difference(torch.cat([told, turns_NR], dim=-1)), turns_NR
+            return self.difference(torch.cat(parts, dim=-1)), None
+        turns_NR = _turns(own, seen_VNF, found_HVN1[..., 0, :, :, 0], turn_between)
+        return self.difference(torch.cat([*parts, turns_NR], dim=-1)), turns_NR
 
     def _weights(
         self,
@@ -199,21 +201,22 @@ class Comparison(nn.Module):
         """Compare crops and boxes in views that show both.
 
         Returns:
-            Differences of crop features and of boxes, (..., H, V, N, F + 4); crop features of what looks are
-            at, (..., H, V, N, F); and how much they are at something, (..., H, V, N, 1).
+            Differences of crop features and of boxes, (..., H, V, N, F + 4); crop features of what the first
+            look is at, (..., V, N, F); and how much looks are at something, (..., H, V, N, 1).
         """
         own_VNX, other_VMX = _crops_and_boxes(own), _crops_and_boxes(other)
         weights_HVNM = _in_both(own, other, weights_HNM)
-        seen_HVNX = torch.einsum("...hvnm,...vmx->...hvnx", weights_HVNM, other_VMX)
+        # The sign goes to the smaller tensor; a difference would cost another copy of the larger one.
+        unseen_HVNX = torch.einsum("...hvnm,...vmx->...hvnx", -weights_HVNM, other_VMX)
         found_HVN1 = weights_HVNM.sum(-1, keepdim=True)
-        differ_HVNX = own_VNX.unsqueeze(-4) * found_HVN1 - seen_HVNX
+        differ_HVNX = torch.addcmul(unseen_HVNX, own_VNX.unsqueeze(-4), found_HVN1)
         width = own.features_VNF.shape[-1]
         if self.training and self.crop_dropout:
             shape = (*differ_HVNX.shape[:-4], 1, 1, differ_HVNX.shape[-2], 1)
-            kept = torch.rand(shape, device=differ_HVNX.device) >= self.crop_dropout
-            crops, boxes = differ_HVNX.split([width, differ_HVNX.shape[-1] - width], dim=-1)
-            differ_HVNX = torch.cat([crops * kept, boxes], dim=-1)
-        return differ_HVNX, seen_HVNX[..., :width], found_HVN1
+            kept_N1 = torch.rand(shape, device=differ_HVNX.device) >= self.crop_dropout
+            crops = torch.arange(differ_HVNX.shape[-1], device=differ_HVNX.device) < width
+            differ_HVNX = differ_HVNX * (kept_N1 | ~crops)
+        return differ_HVNX, -unseen_HVNX[..., 0, :, :, :width], found_HVN1
 
 
 def _crops_and_boxes(sights: Sights) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """A T5-style encoder over words and image tokens: relative positions, RMS norms, no scaling of scores.
 
-Shape suffixes: B batch, L prompt places, H heads, W width, K width of one head.
+Shape suffixes: B batch, L prompt places, N those of all prompts up to their ends, H heads, W width, K
+width of one head.
 """
 
 import math
@@ -8,6 +9,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import nn
+
+from openvima.policies.layers.places import Places
 
 NUM_BUCKETS = 32  # half for keys before the query, half for keys after it
 _EXACT = 8  # distances below have a bucket each
@@ -51,16 +54,19 @@ class TextEncoder(nn.Module):
             mask_BL: Which places are valid, shape (B, L), bool.
 
         Returns:
-            Shape (B, L, W); masked places are finite and mean nothing.
+            Shape (B, L, W); masked places are finite and mean nothing. Those after the last valid one, which
+            pad the batch, are not computed; there it is zero.
         """
-        places = torch.arange(tokens_BLW.shape[1], device=tokens_BLW.device)
-        buckets_LL = relative_bucket(places[None, :] - places[:, None])
+        within = Places(mask_BL.flip(1).cumsum(dim=1).flip(1) > 0)
+        numbers_L = torch.arange(tokens_BLW.shape[1], device=tokens_BLW.device)
+        buckets_LL = relative_bucket(numbers_L[None, :] - numbers_L[:, None])
         bias_HLL = self.position_bias(buckets_LL).permute(2, 0, 1)
         hidden = torch.finfo(tokens_BLW.dtype).min
         bias_BHLL = bias_HLL.masked_fill(~mask_BL[:, None, None, :], hidden)
+        x_NW = within.pack(tokens_BLW)
         for block in self.blocks:
-            tokens_BLW = block(tokens_BLW, bias_BHLL)
-        return self.norm_after(tokens_BLW)
+            x_NW = block(x_NW, within, bias_BHLL)
+        return within.unpack(self.norm_after(x_NW))
 
 
 class TextBlock(nn.Module):
@@ -83,16 +89,16 @@ class TextBlock(nn.Module):
         for linear in (self.key, self.value):
             nn.init.normal_(linear.weight, std=config.width**-0.5)
 
-    def forward(self, x_BLW: torch.Tensor, bias_BHLL: torch.Tensor) -> torch.Tensor:
-        """Map tokens to tokens, shape (B, L, W); `bias_BHLL` is added to the attention scores."""
-        normed = self.norm_attention(x_BLW)
+    def forward(self, x_NW: torch.Tensor, within: Places, bias_BHLL: torch.Tensor) -> torch.Tensor:
+        """Map packed tokens to the same shape; `bias_BHLL` is added to the attention scores."""
+        normed = self.norm_attention(x_NW)
         query, key, value = (
-            linear(normed).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)  # (B, H, L, K)
+            within.unpack(linear(normed)).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)  # (B, H, L, K)
             for linear in (self.query, self.key, self.value)
         )
         mixed = torch.softmax(query @ key.mT + bias_BHLL, dim=-1) @ value
-        x_BLW = x_BLW + self.attention_out(mixed.transpose(1, 2).flatten(2))
-        return x_BLW + self.narrow(torch.relu(self.widen(self.norm_feed_forward(x_BLW))))
+        x_NW = x_NW + self.attention_out(within.pack(mixed.transpose(1, 2).flatten(2)))
+        return x_NW + self.narrow(torch.relu(self.widen(self.norm_feed_forward(x_NW))))
 
 
 class RmsNorm(nn.Module):
