@@ -52,7 +52,9 @@ BESIDE = (
 )  # in the short table: best, best known, like size
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"
+_ANIMATION = "openvima_small.webp"  # that `benchmarks/small_animation.py` makes
 _FIGURES = {
+    "animation": "openvima-small at work on six tasks, each with its prompt",
     "levels": "Success of openvima-small at the four levels beside published models",
     "scaling": "Success against the number of demonstrations",
     "ablations": "Success of the whole preset and of variants without one part",
@@ -273,6 +275,8 @@ def write(findings: Findings, out: Path, images: Path, pages: Sequence[Path], wh
     content = json.dumps(record(findings) | where, indent=2, ensure_ascii=False) + "\n"
     write_whole(out.with_suffix(".json"), content)
     drawn = save_all(findings, images)
+    if (images / _ANIMATION).exists():
+        drawn["animation"] = images / _ANIMATION
     made = tables(findings)
     page = out.with_suffix(".md")
     if not page.exists():

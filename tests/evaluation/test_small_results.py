@@ -21,7 +21,7 @@ WHERE = {"machine": "a machine", "commit": "abc"}
 
 
 def evaluation(policy: str, solved: int, *, control: str = "", late: int = 0) -> Results:
-    """The first `solved` of ten episodes of each task end well, `late` of them a step later than the oracle."""
+    """The first `solved` of ten episodes of each task end well, `late` of them a step late."""
     outcomes = tuple(
         EpisodeOutcome(seed, seed < solved, 1 + (seed < late), "", "" if seed < solved else "missed")
         for seed in range(EPISODES)

@@ -1,0 +1,57 @@
+"""What docs/openvima_small.md says in names and settings is so, its marks can be filled, its figure drawn."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from openvima.policies import preset
+from openvima.policies.heads.candidates import FreePoints
+from openvima.policies.sizes import policy_size
+from openvima.training.recipes import RECIPES
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+TEXT = (DOCS / "openvima_small.md").read_text(encoding="utf-8")
+MARKS = {
+    *(f"{name}-figure" for name in ("animation", "levels", "scaling", "ablations")),
+    *("short", "levels", "tasks", "controls", "ablations", "scaling"),
+}
+
+
+def test_every_file_that_the_page_names_is_there() -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXT):
+        assert (DOCS / target).exists(), target
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/openvima_small.md"])
+def test_every_mark_has_an_end_and_a_table_or_figure(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    begun = re.findall(r"<!-- small:(\S+) -->", text)
+    assert begun and begun == re.findall(r"<!-- /small:(\S+) -->", text)
+    assert set(begun) <= MARKS
+
+
+def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
+    size, recipe = policy_size(preset("small")), RECIPES["small"]
+    assert f"{size.whole.total / 1e6:.1f} million parameters" in TEXT
+    assert f"text encoder of {size.parts['prompt'].total / 1e6:.1f} M parameters" in TEXT
+    assert f"{len(FreePoints(1).points_mm)} free points" in TEXT
+    assert f"{100 * recipe['motion_share']:g} % of them read as" in TEXT
+    assert TEXT.count(str(recipe["pretraining_random_looks"])) == 2
+
+
+def test_the_figure_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(str(DOCS / "images"))
+    monkeypatch.delitem(sys.modules, "policy", raising=False)
+    figure = runpy.run_path(str(DOCS / "images" / "openvima_small_network.py"))["draw"]()
+    sys.modules.pop("policy", None)
+    (axes,) = figure.axes
+    # one object in the prompt and two in view, two crops each; the prompt's scene, two views, two top views
+    assert len(axes.images) == 2 + 4 + 1 + 2 + 2
+    assert {"query", "restore"} <= {text.get_text() for text in axes.texts}
