@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 
 from openvima.env import Setup
 from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.film import Artist
 from openvima.evaluation.players import Player, load_player
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
@@ -290,7 +290,7 @@ def main() -> None:
         )
         player = load_player(batch)
         played = [play_shown(player, entry, first_seed=options.seed, width=width) for entry in wanted]
-    except ConfigError as error:
+    except OpenVimaError as error:
         parser.error(str(error))
     frames = compose(played, columns=options.columns, rows=options.rows, width=width)
     content = encoded(frames, kind, options.quality)
