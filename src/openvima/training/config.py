@@ -33,6 +33,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "pretraining_random_looks": (0, 1),
     "pretraining_twins": (0, 1),
     "pretraining_box_shift": (0, 8),
+    "pretraining_grays": (0, 1),
     "temperature": (1e-3, None),
     "bucket": (0, None),
     "seed": (0, 2**63 - 1),
@@ -94,6 +95,8 @@ class TrainingConfig:
         pretraining_twins: How probable it is for each object that can be moved that a twin lies beside it
             which differs in height, shade, texture or shape alone. Above 0 batches are of whole scenes, and
             each scene is laid a second time with everything turned.
+        pretraining_grays: How probable it is for each object that its prompt image is gray, so that its shape
+            alone tells it.
         pretraining_box_shift: Largest random shift of a crop's borders, in pixels of its 32, as with the
             boxes of a detector.
         temperature: Divisor of similarities in the matching loss.
@@ -150,6 +153,7 @@ class TrainingConfig:
     pretraining_random_looks: float = 0.0
     pretraining_twins: float = 0.0
     pretraining_box_shift: float = 0.0
+    pretraining_grays: float = 0.0
     temperature: float = 0.07
     tune_crops: bool = False
     bucket: int = 0

@@ -318,6 +318,7 @@ class _Trainer:
                 config.pretraining_random_looks,
                 config.pretraining_twins,
                 again=has_turns(network) or config.pretraining_twins > 0,
+                grays=config.pretraining_grays,
             ),
             report=self._say,
         )

@@ -18,15 +18,17 @@ from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
 from openvima.catalog.random_pack import RandomLooks, shows_heading
+from openvima.catalog.textures import NEUTRAL_TEXTURE
 from openvima.perception.objects import ObjectViews, observe_prompt_image, see_objects
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode
+from openvima.tasks.table import NO_SCALE
 from openvima.training.scene_variants import laid_again, with_random_looks, with_twins
 from openvima.training.schedule import step_seed
 
-_NUM_COLUMNS = 6  # of `Pairs`, those of the scene laid again left out
+_NUM_COLUMNS = 8  # of `Pairs`, those of the scene laid again left out
 _DOMAIN = "user"  # neither training nor evaluation episodes are reused
 
 
@@ -58,6 +60,8 @@ class Pairs:
         scene_masks: Shape (K, 2), bool.
         looks: Number of its pair of shape and texture, shape (K,), int64.
         scenes: Number of its scene, shape (K,), int64.
+        shapes: Number of its shape, shape (K,), int64.
+        grays: Whether the prompt image shows it in gray, so that only its shape tells it, shape (K,), bool.
         again: The objects in the scene laid again; None if it was laid once.
     """
 
@@ -67,6 +71,8 @@ class Pairs:
     scene_masks: torch.Tensor
     looks: torch.Tensor
     scenes: torch.Tensor
+    shapes: torch.Tensor
+    grays: torch.Tensor
     again: Again | None = None
 
     def to(self, device: torch.device) -> "Pairs":
@@ -86,6 +92,8 @@ class Pairs:
             change(self.scene_masks),
             change(self.looks),
             change(self.scenes),
+            change(self.shapes),
+            change(self.grays),
             Again(change(again.crops), change(again.masks), change(again.turns)) if again else None,
         )
 
@@ -98,11 +106,13 @@ class Variety:
         random_looks: How probable a random texture is for each object, and how probable a random shape.
         twins: How probable a twin is that differs in height, shade, texture or shape alone.
         again: Lay each scene a second time, with everything turned.
+        grays: How probable it is for each object that its prompt image is gray, as in `novel_noun`.
     """
 
     random_looks: float = 0.0
     twins: float = 0.0
     again: bool = False
+    grays: float = 0.0
 
 
 PLAIN = Variety()
@@ -142,7 +152,9 @@ def render_pairs(
         rng = np.random.default_rng([episode_seed, 1])
         scene = _varied(scene, variety, shades, rasteriser.assets, rng)
         again = laid_again(scene, rng) if variety.again else None
-        columns += pairs_of_scene(scene, _magnifications(episode), rasteriser, looks, number, again)
+        grays = rng.random(len(scene.placements)) < variety.grays
+        enlarged = _magnifications(episode)
+        columns += pairs_of_scene(scene, enlarged, rasteriser, looks, number, again, grays=grays)
         if report and number % 50 == 0:
             report(number, num_scenes, "drawing scenes")
     return stacked(columns)
@@ -177,26 +189,34 @@ def matching_loss(
     mixing = colour_mixing(generator).to(pairs.prompt_crops.device)
     prompt = embed_looks(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
     scene = embed_looks(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
-    loss, accuracy = contrast(prompt, scene, pairs.looks, temperature=temperature)
+    loss, accuracy = contrast(prompt, scene, alike_in_prompts(pairs), temperature=temperature)
     return loss, {"match_accuracy": accuracy}
 
 
+def alike_in_prompts(pairs: Pairs) -> torch.Tensor:
+    """Tell which prompt image (row) could show which object (column) of a batch, (K, K), bool.
+
+    One in colour shows objects of its look, a gray one those of its shape.
+    """
+    same_shape = (pairs.shapes[:, None] == pairs.shapes[None, :]) & pairs.grays[:, None]
+    return same_shape | (pairs.looks[:, None] == pairs.looks[None, :])
+
+
 def contrast(
-    first: torch.Tensor, second: torch.Tensor, looks: torch.Tensor, *, temperature: float
+    first: torch.Tensor, second: torch.Tensor, alike: torch.Tensor, *, temperature: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Loss of telling which of K objects is which, in both directions, and the share that is right.
 
     Args:
         first: Embeddings, shape (K, A).
         second: Those of other images of the same objects, shape (K, A).
-        looks: Objects of one number look alike and are not told apart, shape (K,), int64.
+        alike: Which of the first look like which of the second and are not told apart, shape (K, K), bool.
         temperature: Divisor of the similarities.
     """
     scores = first @ second.T / temperature
     count = len(scores)
     diagonal = torch.eye(count, dtype=torch.bool, device=scores.device)
-    same_look = (looks[:, None] == looks[None, :]) & ~diagonal
-    scores = scores.masked_fill(same_look, torch.finfo(scores.dtype).min)
+    scores = scores.masked_fill(alike & ~diagonal, torch.finfo(scores.dtype).min)
     target = torch.arange(count, device=scores.device)
     loss = (F.cross_entropy(scores, target) + F.cross_entropy(scores.T, target)) / 2
     with torch.no_grad():
@@ -213,13 +233,16 @@ def scene_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256) ->
     scene = torch.cat([embed_looks(encoder, p.scene_crops, p.scene_masks) for p in parts])
     apart = pairs.scenes[:, None] != pairs.scenes[None, :]
     nearest = (prompt @ scene.T).masked_fill(apart, -2.0).argmax(1)
-    return float((pairs.looks[nearest] == pairs.looks).double().mean())
+    is_right = pairs.looks[nearest] == pairs.looks
+    is_right |= pairs.grays & (pairs.shapes[nearest] == pairs.shapes)
+    return float(is_right.double().mean())
 
 
 def pairs_again(pairs: Pairs, again: Again) -> Pairs:
     """Put the scene laid again in the place of prompt images, for the objects that show there."""
     shown = torch.nonzero(again.masks.any(dim=1))[:, 0]
-    return replace(pairs, prompt_crops=again.crops, prompt_masks=again.masks).select(shown)
+    grays = torch.zeros_like(pairs.grays)
+    return replace(pairs, prompt_crops=again.crops, prompt_masks=again.masks, grays=grays).select(shown)
 
 
 def embed_looks(
@@ -281,6 +304,8 @@ def pairs_of_scene(
     looks: dict[tuple, int],
     number: int,
     again: tuple[Scene, dict[int, float]] | None = None,
+    *,
+    grays: Sequence[bool] | np.ndarray = (),
 ) -> list[tuple]:
     """Draw a scene and the prompt images of what it shows.
 
@@ -288,10 +313,11 @@ def pairs_of_scene(
         scene: The scene.
         magnifications: How much prompt images enlarge each kind of object; others are not enlarged.
         rasteriser: Draws.
-        looks: Numbers of looks, by object and texture; where the scene is laid again objects may be
+        looks: Numbers of looks, by object and texture, and of shapes, by object; where the scene is laid again objects may be
             twins, and stretched ones have looks of their own. New ones are added.
         number: Number of the scene.
         again: The scene laid again, and turns by object id.
+        grays: For each object of the scene whether its prompt image is gray; none of them by default.
 
     Returns:
         For each object that shows the fields of `Pairs`, and those of `Again` if it is laid again.
@@ -302,9 +328,12 @@ def pairs_of_scene(
     for slot, placement in enumerate(scene.placements):
         if not seen.masks[:, slot].any():
             continue
-        shown = _prompt_image(placement, magnifications.get(placement.object, 1.0), rasteriser)
+        is_gray = bool(len(grays)) and bool(grays[slot])
+        pictured = replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE) if is_gray else placement
+        shown = _prompt_image(pictured, magnifications.get(placement.object, 1.0), rasteriser)
         key = (placement.object, placement.texture, *(placement.scale if again else ()))
         look = looks.setdefault(key, len(looks))
+        shape = looks.setdefault((placement.object,), len(looks))
         pair = (
             shown.crops[:, 0],
             shown.masks[:, 0],
@@ -312,6 +341,8 @@ def pairs_of_scene(
             seen.masks[:, slot],
             np.int64(look),
             np.int64(number),
+            np.int64(shape),
+            np.bool_(is_gray),
         )
         if again and moved:
             from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad

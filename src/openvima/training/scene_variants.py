@@ -17,7 +17,7 @@ from openvima.catalog.textures import texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
 
 _MOVABLE, _VESSELS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
-_NUM_PALETTE = 2  # random textures of a scene, so that some of its objects share one
+_NUM_PALETTE = 3  # random textures of a scene, so that some of its objects share one
 _STRETCH = (1.35, 2.2)  # factor between the heights of twins
 _TWIN_TRIES = 20
 _TWIN_APART_M = 0.12
@@ -36,13 +36,15 @@ def with_random_looks(scene: Scene, share: float, assets: Assets, rng: np.random
         rng: Every draw comes from here.
     """
     palette = [random_name("texture", rng) for _ in range(_NUM_PALETTE)]
+    # Vessels that were alike stay alike in half of the scenes: then their textures alone tell them apart.
+    common = {} if rng.random() < 0.5 else None
     placements = []
     for placement in scene.placements:
         if rng.random() < share:
             dark = "dark " if rng.random() < 0.25 else ""
             placement = replace(placement, texture=dark + palette[int(rng.integers(_NUM_PALETTE))])
         if rng.random() < share:
-            placement = _with_random_shape(placement, assets, rng)
+            placement = _with_random_shape(placement, assets, rng, common)
         placements.append(placement)
     return replace(scene, placements=tuple(placements))
 
@@ -92,12 +94,16 @@ def laid_again(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int,
     return scene.with_poses(poses), turns
 
 
-def _with_random_shape(placement: Placement, assets: Assets, rng: np.random.Generator) -> Placement:
+def _with_random_shape(
+    placement: Placement, assets: Assets, rng: np.random.Generator, common: dict[str, str] | None
+) -> Placement:
     kind = "shape" if placement.object in _MOVABLE else "vessel" if placement.object in _VESSELS else None
     if kind is None:
         return placement
-    changed = replace(placement, object=random_name(kind, rng))
-    return _at_rest(changed, assets)
+    name = random_name(kind, rng)
+    if common is not None and kind == "vessel":
+        name = common.setdefault(placement.object, name)
+    return _at_rest(replace(placement, object=name), assets)
 
 
 def _at_rest(placement: Placement, assets: Assets) -> Placement:

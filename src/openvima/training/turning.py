@@ -7,7 +7,7 @@ import torch
 from torch.nn import functional as F
 
 from openvima.policies.layers.object_encoder import ObjectEncoder
-from openvima.training.pretrain import Again, Pairs, colour_mixing, contrast
+from openvima.training.pretrain import Again, Pairs, alike_in_prompts, colour_mixing, contrast
 
 TURN_TOLERANCE_RAD = math.radians(15)  # as in `rotate` and `twist`
 _CROP_PX = 32
@@ -35,8 +35,9 @@ def joint_loss(
     masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, again.masks]).transpose(1, 2)
     prompt, scene, moved = encoder.embed_appearance(features, masks)
     rows = again.masks.any(dim=1)
-    alone_loss, alone = contrast(prompt, scene, pairs.looks, temperature=temperature)
-    again_loss, matched = contrast(moved[rows], scene[rows], pairs.looks[rows], temperature=temperature)
+    same_look = pairs.looks[rows, None] == pairs.looks[None, rows]
+    alone_loss, alone = contrast(prompt, scene, alike_in_prompts(pairs), temperature=temperature)
+    again_loss, matched = contrast(moved[rows], scene[rows], same_look, temperature=temperature)
     loss = (alone_loss + again_loss) / 2
     metrics = {"match_accuracy": alone, "again_accuracy": matched}
     if encoder.config.turn_bins:
