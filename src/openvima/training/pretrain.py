@@ -313,8 +313,8 @@ def pairs_of_scene(
         scene: The scene.
         magnifications: How much prompt images enlarge each kind of object; others are not enlarged.
         rasteriser: Draws.
-        looks: Numbers of looks, by object and texture, and of shapes, by object; where the scene is laid again objects may be
-            twins, and stretched ones have looks of their own. New ones are added.
+        looks: Numbers of looks, by object and texture, and of shapes, by object; where the scene is laid
+            again objects may be twins, and stretched ones have looks of their own. New ones are added.
         number: Number of the scene.
         again: The scene laid again, and turns by object id.
         grays: For each object of the scene whether its prompt image is gray; none of them by default.
