@@ -121,11 +121,11 @@ def geometry_of(inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
     distance_BTC1 = apart_BTC2.norm(dim=-1, keepdim=True)
     here_BTC1 = torch.exp(-(distance_BTC1 / _HERE_M).square())
     others_BTN = inputs.masks_BTN & ~F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).bool()
-    beside = [
-        _beside(places_BTC2, inputs.positions_BTN2, others_BTN),
-        _beside(places_BTC2, scenes.positions_BK2[:, None], scenes.masks_BK[:, None]),
+    near = [
+        beside(places_BTC2, inputs.positions_BTN2, others_BTN[:, :, None]),
+        beside(places_BTC2, scenes.positions_BK2[:, None], scenes.masks_BK[:, None, None]),
     ]
-    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1, *beside], dim=-1)
+    return torch.cat([apart_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M, here_BTC1, *near], dim=-1)
 
 
 def products(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
@@ -149,8 +149,20 @@ def recollection_of(inputs: HeadInputs) -> Recollection:
     return inputs.recollection
 
 
-def _beside(places_BTC2: torch.Tensor, others_BTK2: torch.Tensor, masks_BTK: torch.Tensor) -> torch.Tensor:
-    """How near other places are to each one, (B, T, C, 1): 1 for the same place, 0 for none near."""
+def beside(
+    places_BTC2: torch.Tensor,
+    others_BTK2: torch.Tensor,
+    masks_BTCK: torch.Tensor,
+    unit_m: float = _BESIDE_M,
+) -> torch.Tensor:
+    """How near other places are to each one, (B, T, C, 1): 1 for the same place, 0 for none near.
+
+    Args:
+        places_BTC2: Places, metres.
+        others_BTK2: Other places, metres; here and below T may be 1.
+        masks_BTCK: Which of them count for which place; C may be 1.
+        unit_m: What is farther away than this is not near.
+    """
     apart_BTCK = (places_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
-    near_BTCK = torch.exp(-(apart_BTCK / _BESIDE_M).square()) * masks_BTK[:, :, None]
+    near_BTCK = torch.exp(-(apart_BTCK / unit_m).square()) * masks_BTCK
     return F.pad(near_BTCK, (0, 1)).amax(dim=-1, keepdim=True)  # there may be none

@@ -31,6 +31,7 @@ from openvima.policies.heads.candidates import (
     KINDS,
     NUM_GEOMETRY,
     FreePoints,
+    beside,
     candidate_masks,
     geometry_of,
     kinds_of,
@@ -55,6 +56,7 @@ from openvima.policies.heads.pointing import (
 )
 from openvima.policies.layers.mlp import mlp
 
+_ON_TOP_M = 0.04  # an object so near to another one lies in or on it, more or less
 _FAR = 10.0  # in units of offsets; beyond it, distances count as this
 _SURE = 5.0  # score of a turn that is seen without doubt, before the network learns how much it counts
 
@@ -211,14 +213,15 @@ class CopyingHead(ActionHead):
 
 
 class PickPointer(Pointer):
-    """A pointer that also knows how objects lie to where the last one was picked, and put.
+    """A pointer that also knows how objects lie: to where the last one was picked, and put, and to others.
 
-    "… then put the object that was previously at its {direction} into the same {container}."
+    "… then put the object that was previously at its {direction} into the same {container}." And what lies
+    where a scene of the prompt shows another object is to be cleared out of the way.
     """
 
     def __init__(self, config: CopyingConfig, width: int) -> None:
         super().__init__(width)
-        self.lying = mlp((7, config.hidden_width, width))
+        self.lying = mlp((10, config.hidden_width, width))
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return what is known of the objects and of how they lie, (B, T, N, D)."""
@@ -231,7 +234,16 @@ class PickPointer(Pointer):
             vector_BTN2 = (vector_BTN2 / OFFSET_UNIT_M).clamp(-_FAR, _FAR)
             apart += [vector_BTN2, vector_BTN2.norm(dim=-1, keepdim=True)]
         is_there_BTN1 = torch.ones_like(apart[1])
-        lies_BTNG = torch.cat([*apart, is_there_BTN1], dim=-1) * has_previous_BT1
+        since_BTNG = torch.cat([*apart, is_there_BTN1], dim=-1) * has_previous_BT1
+        scenes, places_BTN2 = recollection_of(inputs).scenes, inputs.positions_BTN2
+        is_other_NN = ~torch.eye(places_BTN2.shape[2], dtype=torch.bool, device=places_BTN2.device)
+        others_BTNN = inputs.masks_BTN[:, :, None] & is_other_NN
+        near = [
+            beside(places_BTN2, scenes.positions_BK2[:, None], scenes.masks_BK[:, None, None]),
+            beside(places_BTN2, places_BTN2, others_BTNN),
+            beside(places_BTN2, places_BTN2, others_BTNN, _ON_TOP_M),
+        ]
+        lies_BTNG = torch.cat([since_BTNG, *near], dim=-1)
         return keys_BTND + self.lying(lies_BTNG.to(keys_BTND.dtype))
 
 
