@@ -1,10 +1,11 @@
-"""What the parts of the preset `small` are worth, and what more demonstrations are.
+r"""What the parts of the preset `small` are worth, and what more demonstrations are.
 
-    python benchmarks/small_ablations.py --data train400 --crops crops --out ablations --only full,no-comparison
+    python benchmarks/small_ablations.py --data train400 --crops crops --out ablations \
+        --only full,no-comparison
 
-Every variant is trained with the same number of steps, then plays the same evaluation episodes. Those that match
-looks begin with the crop encoder of the run `--crops`, which stays as it is; so differences are those of cloning.
-Repeating a command continues it.
+Every variant is trained with the same number of steps, then plays the same evaluation episodes. Those that
+match looks begin with the crop encoder of the run `--crops`, which stays as it is; so differences are those
+of cloning. Repeating a command continues it.
 """
 
 import argparse

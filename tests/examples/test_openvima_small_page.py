@@ -43,6 +43,9 @@ def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
     assert f"{len(FreePoints(1).points_mm)} free points" in TEXT
     assert f"{100 * recipe['motion_share']:g} % of them read as" in TEXT
     assert TEXT.count(str(recipe["pretraining_random_looks"])) == 2
+    assert f"probability {recipe['pretraining_grays']:g} the prompt image of an object is gray" in " ".join(
+        TEXT.split()
+    )
 
 
 def test_the_figure_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:

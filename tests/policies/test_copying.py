@@ -276,6 +276,71 @@ def test_it_learns_to_copy_the_place_of_what_looks_alike_and_does_so_for_looks_n
     assert metrics["accuracy"] > 0.9
 
 
+def previous(inputs: HeadInputs, start: int, place_BT2) -> HeadInputs:
+    """The same after actions that picked there (start 0), or put there (start 6)."""
+    actions = inputs.previous_BTC.clone()
+    actions[:, 1:, start : start + 2] = place_BT2[:, 1:]
+    return replace(inputs, previous_BTC=actions)
+
+
+@pytest.mark.parametrize("start", [0, 6])
+def test_what_to_pick_depends_on_where_the_last_object_was_picked_and_put(head, inputs, start):
+    elsewhere = previous(inputs, start, inputs.positions_BTN2[:, :, 2] + 0.05)
+    before, after = torch.softmax(head.pick(inputs), -1), torch.softmax(head.pick(elsewhere), -1)
+    assert torch.equal(after[:, 0], before[:, 0])  # nothing was taken before it
+    assert ((after[:, 1] - before[:, 1]).abs().amax(-1) > 1e-3).all()
+
+
+def test_only_the_places_of_the_last_action_count_and_all_that_is_far_counts_alike(head, inputs):
+    turned_tool = inputs.previous_BTC.clone()
+    turned_tool[:, 1:, [2, 3, 4, 5, 8, 9, 10, 11]] += 1.0
+    assert torch.equal(head.pick(replace(inputs, previous_BTC=turned_tool)), head.pick(inputs))
+    far, farther = (previous(inputs, 0, torch.full((B, T, 2), value)) for value in (50.0, 60.0))
+    assert torch.equal(head.pick(far), head.pick(farther))
+
+
+def test_at_the_first_step_nothing_of_a_previous_action_counts(head, inputs):
+    before = head.pick(inputs)
+    with torch.no_grad():
+        head.pick.lying[0].weight[:, :7] += 1.0
+    assert torch.equal(head.pick(inputs)[:, 0], before[:, 0])
+    assert not torch.allclose(head.pick(inputs)[:, 1], before[:, 1])
+
+
+def test_what_to_pick_depends_on_what_lies_beside_and_on_what_a_scene_shows_there(head, inputs):
+    before = head.pick(inputs)
+    scenes = inputs.recollection.scenes.positions_BK2.clone()
+    scenes[:, 1] = inputs.positions_BTN2[:, 0, 1] + 0.01  # the second object lies where another one shall be
+    after = head.pick(remembering(inputs, "scenes", "positions_BK2", scenes))
+    assert ((after - before)[:, 0, 1].abs() > 1e-6).all()
+    close = inputs.positions_BTN2.clone()
+    close[:, 0, 3] = close[:, 0, 1] + 0.01  # in the second episode there is no fourth object
+    changed = (head.pick(replace(inputs, positions_BTN2=close)) - before)[:, 0, 1].abs()
+    assert (changed > 1e-6).tolist() == [True, False, True]
+
+
+def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
+    """Tokens and looks are drawn anew, so nothing else tells the objects apart."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+
+    def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
+        drawn = drawn_inputs(batch=64, seed=seed)
+        drawn = previous(drawn, 6, drawn.positions_BTN2[:, :, 0])
+        wanted = targets_at(drawn, drawn.positions_BTN2[:, :, 1])
+        is_second = (torch.arange(T) > 0).expand(64, T)
+        return drawn, replace(wanted, steps_BT=is_second)
+
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.01)
+    for step in range(80):
+        optimizer.zero_grad()
+        loss, _ = head.loss(*example(step))
+        loss.backward()
+        optimizer.step()
+    assert head.loss(*example(1000))[1]["pick_accuracy"] > 0.8  # by chance a quarter
+
+
 def test_turns_that_the_prompt_shows_are_copied(inputs):
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)

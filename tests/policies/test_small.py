@@ -13,7 +13,7 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.heads.base import HeadInputs, Remembered  # noqa: E402
+from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts, on_table  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
@@ -47,14 +47,18 @@ def network() -> PolicyNetwork:
 
 
 @torch.no_grad()
-def read_whole(network: PolicyNetwork, demos) -> tuple[HeadInputs, "torch.Tensor"]:
-    """What the head is given for all steps of some demonstrations, and what it decides."""
+def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInputs, "torch.Tensor"]:
+    """What the head is given for all steps of some demonstrations, and what it decides.
+
+    Actions are those of the demonstrations, or others that were taken.
+    """
     reader = Reader.of(network.config.images)
     examples, images = examples_of(demos, reader)
     batch = Collator(reader)(examples)
     features = network.encode_images(images)
     memory = network.encode_prompts(batch.prompts, features)
-    inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
+    actions_BTC = batch.targets.actions_BTC if taken_BTC is None else taken_BTC
+    inputs = network(memory, batch.history, features, actions_BTC)
     return inputs, network.head.decide(inputs)
 
 
@@ -86,6 +90,7 @@ def test_reading_step_by_step_gives_the_head_what_reading_at_once_does(network, 
             count = now.masks_BTN.shape[2]
             torch.testing.assert_close(now.query_BTD[0, 0], whole.query_BTD[b, t])
             torch.testing.assert_close(now.objects_BTND[0, 0], whole.objects_BTND[b, t, :count])
+            torch.testing.assert_close(now.previous_BTC[0, 0], whole.previous_BTC[b, t])
             assert now.recollection.steps_T.tolist() == [t]
             for kind in ("first", "scenes"):
                 one, all_of_them = getattr(now.recollection, kind), getattr(whole.recollection, kind)
@@ -96,6 +101,30 @@ def test_reading_step_by_step_gives_the_head_what_reading_at_once_does(network, 
                         others = getattr(all_of_them, field.name)[b, : len(exist)]
                         torch.testing.assert_close(value[0][exist], others[exist])
             torch.testing.assert_close(network.head.decide(now)[0, 0], decided[b, t])
+
+
+def test_acting_in_a_batch_decides_what_reading_whole_histories_does(network, demos):
+    policy, several = NetworkPolicy(network), [demo for demo in demos if demo.num_steps > 1]
+    policy.reset([demo.prompt for demo in several])
+    taken = torch.zeros(len(several), max(demo.num_steps for demo in several), 12)
+    for t in range(taken.shape[1]):
+        observations = [demo.observation(t) if t < demo.num_steps else None for demo in several]
+        for b, action in enumerate(policy.act(observations)):
+            if action is not None:
+                taken[b, t] = torch.from_numpy(np.concatenate([action[key] for key in ACTION_PARTS]))
+    inputs, decided = read_whole(network, several, taken)
+    others = read_whole(network, several, taken.roll(1, 0))[0]
+    for b, demo in enumerate(several):
+        steps = slice(demo.num_steps)
+        torch.testing.assert_close(decided[b, steps].float(), taken[b, steps])
+        torch.testing.assert_close(inputs.previous_BTC[b, 1 : demo.num_steps], taken[b, : demo.num_steps - 1])
+        assert (inputs.previous_BTC[b, 0] == 0).all()
+        assert (inputs.previous_BTC[b, demo.num_steps :] == 0).all()
+    # Other actions before it, with the tokens as they were: other scores.
+    mixed = replace(inputs, previous_BTC=others.previous_BTC)
+    changed = (network.head.pick(mixed) - network.head.pick(inputs)).abs().amax(-1)
+    assert (changed[:, 0] == 0).all()
+    assert (changed[:, 1] > 1e-6).all()
 
 
 def test_the_first_observation_stays_in_memory_and_pictures_of_single_objects_are_no_places(network, demos):

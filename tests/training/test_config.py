@@ -24,6 +24,7 @@ BAD = {
     "pretraining_random_looks": (-0.1, 1.1),
     "pretraining_twins": (-0.1, 1.1, math.nan),
     "pretraining_box_shift": (-1.0, 9.0),
+    "pretraining_grays": (-0.1, 1.1),
     "temperature": (0.0,),
     "seed": (-1,),
     "validation_share": (-0.1, 1.0),

@@ -80,6 +80,7 @@ def test_the_small_policy_is_trained_by_one_command(trained) -> None:
     first, second, third = (resolved(config) for config in trained)
     assert first == second == replace(third, steps=first.steps)
     assert (first.preset, first.pretraining_steps, first.steps, third.steps) == ("small", 3000, 4000, 9)
+    assert (first.pretraining_grays, first.motion_share, first.learning_rate) == (0.3, 0.25, 3e-4)
 
 
 def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for(trained, tmp_path) -> None:

@@ -1,0 +1,197 @@
+"""Gray prompt images, which match by shape alone; and random vessels that only textures tell apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.catalog.packs import load_assets  # noqa: E402
+from openvima.catalog.random_pack import RandomLooks, is_random  # noqa: E402
+from openvima.catalog.textures import NEUTRAL_COLOUR  # noqa: E402
+from openvima.perception.objects import observe_prompt_image  # noqa: E402
+from openvima.render.rasteriser import Rasteriser  # noqa: E402
+from openvima.scene import Placement, Pose, Prompt, Scene  # noqa: E402
+from openvima.tasks.novel_words import gray_image  # noqa: E402
+from openvima.training import TrainingConfig, loop, pretrain, train  # noqa: E402
+from openvima.training.pretrain import Pairs, Variety, alike_in_prompts, pairs_of_scene, stacked  # noqa: E402
+from openvima.training.scene_variants import with_random_looks  # noqa: E402
+
+TASKS = ("twist", "novel_adj", "visual_manipulation")
+HARD = Variety(random_looks=0.5, twins=0.6, again=True)
+SIZE = (0.144, 0.144, 0.036)  # m
+RED_A = Placement(5, "letter A", "red", SIZE, Pose.planar(0.5, -0.2))
+BLUE_A = replace(RED_A, id=6, texture="blue", pose=Pose.planar(0.5, 0.0))
+HIGH_HEART = Placement(7, "heart", "red", SIZE, Pose.planar(0.5, 0.2), scale=(1.0, 1.0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def rasteriser() -> Rasteriser:
+    return Rasteriser(load_assets("procedural"))
+
+
+def pairs_of(rasteriser: Rasteriser, *placements: Placement, grays=()) -> Pairs:
+    return stacked(pairs_of_scene(Scene(placements), {}, rasteriser, {}, 0, grays=grays))
+
+
+def drawn(variety: Variety, seed: int = 0) -> Pairs:
+    return pretrain.render_pairs(TASKS, num_scenes=9, seed=seed, assets="procedural", variety=variety)
+
+
+def chroma(crops: "torch.Tensor") -> "torch.Tensor":
+    """How far the channels of each pixel lie apart; (K, 2, 3, 32, 32) gives (K, 2, 32, 32)."""
+    return (crops.amax(dim=2).int() - crops.amin(dim=2).int()).abs()
+
+
+def test_a_gray_prompt_image_has_no_colour_and_the_scene_keeps_its_own(rasteriser):
+    pairs = pairs_of(rasteriser, RED_A, BLUE_A, HIGH_HEART, grays=[True, False, True])
+    assert pairs.grays.tolist() == [True, False, True]
+    largest = chroma(pairs.prompt_crops).flatten(1).amax(1)
+    neutral = max(NEUTRAL_COLOUR) - min(NEUTRAL_COLOUR)
+    assert (largest[pairs.grays] <= neutral).all()  # the neutral colour is a warm gray
+    assert (largest[~pairs.grays] > 4 * neutral).all()
+    assert pairs.prompt_masks.all()
+    plain = pairs_of(rasteriser, RED_A, BLUE_A, HIGH_HEART)
+    assert not plain.grays.any()
+    assert torch.equal(plain.scene_crops, pairs.scene_crops)
+    assert torch.equal(plain.prompt_crops[1], pairs.prompt_crops[1])
+
+
+def test_a_gray_prompt_image_is_that_of_the_tasks_whatever_texture_and_scale(rasteriser):
+    low = replace(HIGH_HEART, id=8, texture="green", scale=(1.0, 1.0, 1.0), pose=Pose.planar(0.6, -0.1))
+    pairs = pairs_of(rasteriser, HIGH_HEART, low, grays=[True, True])
+    assert torch.equal(pairs.prompt_crops[0], pairs.prompt_crops[1])
+    coloured = pairs_of(rasteriser, HIGH_HEART, replace(low, texture="red"))
+    assert not torch.equal(coloured.prompt_crops[0], coloured.prompt_crops[1])  # scale shows
+    image = rasteriser.prompt(Prompt("{object}", (("object", gray_image(HIGH_HEART)),))).images["object"]
+    np.testing.assert_array_equal(pairs.prompt_crops[0], observe_prompt_image(image).crops[:, 0])
+
+
+def test_a_gray_row_leaves_out_all_of_its_shape_and_others_those_of_their_look(rasteriser):
+    purple_a = replace(RED_A, id=8, texture="purple", pose=Pose.planar(0.6, 0.3))
+    red_a = replace(RED_A, id=9, pose=Pose.planar(0.4, 0.3))
+    placements = (RED_A, BLUE_A, HIGH_HEART, purple_a, red_a)
+    pairs = pairs_of(rasteriser, *placements, grays=[True, False, True, False, False])
+    assert alike_in_prompts(pairs).int().tolist() == [
+        [1, 1, 0, 1, 1],  # a gray A
+        [0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0],  # a gray heart
+        [0, 0, 0, 1, 0],
+        [1, 0, 0, 0, 1],
+    ]
+
+
+def test_cells_that_are_alike_count_neither_in_the_loss_nor_in_the_share():
+    own, other = torch.tensor([1.0, 0.0]), torch.tensor([0.8, 0.6])
+    first, second = torch.stack([other, other]), torch.stack([own, other])  # both are more like the second
+    alike = torch.eye(2, dtype=torch.bool)
+    strict_loss, strict = pretrain.contrast(first, second, alike, temperature=1.0)
+    alike[0, 1] = True
+    loss, share = pretrain.contrast(first, second, alike, temperature=1.0)
+    assert (strict, share) == (0.5, 1.0)
+    assert loss < strict_loss
+    scores = first @ second.T
+    # What is left: the second row against the first object, and that object against the second row.
+    apart = torch.stack([scores[1, 0] - scores[1, 1], scores[1, 0] - scores[0, 0]])
+    torch.testing.assert_close(loss, apart.exp().log1p().sum() / 4)
+
+
+def test_for_a_gray_prompt_image_any_object_of_its_shape_is_right(monkeypatch):
+    """Objects 0 and 1 have one shape; each prompt image is taken for what `found` says."""
+    found = torch.tensor([1, 0, 0])
+    crops = torch.zeros(2, 3, 2, 3, 32, 32, dtype=torch.uint8)
+    crops[0, :, 0, 0, 0, 0], crops[1, :, 0, 0, 0, 0] = found, torch.arange(3)
+    seen = torch.ones(3, 2, dtype=torch.bool)
+    grays = torch.tensor([True, False, True])
+    pairs = Pairs(
+        crops[0],
+        seen,
+        crops[1],
+        seen,
+        torch.arange(3),
+        torch.zeros(3, dtype=torch.int64),
+        torch.tensor([7, 7, 8]),
+        grays,
+    )
+
+    def embedded(encoder, crops, masks):
+        return torch.nn.functional.one_hot(crops[:, 0, 0, 0, 0].long(), 3).float()
+
+    monkeypatch.setattr(pretrain, "embed_looks", embedded)
+    assert pretrain.scene_accuracy(None, pairs) == pytest.approx(
+        1 / 3
+    )  # the first; the last is no shape of 8
+    assert pretrain.scene_accuracy(None, replace(pairs, grays=~grays)) == pytest.approx(1 / 3)
+    assert pretrain.scene_accuracy(None, replace(pairs, grays=torch.zeros_like(grays))) == 0
+
+
+def test_the_scene_laid_again_is_in_colour():
+    pairs = drawn(replace(HARD, grays=1.0))
+    assert pairs.grays.all()
+    assert pairs.again is not None
+    assert not pretrain.pairs_again(pairs, pairs.again).grays.any()
+
+
+def test_gray_pairs_change_nothing_else_that_is_drawn():
+    plain, some = drawn(HARD), drawn(replace(HARD, grays=0.5))
+    assert not plain.grays.any()
+    assert 0.2 < some.grays.float().mean() < 0.8
+    for name in ("scene_crops", "scene_masks", "looks", "scenes", "shapes"):
+        assert torch.equal(getattr(plain, name), getattr(some, name)), name
+    assert torch.equal(plain.again.crops, some.again.crops)
+    assert torch.equal(plain.again.turns.nan_to_num(), some.again.turns.nan_to_num())
+    is_same = (plain.prompt_crops == some.prompt_crops).flatten(1).all(1)
+    assert is_same[~some.grays].all()
+    assert not is_same[some.grays].any()
+
+
+def test_which_are_gray_follows_from_the_seed():
+    variety = replace(HARD, grays=0.5)
+    first, second, other = drawn(variety), drawn(variety), drawn(variety, seed=1)
+    assert torch.equal(first.grays, second.grays)
+    assert torch.equal(first.prompt_crops, second.prompt_crops)
+    assert first.grays.tolist() != other.grays.tolist()
+
+
+def test_a_run_draws_as_many_as_its_settings_say(settings, monkeypatch):
+    varieties, original = [], loop.render_pairs
+
+    def spy(*words, variety, **rest):
+        varieties.append(variety)
+        return original(*words, variety=variety, **rest)
+
+    monkeypatch.setattr(loop, "render_pairs", spy)
+    train(TrainingConfig(**{**settings, "steps": 1, "pretraining_grays": 0.4}))
+    assert [variety.grays for variety in varieties] == [0.4]
+
+
+def vessels_of(seed: int, share: float = 1.0) -> list[str]:
+    """Shapes of three bowls, a frame and two hearts with random looks."""
+    names = ("bowl", "bowl", "bowl", "frame", "heart", "heart")
+    scene = Scene(
+        tuple(
+            Placement(5 + k, name, "red", (0.15, 0.15, 0.05), Pose.planar(0.5, 0.1 * k - 0.3), fixed=k < 4)
+            for k, name in enumerate(names)
+        )
+    )
+    changed = with_random_looks(
+        scene, share, RandomLooks(load_assets("procedural")), np.random.default_rng(seed)
+    )
+    return [placement.object for placement in changed.placements]
+
+
+def test_random_vessels_of_one_kind_are_alike_in_half_of_the_scenes():
+    scenes = [vessels_of(seed) for seed in range(60)]
+    assert all(is_random(name) for scene in scenes for name in scene)
+    counts = [len(set(scene[:3])) for scene in scenes]
+    assert set(counts) == {1, 3}
+    assert 0.25 < counts.count(1) / len(counts) < 0.75
+    # What was not alike does not become so, and what can be moved has a shape of its own.
+    assert all(scene[3] not in scene[:3] and scene[4] != scene[5] for scene in scenes)
+    assert len({scene[0] for scene in scenes}) == len(scenes)
+
+
+def test_random_vessels_follow_from_the_seed():
+    assert vessels_of(3, 0.5) == vessels_of(3, 0.5)
+    assert len({tuple(vessels_of(seed, 0.5)) for seed in range(5)}) > 1
