@@ -177,7 +177,6 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
     assert SMALL in Path("quick", "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.skipif(not PACKAGED[SMALL].is_here, reason=f"{PACKAGED[SMALL].folder} holds no weights yet")
 def test_the_weights_of_the_package_solve_tasks_with_novel_objects() -> None:
     policy = load_policy(SMALL)
     assert sum(parameter.numel() for parameter in policy.network.parameters()) <= 10_000_000

@@ -23,7 +23,7 @@ interrupted run exactly where its last checkpoint stands.
 Example: openvima train --data demos --preset nano --out run
 
 --recipe names settings to begin with: "paper" trains as the VIMA paper does, "workstation" on one GPU with
-less data, "nano" for minutes on a few cores, "small" as the policy of the package was trained. By default it
+less data, "nano" for minutes on a few cores, "small" for a policy like that of the package. By default it
 is "small" for the preset of that name, "nano" for nano presets and learners of your own, else "paper". With
 --init no recipe or file brings pretraining; --pretraining-steps does.
 --config takes a YAML file of settings, such as the config.yaml of another run. What is given here counts

@@ -22,10 +22,8 @@ from openvima.policies.heads.base import (
     HeadInputs,
     ReadOn,
     Remembered,
-    from_unit_range,
     likeliest,
     masked_mean,
-    to_unit_range,
 )
 from openvima.policies.heads.candidates import (
     KINDS,
@@ -44,12 +42,13 @@ from openvima.policies.heads.candidates import (
 )
 from openvima.policies.heads.pointing import (
     OFFSET_UNIT_M,
-    RIGHT_OFFSET_M,
     Pointer,
-    accuracy,
     at,
     carried_place,
     cross_entropy,
+    offset_loss,
+    pick_and_place,
+    pointing_metrics,
     turn_of,
     turned,
     yaw_bin,
@@ -139,28 +138,20 @@ class CopyingHead(ActionHead):
         offset, yaw_scores = self.relate(inputs, pick, copied)
         true_offset = goal - positions_at(inputs, copied)
         yaw = yaw_bin(turn_of(targets.actions_BTC), self.config.num_yaw_bins)
-        huber = F.smooth_l1_loss(
-            offset / OFFSET_UNIT_M, true_offset / OFFSET_UNIT_M, reduction="none", beta=0.1
-        )
         surprise = place_scores.logsumexp(-1) - right_scores.logsumexp(-1)
         losses = {
             "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
             "place": masked_mean(surprise, has_pick),
-            "offset": masked_mean(huber.sum(-1), has_pick) * self.config.offset_weight,
+            "offset": masked_mean(offset_loss(offset, true_offset), has_pick) * self.config.offset_weight,
             "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * self.config.yaw_weight,
         }
-        with torch.no_grad():
-            told = has_pick & is_told_BT
-            error_BT = (offset - true_offset).norm(dim=-1)
-            right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == copied)
-            right_BT &= error_BT < RIGHT_OFFSET_M
-            metrics = {
-                "accuracy": masked_mean(right_BT.to(offset.dtype), told),
-                "pick_accuracy": accuracy(pick_scores, pick, has_pick),
-                "place_accuracy": accuracy(place_scores, copied, told),
-                "yaw_accuracy": accuracy(yaw_scores, yaw, told),
-                "offset_error_m": masked_mean(error_BT, told),
-            }
+        metrics = pointing_metrics(
+            (pick_scores, place_scores, yaw_scores),
+            (pick, copied, yaw),
+            offset - true_offset,
+            has_pick,
+            has_pick & is_told_BT,
+        )
         return torch.stack(list(losses.values())).sum(), metrics
 
     def decide(
@@ -173,13 +164,9 @@ class CopyingHead(ActionHead):
         offset, yaw_scores = self.relate(inputs, pick, place)
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
-        zero, one = torch.zeros_like(turn), torch.ones_like(turn)
         grasp, goal = at(inputs.grasps_BTN2, pick), positions_at(inputs, place) + offset
         held = turned(grasp - at(inputs.positions_BTN2, pick), turn)
-        pose1 = [torch.where(inputs.lifts_BT[..., None], goal + held, goal)]
-        pose1.append(torch.stack([zero, zero, torch.sin(turn / 2), torch.cos(turn / 2)], dim=-1))
-        pose0 = [grasp, torch.stack([zero, zero, zero, one], dim=-1)]
-        return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
+        return pick_and_place(grasp, torch.where(inputs.lifts_BT[..., None], goal + held, goal), turn)
 
     def relate(
         self, inputs: HeadInputs, pick_BT: torch.Tensor, place_BT: torch.Tensor

@@ -84,26 +84,19 @@ class PointingHead(ActionHead):
         true_place = torch.where(inputs.lifts_BT[..., None], carried_place(actions, grasp), actions[..., 6:8])
         true_offset = true_place - at(inputs.positions_BTN2, place)
         yaw = yaw_bin(turn_of(actions), self.config.num_yaw_bins)
-        huber = F.smooth_l1_loss(
-            offset / OFFSET_UNIT_M, true_offset / OFFSET_UNIT_M, reduction="none", beta=0.1
-        )
         losses = {
             "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
             "place": masked_mean(cross_entropy(place_scores, place), has_place),
-            "offset": masked_mean(huber.sum(-1), has_place) * self.config.offset_weight,
+            "offset": masked_mean(offset_loss(offset, true_offset), has_place) * self.config.offset_weight,
             "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_place) * self.config.yaw_weight,
         }
-        with torch.no_grad():
-            error_BT = (offset - true_offset).norm(dim=-1)
-            right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == place)
-            right_BT &= error_BT < RIGHT_OFFSET_M
-            metrics = {
-                "accuracy": masked_mean(right_BT.to(offset.dtype), has_place),
-                "pick_accuracy": accuracy(pick_scores, pick, has_pick),
-                "place_accuracy": accuracy(place_scores, place, has_place),
-                "yaw_accuracy": accuracy(yaw_scores, yaw, has_place),
-                "offset_error_m": masked_mean(error_BT, has_place),
-            }
+        metrics = pointing_metrics(
+            (pick_scores, place_scores, yaw_scores),
+            (pick, place, yaw),
+            offset - true_offset,
+            has_pick,
+            has_place,
+        )
         return torch.stack(list(losses.values())).sum(), metrics
 
     def decide(
@@ -115,11 +108,7 @@ class PointingHead(ActionHead):
         offset, yaw_scores = self.relate(inputs, pick, place)
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         turn = choose(yaw_scores).to(offset.dtype) * (2 * math.pi / self.config.num_yaw_bins)
-        zero, one = torch.zeros_like(turn), torch.ones_like(turn)
-        pose0 = [at(inputs.grasps_BTN2, pick), torch.stack([zero, zero, zero, one], dim=-1)]
-        pose1 = [at(inputs.positions_BTN2, place) + offset]
-        pose1.append(torch.stack([zero, zero, torch.sin(turn / 2), torch.cos(turn / 2)], dim=-1))
-        return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
+        return pick_and_place(at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, place) + offset, turn)
 
     def place_scores(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Scores (B, T, N) of the place, given the slot of the picked object."""
@@ -169,6 +158,51 @@ class Pointer(nn.Module):
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return what the query is compared with, (B, T, N, D)."""
         return self.key(inputs.objects_BTND)
+
+
+def offset_loss(offset_BT2: torch.Tensor, true_offset_BT2: torch.Tensor) -> torch.Tensor:
+    """Huber loss of offsets in metres, (B, T)."""
+    scaled = (offset_BT2 / OFFSET_UNIT_M, true_offset_BT2 / OFFSET_UNIT_M)
+    return F.smooth_l1_loss(*scaled, reduction="none", beta=0.1).sum(-1)
+
+
+@torch.no_grad()
+def pointing_metrics(
+    scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    right: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    error_BT2: torch.Tensor,
+    has_pick_BT: torch.Tensor,
+    is_told_BT: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    """Shares of right choices, and the mean error of the offset.
+
+    Args:
+        scores: Of pick, place and yaw, (B, T, classes) each.
+        right: The right classes, (B, T) each.
+        error_BT2: What the offset lacks, metres.
+        has_pick_BT: At which steps the object to pick is known.
+        is_told_BT: At which of these the place is, too.
+    """
+    (pick_scores, place_scores, yaw_scores), (pick, place, yaw) = scores, right
+    error_BT = error_BT2.norm(dim=-1)
+    right_BT = (pick_scores.argmax(-1) == pick) & (place_scores.argmax(-1) == place)
+    right_BT &= error_BT < RIGHT_OFFSET_M
+    return {
+        "accuracy": masked_mean(right_BT.to(error_BT2.dtype), is_told_BT),
+        "pick_accuracy": accuracy(pick_scores, pick, has_pick_BT),
+        "place_accuracy": accuracy(place_scores, place, is_told_BT),
+        "yaw_accuracy": accuracy(yaw_scores, yaw, is_told_BT),
+        "offset_error_m": masked_mean(error_BT, is_told_BT),
+    }
+
+
+def pick_and_place(grasp_BT2: torch.Tensor, put_BT2: torch.Tensor, turn_BT: torch.Tensor) -> torch.Tensor:
+    """Actions (B, T, 12), within bounds, that pick at one place and put at another, turned by radians."""
+    zero, one = torch.zeros_like(turn_BT), torch.ones_like(turn_BT)
+    pose0 = [grasp_BT2, torch.stack([zero, zero, zero, one], dim=-1)]
+    half = turn_BT / 2
+    pose1 = [put_BT2, torch.stack([zero, zero, torch.sin(half), torch.cos(half)], dim=-1)]
+    return from_unit_range(to_unit_range(torch.cat(pose0 + pose1, dim=-1)))
 
 
 def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
