@@ -28,6 +28,7 @@ from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.common import SIZES
 from openvima.policies.families.vima import vima
+from openvima.policies.heads.copying import CopyingConfig
 from openvima.policies.heads.pointing import PointingConfig
 from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.layers.text_encoder import TextEncoderConfig
@@ -39,7 +40,9 @@ _CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
 _SETTINGS = {
     "learning_rate": 7e-4,
     "warmup_steps": 100,
-    "motion_share": 0.12,
+    "motion_share": 0.2,
+    "bystander_share": 0.35,
+    "naming_share": 0.3,
     "validation_share": 0.02,
     "validation_episodes": 500,
     "tensorboard": False,
@@ -75,6 +78,12 @@ def _with_dropout(share: float) -> PolicyConfig:
     return replace(config, images=replace(config.images, crop_dropout=share))
 
 
+def _without_loss_of_looks() -> PolicyConfig:
+    config = small()
+    assert isinstance(config.head, CopyingConfig)
+    return replace(config, head=replace(config.head, look_weight=0.0))
+
+
 def _vima() -> PolicyConfig:
     """VIMA with as many parameters as `small`, and its text encoder."""
     text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
@@ -95,8 +104,10 @@ VARIANTS = {
         "objects are not compared with those of the prompt, nor with each other",
         lambda: replace(small(), comparison=None),
     ),
+    "no-looks": Variant("no loss of picking by looks alone", _without_loss_of_looks),
     "no-turns": Variant("turns between two images are not estimated", _without_turns),
     "no-motions": Variant("no demonstrations as motions", settings={"motion_share": 0.0}),
+    "no-names": Variant("no invented nouns but those of the tasks", settings={"naming_share": 0.0}),
     "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
     "vima": Variant(
         "VIMA's architecture, table bins, vision transformer trained along",

@@ -12,6 +12,7 @@ from openvima.policies.layers.comparison import (  # noqa: E402
     Comparison,
     ComparisonConfig,
     Sights,
+    alike_shown,
     earlier,
     others,
 )
@@ -105,6 +106,12 @@ def test_of_pictures_that_look_alike_one_look_takes_the_latest_and_one_the_earli
 
 def test_others_are_all_but_the_object_itself():
     assert torch.equal(others(sights(3, seed=0)), ~torch.eye(3, dtype=torch.bool))
+
+
+def test_what_lies_on_the_table_is_shown_alike_and_so_is_what_is_shown_alone():
+    on_table = torch.tensor([[False, True, True]]).expand(B, -1)
+    alike = alike_shown(sights(3, seed=0, on_table_N=on_table))
+    assert alike[0].tolist() == [[True, False, False], [False, True, True], [False, True, True]]
 
 
 def test_the_way_that_an_object_has_gone_is_told_and_nothing_else_if_all_else_is_equal(comparison):

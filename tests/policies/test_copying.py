@@ -26,7 +26,7 @@ IN_VIEW, AT_FIRST, IN_PROMPT = 0, N, N + NUM_FIRST  # number of the first candid
 def head() -> CopyingHead:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+        network = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
         torch.nn.init.normal_(network.offset.weight, std=0.1)  # it starts at zero
         return network
 
@@ -185,7 +185,7 @@ def test_every_candidate_at_the_demonstrated_place_is_right(head, inputs):
     assert near[..., [AT_FIRST, IN_PROMPT + 1]].all()
     assert is_told.all()
     chances = (torch.softmax(scores, dim=-1) * near).sum(-1)
-    no_others = replace(head.config, offset_weight=0.0, yaw_weight=0.0)
+    no_others = replace(head.config, offset_weight=0.0, yaw_weight=0.0, look_weight=0.0)
     head.config = no_others
     picks = torch.softmax(head.pick(twice), dim=-1)[..., 0]
     loss, _ = head.loss(twice, wanted)
@@ -211,7 +211,9 @@ def test_steps_that_only_clear_the_way_count_in_the_loss_but_not_in_the_metrics(
         metrics["pick_accuracy"]
         == head.loss(inputs, targets_at(inputs, away, place_slot=1))[1]["pick_accuracy"]
     )
-    assert all(value == 0 for name, value in metrics.items() if name != "pick_accuracy")
+    assert all(
+        value == 0 for name, value in metrics.items() if name not in ("pick_accuracy", "look_accuracy")
+    )
 
 
 @pytest.mark.parametrize("unknown", ["steps_BT", "pick_BT"])
@@ -245,12 +247,55 @@ def test_a_prompt_that_shows_nothing_is_possible(head, inputs):
     assert head.loss(blank, targets_at(blank, place_of(blank, AT_FIRST)))[0].isfinite()
 
 
+def test_the_loss_of_looks_teaches_what_is_attended_to_and_not_how_much_looks_count(head, inputs):
+    chances = torch.softmax(head.pick.by_looks(inputs), dim=-1)[..., 0]
+    (-chances.log().mean()).backward()
+    taught = {name for name, parameter in head.named_parameters() if parameter.grad is not None}
+    assert taught == {
+        f"pick.prompt_{name}.{part}" for name in ("query", "key") for part in ("weight", "bias")
+    }
+
+
+def test_what_looks_like_both_that_are_asked_for_is_picked_rather_than_what_looks_like_one(head, inputs):
+    appearance = torch.zeros_like(inputs.appearance_BTNA)
+    appearance[:, :, 0, 0] = appearance[:, :, 1, 1] = 1.0
+    appearance[:, :, 2, :2] = math.sqrt(0.5)
+    marks = torch.zeros_like(inputs.prompt_BMD)
+    marks[:, 0, 0] = marks[:, 1, 1] = 100.0
+    looks = torch.zeros_like(inputs.prompt_appearance_BMA)
+    looks[:, 0, 0] = looks[:, 1, 1] = 1.0
+    asking = replace(inputs, appearance_BTNA=appearance, prompt_BMD=marks, prompt_appearance_BMA=looks)
+    pick = head.pick
+    with torch.no_grad():
+        pick.prompt_key.weight.copy_(torch.eye(D))
+        pick.prompt_key.bias.zero_()
+        pick.prompt_query.weight.zero_()
+        pick.prompt_query.bias.copy_(torch.eye(D)[:2].flatten())
+        for weights in (pick.query.weight, pick.query.bias):
+            weights.zero_()
+    assert (pick(asking).argmax(-1) == 2).all()
+    with torch.no_grad():  # the first alone
+        pick.sharpness.bias[1] = -50.0
+    assert (pick(asking).argmax(-1) == 0).all()
+
+
+def test_words_may_describe_how_the_place_looks(head, inputs):
+    pick = torch.zeros(B, T, dtype=torch.int64)
+    known = head.with_free_points(inputs)
+    before = head.place(known, pick)
+    with torch.no_grad():
+        head.place.described.bias.copy_(inputs.appearance_BTNA[1, 0, 2])
+    change = (head.place(known, pick) - before)[1, 0, :N]
+    assert change.argmax() == 2
+    assert change[2] > 5
+
+
 @pytest.mark.parametrize(("kind", "first"), [("first", AT_FIRST), ("scenes", IN_PROMPT)])
 def test_it_learns_to_copy_the_place_of_what_looks_alike_and_does_so_for_looks_never_seen(kind, first):
     """Objects differ from step to step; that a remembered one looks like the picked one stays the same."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
 
     def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
         drawn = drawn_inputs(batch=32, seed=seed)
@@ -323,7 +368,7 @@ def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
     """Tokens and looks are drawn anew, so nothing else tells the objects apart."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
 
     def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
         drawn = drawn_inputs(batch=64, seed=seed)
@@ -344,7 +389,7 @@ def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
 def test_turns_that_the_prompt_shows_are_copied(inputs):
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D, turn_bins=72).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D, A, turn_bins=72).double()
     torch.nn.init.zeros_(head.yaw.weight)
     torch.nn.init.zeros_(head.yaw.bias)
     turns = torch.zeros(B, NUM_SCENE, 72, dtype=torch.float64)
@@ -365,7 +410,9 @@ def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_
             assert torch.equal(got[b, t], candidate_positions(inputs)[b, t, place[b, t]])
 
 
-@pytest.mark.parametrize("sizes", [{"num_yaw_bins": 1}, {"hidden_width": 0}, {"num_numbers": 0}])
+@pytest.mark.parametrize(
+    "sizes", [{"num_yaw_bins": 1}, {"hidden_width": 0}, {"num_numbers": 0}, {"num_asked": 0}]
+)
 def test_sizes_that_make_no_sense_are_refused(sizes):
     with pytest.raises(ConfigError, match="copying head"):
         CopyingConfig(**sizes)

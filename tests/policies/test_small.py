@@ -200,6 +200,29 @@ def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(d
         np.testing.assert_array_equal(batch.positions_S2, prompt.objects.positions())
 
 
+def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tell(network, demos):
+    """Following a motion is the same task whether or not the prompt also names the object that moves."""
+    frames, alone = demos[1].prompt, demos[3].prompt.images["base_obj"]
+    with_object = replace(
+        frames, text=f"{{base_obj}} {frames.text}", images={"base_obj": alone, **frames.images}
+    )
+    told = []
+    for prompt in (frames, with_object):
+        read = Reader.of(network.config.images).read_prompt(prompt)
+        images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
+        numbers = np.arange(len(images)).reshape(2, -1)
+        with torch.no_grad():
+            batch, features = batch_prompts([read], [numbers]), network.encode_images(images)
+            scenes = network.encode_prompts(batch, features).scenes
+            shown = network._shown(
+                batch, batch.images_BL >= 0, features[batch.crops_VS], scenes.appearance_BKA[0]
+            )
+        told.append((scenes.numbers_BK, scenes.turns_BKR, shown.changes_SD[None]))
+    for before, after in zip(*told, strict=True):
+        torch.testing.assert_close(after[:, 1:], before)
+    assert told[0][0].max() == len(frames.images) - 1
+
+
 def test_one_object_in_the_middle_stands_alone_and_all_else_is_the_table():
     middle, aside = [128, 63, 20, 20], [100, 63, 20, 20]
     numbers = np.array([0, 1, 2, 2, 3])

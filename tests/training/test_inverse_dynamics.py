@@ -175,7 +175,14 @@ def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("switch", "value"), [("motion_share", 0.5), ("autoregressive", True), ("visual_residual", True)]
+    ("switch", "value"),
+    [
+        ("motion_share", 0.5),
+        ("bystander_share", 0.5),
+        ("naming_share", 0.5),
+        ("autoregressive", True),
+        ("visual_residual", True),
+    ],
 )
 def test_a_learner_of_ones_own_has_no_such_switch(switch, value, data, tmp_path) -> None:
     config = TrainingConfig(data=data, out=tmp_path / "run", preset="some:learner", **{switch: value})

@@ -35,7 +35,7 @@ from openvima.policies.heads.copying import CopyingConfig, CopyingHead
 from openvima.policies.heads.pointing import PointingHead
 from openvima.policies.inputs import HistoryBatch, PromptBatch
 from openvima.policies.layers.action_encoder import ActionEncoder
-from openvima.policies.layers.comparison import Comparison, Sights, TurnBetween, earlier, others
+from openvima.policies.layers.comparison import Comparison, Sights, TurnBetween, alike_shown, earlier, others
 from openvima.policies.layers.frame_encoder import FrameEncoder
 from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoder
@@ -208,6 +208,7 @@ class PolicyNetwork(nn.Module):
             return memory
         place_BMD = shown.order_BM[..., None].expand(-1, -1, encoded_BLD.shape[-1])
         scenes = _remembered(encoded_BLD.gather(1, place_BMD), shown.sights, shown.turns_BMR)
+        scenes = replace(scenes, numbers_BK=_scene_numbers(shown.sights))
         return replace(memory, sights=shown.sights, scenes=scenes)
 
     def begin(self, memory: Memory) -> HistoryState:
@@ -399,7 +400,9 @@ class PolicyNetwork(nn.Module):
         sights = _sights_of(prompts, row_BM, exists_BM, features_VSF, looks_SA)
         if self.compare_within is None:
             return _Shown(order_BM, sights, None, None)
-        changes_BMD, turns_BMR = self.compare_within(sights, sights, earlier(sights), self._turn_between)
+        changes_BMD, turns_BMR = self.compare_within(
+            sights, sights, earlier(sights) & alike_shown(sights), self._turn_between
+        )
         changes_SD = changes_BMD.new_zeros(prompts.masks_VS.shape[1], changes_BMD.shape[-1])
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
         return _Shown(order_BM, sights, changes_SD, turns_BMR)
@@ -553,6 +556,13 @@ def _remembered(
     )
 
 
+def _scene_numbers(sights: Sights) -> torch.Tensor:
+    """Number of the picture of the table that shows each object, (B, M); others do not count."""
+    numbers_BM = sights.numbers_N
+    is_next_BM = numbers_BM != F.pad(numbers_BM[:, :-1], (1, 0), value=-1)
+    return ((is_next_BM & sights.on_table_N).cumsum(dim=1) - 1).clamp(min=0)
+
+
 def _appearance_width(config: PolicyConfig) -> int:
     return config.images.appearance_width if isinstance(config.images, ObjectEncoderConfig) else 0
 
@@ -563,5 +573,6 @@ def _head(config: PolicyConfig) -> ActionHead:
         return AutoregressiveHead(head, width)
     if isinstance(head, CopyingConfig):
         assert isinstance(config.images, ObjectEncoderConfig)  # the config has seen to it
-        return CopyingHead(head, width, config.images.turn_bins if config.comparison else 0)
+        images = config.images
+        return CopyingHead(head, width, images.appearance_width, images.turn_bins if config.comparison else 0)
     return BinsHead(head, width) if isinstance(head, BinsConfig) else PointingHead(head, width)

@@ -66,7 +66,7 @@ def small() -> "PolicyConfig":
             width=192,
             fuse_views=True,
             appearance_width=128,
-            crop_dropout=0.25,
+            crop_dropout=0.35,
             turn_bins=72,
         ),
         prompt=PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size()),

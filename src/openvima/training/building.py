@@ -21,7 +21,15 @@ from openvima.training.run_folder import flattened
 from openvima.training.schedule import step_seed
 
 # Settings that only networks of this package have.
-_OF_PRESETS = ("pretraining_steps", "t5", "motion_share", "autoregressive", "visual_residual")
+_OF_PRESETS = (
+    "pretraining_steps",
+    "t5",
+    "motion_share",
+    "bystander_share",
+    "naming_share",
+    "autoregressive",
+    "visual_residual",
+)
 
 
 def resolved(config: TrainingConfig) -> TrainingConfig:
@@ -34,6 +42,11 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
         raise ConfigError(
             f"detected_share is {config.detected_share:g}, but no detector is given; name one with boxes, "
             "such as 'detector'."
+        )
+    if config.boxes is not None and config.bystander_share:
+        raise ConfigError(
+            f"bystander_share is {config.bystander_share:g} and boxes {config.boxes!r}; found objects "
+            "have no ids that tell bystanders. Leave out either."
         )
     if config.boxes is not None and config.detected_share is None:
         config = replace(config, detected_share=DETECTED_SHARE)
@@ -51,6 +64,12 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
         )
     if config.t5 is not None and not reads_with_t5:
         raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
+    for name in ("bystander_share", "naming_share"):
+        if getattr(config, name) and not isinstance(images, ObjectEncoderConfig):
+            raise ConfigError(
+                f"{name} is {getattr(config, name):g}, but preset {config.preset!r} sees whole frames; it "
+                "needs one that sees objects."
+            )
     has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
     if config.pretraining_steps and not has_appearance:
         raise ConfigError(
@@ -108,6 +127,8 @@ def build_learner(config: TrainingConfig) -> Learner:
         reader,
         spurious_probability=config.spurious_probability,
         motion_share=config.motion_share,
+        bystander_share=config.bystander_share,
+        naming_share=config.naming_share,
     )
 
 

@@ -25,6 +25,8 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "clip_norm": (1e-6, None),
     "spurious_probability": (0, 1),
     "motion_share": (0, 1),
+    "bystander_share": (0, 1),
+    "naming_share": (0, 1),
     "detected_share": (0, 1),
     "pretraining_steps": (0, None),
     "pretraining_scenes": (1, None),
@@ -34,6 +36,7 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "pretraining_twins": (0, 1),
     "pretraining_box_shift": (0, 8),
     "pretraining_grays": (0, 1),
+    "pretraining_gaps": (0, 1),
     "temperature": (1e-3, None),
     "bucket": (0, None),
     "seed": (0, 2**63 - 1),
@@ -77,6 +80,10 @@ class TrainingConfig:
         motion_share: Share of demonstrations that are read as "Follow this motion: frame … frame" instead of
             with the prompt of their task: 1 for inverse dynamics pretraining, part of them for use in
             context. The checkpoint is chosen by tasks, unless it is 1.
+        bystander_share: How probable it is for each object that nothing is done with in a motion that it is
+            out of view, and how probable that pictures of the motion leave it out. Needs true boxes.
+        naming_share: Share of demonstrations whose prompts get invented nouns for objects: "This is a wug
+            {image}." Those that have invented words of their own stay as they are.
         boxes: Detector whose boxes part of the demonstrations are shown with, images of prompts included:
             "detector" for the one that comes with the package, "detector=folder" for another trained one, or
             "module:function" or "file.py:function", which makes an `ObjectFinder`.
@@ -97,6 +104,8 @@ class TrainingConfig:
             each scene is laid a second time with everything turned.
         pretraining_grays: How probable it is for each object that its prompt image is gray, so that its shape
             alone tells it.
+        pretraining_gaps: How probable it is for each object that gaps are painted over it, through which the
+            ground shows: white in prompt images, the table in scenes.
         pretraining_box_shift: Largest random shift of a crop's borders, in pixels of its 32, as with the
             boxes of a detector.
         temperature: Divisor of similarities in the matching loss.
@@ -144,6 +153,8 @@ class TrainingConfig:
     clip_norm: float = 1.0
     spurious_probability: float = 0.05
     motion_share: float = 0.0
+    bystander_share: float = 0.0
+    naming_share: float = 0.0
     boxes: str | None = None
     detected_share: float | None = None
     pretraining_steps: int | None = None
@@ -154,6 +165,7 @@ class TrainingConfig:
     pretraining_twins: float = 0.0
     pretraining_box_shift: float = 0.0
     pretraining_grays: float = 0.0
+    pretraining_gaps: float = 0.0
     temperature: float = 0.07
     tune_crops: bool = False
     bucket: int = 0

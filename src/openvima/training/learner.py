@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from openvima.data.tokens.episode import TokenKind
+from openvima.data.tokens.episode import TokenEpisode, TokenKind
 from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.checkpoint import load_weights, write_checkpoint
@@ -21,6 +21,7 @@ from openvima.training.augment import augmented
 from openvima.training.collate import Collator
 from openvima.training.dataset import Batch, Example, stack_images, token_kind
 from openvima.training.inverse_dynamics import as_motion
+from openvima.training.rereading import as_named, without_bystanders
 
 # From examples and, while training, one generator for each of them, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -86,6 +87,8 @@ class PolicyLearner(Learner):
         spurious_probability: How often each view of each step shows an object that is none.
         motion_share: Share of demonstrations that are read as motions, see `as_motion`; the others keep the
             prompts of their tasks.
+        bystander_share: How probable it is that motions leave an object out, see `without_bystanders`.
+        naming_share: Share of the others whose objects get names, see `as_named`.
     """
 
     def __init__(
@@ -95,6 +98,8 @@ class PolicyLearner(Learner):
         *,
         spurious_probability: float = 0.0,
         motion_share: float = 0.0,
+        bystander_share: float = 0.0,
+        naming_share: float = 0.0,
     ) -> None:
         super().__init__()
         self.network = network
@@ -103,6 +108,7 @@ class PolicyLearner(Learner):
         self.score = network.head.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
         self._spurious_probability, self._motion_share = spurious_probability, motion_share
+        self._bystander_share, self._naming_share = bystander_share, naming_share
 
     def collator(self) -> "PolicyCollate":
         """Return what makes batches; see `Learner`."""
@@ -111,6 +117,8 @@ class PolicyLearner(Learner):
             self._spurious_probability,
             with_images=self.features is None,
             motion_share=self._motion_share,
+            bystander_share=self._bystander_share,
+            naming_share=self._naming_share,
         )
 
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -149,14 +157,24 @@ class PolicyCollate:
             the images of all demonstrations.
         motion_share: Share of demonstrations that are read as motions. When validating they all are if it is
             1, and else none.
+        bystander_share: As in `PolicyLearner`; not when validating.
+        naming_share: As in `PolicyLearner`; not when validating.
     """
 
     def __init__(
-        self, reader: Reader, spurious_probability: float, *, with_images: bool, motion_share: float = 0.0
+        self,
+        reader: Reader,
+        spurious_probability: float,
+        *,
+        with_images: bool,
+        motion_share: float = 0.0,
+        bystander_share: float = 0.0,
+        naming_share: float = 0.0,
     ) -> None:
         self._collate = Collator(reader)
         self._probability, self._with_images = spurious_probability, with_images
         self._motion_share = motion_share
+        self._bystander_share, self._naming_share = bystander_share, naming_share
 
     def __call__(
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
@@ -175,15 +193,23 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None
     ) -> Sequence[Example]:
         """Read as many as are wanted as motions; a demonstration has either prompt, never parts of both."""
+        if rngs is None:
+            return (
+                examples if self._motion_share < 1 else [_reread(example, as_motion) for example in examples]
+            )
+        return [_reread(example, self._told, rng) for example, rng in zip(examples, rngs, strict=True)]
+
+    def _told(self, tokens: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
         share = self._motion_share
-        if share in (0, 1) or rngs is None:
-            are_motions = [share == 1] * len(examples)
-        else:
-            are_motions = [rng.random() < share for rng in rngs]
-        return [
-            replace(example, tokens=as_motion(example.tokens)) if is_motion else example
-            for example, is_motion in zip(examples, are_motions, strict=True)
-        ]
+        if share == 1 or (share and rng.random() < share):
+            motion = as_motion(tokens)
+            return without_bystanders(motion, self._bystander_share, rng) if self._bystander_share else motion
+        is_named = self._naming_share and rng.random() < self._naming_share
+        return as_named(tokens, rng) if is_named else tokens
+
+
+def _reread(example: Example, change: Callable[..., TokenEpisode], *given: np.random.Generator) -> Example:
+    return replace(example, tokens=change(example.tokens, *given))
 
 
 def make_learner(name: str) -> Learner:

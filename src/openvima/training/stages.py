@@ -15,6 +15,7 @@ from openvima.errors import ConfigError
 from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
 from openvima.training.config import TrainingConfig
+from openvima.training.gaps import with_gaps
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.parallel import Parallel
 from openvima.training.pretrain import Pairs, matching_loss, pairs_again, scene_accuracy
@@ -71,6 +72,8 @@ class Matching:
         batch = self._training.select(self._rows(generator).to(self._training.looks.device))
         if self.encoder.config.turn_bins:
             batch = mirrored(batch, generator)
+        if config.pretraining_gaps:
+            batch = with_gaps(batch, config.pretraining_gaps, generator)
         if config.pretraining_box_shift:
             batch = shifted(batch, config.pretraining_box_shift, generator)
         loss_of = matching_loss if batch.again is None else joint_loss

@@ -48,7 +48,7 @@ class Remembered:
         masks_BK: Which of them exist and have a place on the table.
         appearance_BKA: Their appearance.
         positions_BK2: Table points under their boxes, metres; in float32 at least.
-        numbers_BK: Which image shows each, counted from 0.
+        numbers_BK: Which picture of the table shows each, counted from 0 in reading order.
         turns_BKR: Chances of the turns that each has made since an earlier image, counterclockwise, if they
             are estimated.
     """

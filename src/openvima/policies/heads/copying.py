@@ -43,6 +43,7 @@ from openvima.policies.heads.candidates import (
 from openvima.policies.heads.pointing import (
     OFFSET_UNIT_M,
     Pointer,
+    accuracy,
     at,
     carried_place,
     cross_entropy,
@@ -69,6 +70,9 @@ class CopyingConfig:
         num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 means no turn.
         offset_weight: Weight of the offset's loss against the pointers'.
         yaw_weight: Weight of the yaw's loss.
+        look_weight: Weight of the loss of picking by looks alone. It teaches which object of the prompt is
+            meant; known objects can be found without, which is no help with novel ones.
+        num_asked: Objects of the prompt that the pick is compared with at once.
         num_numbers: Images of a prompt, and steps, that are told apart by their number; later ones count as
             the last of these.
     """
@@ -77,13 +81,16 @@ class CopyingConfig:
     num_yaw_bins: int = 72
     offset_weight: float = 2.0
     yaw_weight: float = 0.5
+    look_weight: float = 0.5
+    num_asked: int = 2
     num_numbers: int = 16
 
     def __post_init__(self) -> None:
-        if self.num_yaw_bins < 2 or self.hidden_width < 1 or self.num_numbers < 1:
+        if self.num_yaw_bins < 2 or min(self.hidden_width, self.num_asked, self.num_numbers) < 1:
             raise ConfigError(
-                f"copying head: num_yaw_bins is {self.num_yaw_bins}, hidden_width {self.hidden_width} and "
-                f"num_numbers {self.num_numbers}; they must be at least 2, 1 and 1."
+                f"copying head: num_yaw_bins is {self.num_yaw_bins}, hidden_width {self.hidden_width}, "
+                f"num_asked {self.num_asked} and num_numbers {self.num_numbers}; they must be at least 2, 1, "
+                "1 and 1."
             )
 
 
@@ -104,12 +111,12 @@ class CopyingHead(ActionHead):
     as the head has.
     """
 
-    def __init__(self, config: CopyingConfig, width: int, turn_bins: int = 0) -> None:
+    def __init__(self, config: CopyingConfig, width: int, appearance_width: int, turn_bins: int = 0) -> None:
         super().__init__()
         self.config = config
         self.shown_turn = ShownTurn(width) if turn_bins == config.num_yaw_bins else None
         self.pick = PickPointer(config, width)
-        self.place = PlacePointer(config, width)
+        self.place = PlacePointer(config, width, appearance_width)
         self.free = FreePoints(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
         self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
@@ -121,7 +128,7 @@ class CopyingHead(ActionHead):
     def loss(
         self, inputs: HeadInputs, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Cross-entropy of both pointers and of the yaw, and Huber loss of the offset.
+        """Cross-entropy of both pointers, of the looks and of the yaw, and Huber loss of the offset.
 
         Every candidate at the demonstrated place is right: the loss is that of their chances together. Where
         there is none, the object that the demonstration names is, and the offset has to lead from there to
@@ -139,8 +146,10 @@ class CopyingHead(ActionHead):
         true_offset = goal - positions_at(inputs, copied)
         yaw = yaw_bin(turn_of(targets.actions_BTC), self.config.num_yaw_bins)
         surprise = place_scores.logsumexp(-1) - right_scores.logsumexp(-1)
+        by_looks = self.pick.by_looks(inputs)
         losses = {
             "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
+            "look": masked_mean(cross_entropy(by_looks, pick), has_pick) * self.config.look_weight,
             "place": masked_mean(surprise, has_pick),
             "offset": masked_mean(offset_loss(offset, true_offset), has_pick) * self.config.offset_weight,
             "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * self.config.yaw_weight,
@@ -152,6 +161,7 @@ class CopyingHead(ActionHead):
             has_pick,
             has_pick & is_told_BT,
         )
+        metrics["look_accuracy"] = accuracy(by_looks, pick, has_pick)
         return torch.stack(list(losses.values())).sum(), metrics
 
     def decide(
@@ -207,7 +217,7 @@ class PickPointer(Pointer):
     """
 
     def __init__(self, config: CopyingConfig, width: int) -> None:
-        super().__init__(width)
+        super().__init__(width, config.num_asked)
         self.lying = mlp((10, config.hidden_width, width))
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
@@ -256,11 +266,12 @@ class ShownTurn(nn.Module):
 class PlacePointer(nn.Module):
     """Scores the candidates for the place of an object that was chosen.
 
-    A score sums up: query · key; how much the candidate looks like the picked object, and like the prompt
-    object that the query attends to; where it comes from; and how it lies to the picked object.
+    A score sums up: query · key; how much the candidate looks like the picked object, and like what is asked
+    for; where it comes from; and how it lies to the picked object. What is asked for is a prompt object that
+    the query attends to, or words: "… into the blue object."
     """
 
-    def __init__(self, config: CopyingConfig, width: int) -> None:
+    def __init__(self, config: CopyingConfig, width: int, appearance_width: int) -> None:
         super().__init__()
         self.context = nn.Linear(2 * width, width)
         self.steps = nn.Embedding(config.num_numbers, width)
@@ -269,6 +280,9 @@ class PlacePointer(nn.Module):
         self.keys = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
         self.prompt_query = nn.Linear(width, width)
         self.prompt_key = nn.Linear(width, width)
+        self.described = nn.Linear(width, appearance_width)  # how what words ask for looks
+        nn.init.zeros_(self.described.weight)
+        nn.init.zeros_(self.described.bias)
         # For each kind of candidate: how much either likeness counts, and how much the kind is wanted.
         self.alike, self.asked, self.kind = (nn.Linear(width, len(KINDS)) for _ in range(3))
         self.geometry = nn.Linear(width, NUM_GEOMETRY)
@@ -308,11 +322,11 @@ class PlacePointer(nn.Module):
         """How much candidates look like the picked object and like what is asked for, both (B, T, C)."""
         kept_BKA = torch.cat([part.appearance_BKA for part in recollection_of(inputs).parts], dim=1)
         picked_BTA = at(inputs.appearance_BTNA, pick_BT)
-        asked_BTA = torch.zeros_like(picked_BTA)
+        asked_BTA = self.described(context_BTD)
         if inputs.prompt_BMD.shape[1]:
             asked_BTM = self.prompt_query(context_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
             hidden = torch.finfo(asked_BTM.dtype).min
             asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
-            asked_BTA = asked_BTM @ inputs.prompt_appearance_BMA
+            asked_BTA = asked_BTA + asked_BTM @ inputs.prompt_appearance_BMA
         alike_BTC = products(picked_BTA, inputs.appearance_BTNA, kept_BKA)
         return alike_BTC, products(asked_BTA, inputs.appearance_BTNA, kept_BKA)

@@ -129,31 +129,54 @@ class PointingHead(ActionHead):
 
 
 class Pointer(nn.Module):
-    """Scores the objects in view for one role."""
+    """Scores the objects in view for one role.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        width: Width of tokens.
+        num_asked: Objects of the prompt that are looked for at once: what is meant, and, say, what shows how
+            it is to be.
+    """
+
+    def __init__(self, width: int, num_asked: int = 1) -> None:
         super().__init__()
+        self.num_asked = num_asked
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width)
-        self.prompt_query = nn.Linear(width, width)
+        self.prompt_query = nn.Linear(width, num_asked * width)
         self.prompt_key = nn.Linear(width, width)
-        self.sharpness = nn.Linear(width, 1)  # how much the look counts in this situation
+        self.sharpness = nn.Linear(width, num_asked)  # how much each look counts in this situation
         nn.init.zeros_(self.sharpness.weight)
-        nn.init.constant_(self.sharpness.bias, 10.0)
+        nn.init.constant_(self.sharpness.bias, 10.0 / num_asked)
 
     def forward(self, inputs: HeadInputs) -> torch.Tensor:
         """Return scores, shape (B, T, N); objects that do not exist score the most negative number."""
         scale = inputs.query_BTD.shape[-1] ** -0.5
         query_BTD = self.query(inputs.query_BTD)
         scores_BTN = (self.keys(inputs) @ query_BTD[..., None]).squeeze(-1) * scale
-        hidden = torch.finfo(scores_BTN.dtype).min
-        if inputs.prompt_BMD.shape[1]:
-            asked_BTM = self.prompt_query(inputs.query_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
-            asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
-            look_BTA = asked_BTM @ inputs.prompt_appearance_BMA
-            similarity_BTN = (inputs.appearance_BTNA @ look_BTA[..., None]).squeeze(-1)
-            scores_BTN = scores_BTN + F.softplus(self.sharpness(inputs.query_BTD)) * similarity_BTN
-        return scores_BTN.masked_fill(~inputs.masks_BTN, hidden)
+        return self._existing(scores_BTN + self._looks(inputs, self._sharpness(inputs)), inputs)
+
+    def by_looks(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return the scores by looks alone, as `forward`; their gradient goes to what is attended to."""
+        return self._existing(self._looks(inputs, self._sharpness(inputs).detach()), inputs)
+
+    def _sharpness(self, inputs: HeadInputs) -> torch.Tensor:
+        return F.softplus(self.sharpness(inputs.query_BTD))
+
+    def _looks(self, inputs: HeadInputs, sharpness_BTH: torch.Tensor) -> torch.Tensor:
+        """How much objects look like the H prompt objects that the query attends to, (B, T, N)."""
+        if not inputs.prompt_BMD.shape[1]:
+            return torch.zeros_like(inputs.appearance_BTNA[..., 0])
+        scale = inputs.query_BTD.shape[-1] ** -0.5
+        query_BTHD = self.prompt_query(inputs.query_BTD).unflatten(-1, (self.num_asked, -1))
+        asked_BTHM = query_BTHD @ self.prompt_key(inputs.prompt_BMD)[:, None].mT * scale
+        hidden = torch.finfo(asked_BTHM.dtype).min
+        asked_BTHM = asked_BTHM.masked_fill(~inputs.prompt_masks_BM[:, None, None], hidden)
+        look_BTHA = torch.softmax(asked_BTHM, dim=-1) @ inputs.prompt_appearance_BMA[:, None]
+        look_BTA = (sharpness_BTH[..., None] * look_BTHA).sum(dim=2)
+        return (inputs.appearance_BTNA @ look_BTA[..., None]).squeeze(-1)
+
+    def _existing(self, scores_BTN: torch.Tensor, inputs: HeadInputs) -> torch.Tensor:
+        return scores_BTN.masked_fill(~inputs.masks_BTN, torch.finfo(scores_BTN.dtype).min)
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return what the query is compared with, (B, T, N, D)."""

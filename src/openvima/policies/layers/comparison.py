@@ -248,6 +248,11 @@ def earlier(sights: Sights, other: Sights | None = None) -> torch.Tensor:
     return other.numbers_N[..., None, :] < sights.numbers_N[..., :, None]
 
 
+def alike_shown(sights: Sights) -> torch.Tensor:
+    """Which objects are shown as each one is, on the table or alone, shape (..., N, N)."""
+    return sights.on_table_N[..., None, :] == sights.on_table_N[..., :, None]
+
+
 def others(sights: Sights) -> torch.Tensor:
     """Which objects are other ones than each, shape (N, N)."""
     count = sights.numbers_N.shape[-1]

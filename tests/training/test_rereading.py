@@ -1,0 +1,132 @@
+"""Demonstrations told in other words, and motions without what is beside the point."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data.records import rollout_oracle  # noqa: E402
+from openvima.data.tokens.episode import COUNT, ID, PICK, PLACE, image_names, tokens_of  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.tasks.novel_words import NOUNS  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.dataset import Example  # noqa: E402
+from openvima.training.inverse_dynamics import as_motion  # noqa: E402
+from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.rereading import as_named, without_bystanders  # noqa: E402
+from training_examples import rngs_of  # noqa: E402
+
+NAMED = (
+    "visual_manipulation",
+    "rotate",
+    "pick_in_order_then_restore",
+    "manipulate_old_neighbor",
+    "same_shape",
+)
+KEPT = ("novel_noun", "novel_adj", "rearrange", "twist", "scene_understanding", "follow_order")
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    def tokens(task: str):
+        return tokens_of(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
+
+    return {task: tokens(task) for task in (*NAMED, *KEPT)}
+
+
+def _images(episode) -> dict[str, list]:
+    parts = np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1])
+    return {name: rows.tolist() for name, rows in zip(image_names(episode.text), parts, strict=True)}
+
+
+@pytest.mark.parametrize("task", NAMED)
+def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task, episodes):
+    episode, with_others = episodes[task], 0
+    for seed in range(12):
+        named = as_named(episode, np.random.default_rng(seed))
+        images = _images(named)
+        others = [images.pop(name) for name in list(images) if name.startswith("other_")]
+        assert images == _images(episode)
+        with_others += bool(others)
+        for ((_, *numbers_and_boxes),) in others:
+            numbers = numbers_and_boxes[:2]
+            row = next(row for row in episode.objects.tolist() if row[1:3] == numbers)
+            assert row[0] not in episode.steps[0, [PICK, PLACE]]
+        *definitions, rest = named.text.split(". ", named.text.count("This is a "))
+        meaning = {}
+        for sentence in definitions:
+            noun, image = sentence.removeprefix("This is a ").split(" ")
+            meaning[noun] = image
+        meant = {noun: image for noun, image in meaning.items() if not image.startswith("{other_")}
+        assert 1 <= len(meant) <= 2
+        assert set(meaning) <= set(NOUNS)
+        assert len(meaning) == len(meant) + len(others)
+        assert not any(re.search(rf"\b{noun}\b", rest) for noun in set(meaning) - set(meant))
+        for noun, image in meant.items():
+            assert image not in rest
+            rest = rest.replace(f"the {noun}", image).replace(noun, image)
+        assert rest.replace("the {", "{") == episode.text.replace("the {", "{")
+    assert bool(with_others) == (task != "rotate" or episode.steps[0, COUNT] > 1)
+
+
+@pytest.mark.parametrize("task", KEPT)
+def test_prompts_with_invented_words_or_without_single_objects_stay(task, episodes):
+    assert as_named(episodes[task], np.random.default_rng(0)) is episodes[task]
+
+
+def test_names_are_read_in_training_and_not_in_validation(episodes):
+    several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
+    collate = PolicyCollate(Reader("objects"), 0.0, with_images=True, naming_share=1.0)
+    plain = PolicyCollate(Reader("objects"), 0.0, with_images=True)
+    assert torch.equal(collate(several).prompts.words_BL, plain(several).prompts.words_BL)
+    lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
+    assert (lengths[0] > lengths[1]).all()
+
+
+@pytest.mark.parametrize("task", ["visual_manipulation", "pick_in_order_then_restore"])
+def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
+    motion = as_motion(episodes[task])
+    used = set(motion.steps[:, [PICK, PLACE]].flat)
+    bystanders = set(motion.objects[:, ID].tolist()) - used
+    assert bystanders
+    unseen, unpictured = set(), set()
+    for seed in range(20):
+        less = without_bystanders(motion, 0.5, np.random.default_rng(seed))
+        assert less.steps[:, COUNT].sum() == len(less.objects)
+        assert less.prompt_counts.sum() == len(less.prompt)
+        assert np.array_equal(less.steps[:, [PICK, PLACE]], motion.steps[:, [PICK, PLACE]])
+        out = {
+            ids: set(rows[:, ID].tolist())
+            for ids, rows in (("view", less.objects), ("pictures", less.prompt))
+        }
+        gone = [bystanders - out["view"], bystanders - out["pictures"]]
+        assert used <= out["view"] and used <= out["pictures"]
+        assert not gone[0] & gone[1]
+        for frame, rows in enumerate(np.split(less.prompt, np.cumsum(less.prompt_counts)[:-1])):
+            before = np.split(motion.prompt, np.cumsum(motion.prompt_counts)[:-1])[frame]
+            kept = before[~np.isin(before[:, ID], list(gone[1]))]
+            assert np.array_equal(rows, kept)
+        unseen |= gone[0]
+        unpictured |= gone[1]
+    assert unseen == unpictured == bystanders
+    same = without_bystanders(motion, 0.0, np.random.default_rng(0))
+    assert np.array_equal(same.objects, motion.objects) and np.array_equal(same.prompt, motion.prompt)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"preset": "gpt-nano", "naming_share": 0.5}, "sees whole frames"),
+        ({"preset": "gpt-nano", "bystander_share": 0.5}, "sees whole frames"),
+        ({"preset": "nano", "bystander_share": 0.5, "boxes": "detector"}, "no ids that tell bystanders"),
+    ],
+)
+def test_what_needs_objects_and_their_ids_says_so(settings, message, tmp_path):
+    config = replace(TrainingConfig(data=tmp_path, out=tmp_path / "run"), **settings)
+    with pytest.raises(ConfigError, match=message):
+        train(config)
