@@ -46,7 +46,7 @@ def nano_bins() -> "PolicyConfig":
 
 
 def small() -> "PolicyConfig":
-    """8.3 M parameters: it copies places that it has seen, and compares objects with each other."""
+    """8.4 M parameters: it copies places that it has seen, and compares objects with each other."""
     from openvima.policies.config import PolicyConfig
     from openvima.policies.heads.copying import CopyingConfig
     from openvima.policies.layers.comparison import ComparisonConfig
