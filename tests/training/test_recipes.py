@@ -99,7 +99,7 @@ def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for
         (["--config", str(of_its_own)], 7),
         (["--config", str(of_its_own), *init], 0),
         (["--config", str(without)], 0),
-        (["--preset", "small", "--init", "None"], 3000),
+        (["--preset", "small", "--init", "None"], 4000),
     ):
         assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
         assert resolved(trained[-1]).pretraining_steps == expected, words
