@@ -42,10 +42,13 @@ def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
     assert f"text encoder of {size.parts['prompt'].total / 1e6:.1f} M parameters" in TEXT
     assert f"{len(FreePoints(1).points_mm)} free points" in TEXT
     assert f"{100 * recipe['motion_share']:g} % of them read as" in TEXT
-    assert TEXT.count(str(recipe["pretraining_random_looks"])) == 2
-    assert f"probability {recipe['pretraining_grays']:g} the prompt image of an object is gray" in " ".join(
-        TEXT.split()
+    page, looks = " ".join(TEXT.split()), recipe["pretraining_random_looks"]
+    assert (
+        f"probability {looks:g} an object there has a random shape, and with {looks:g} a random texture"
+        in page
     )
+    assert f"probability {recipe['pretraining_grays']:g} the prompt image of an object is gray" in page
+    assert f"with {recipe['pretraining_gaps']:g} gaps are painted over it" in page
 
 
 def test_the_figure_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:
