@@ -61,7 +61,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
-        # What made the policy that comes with the package; docs/training.md has its cost.
+        # For a policy like the one that comes with the package; docs/training.md tells how that was made.
         "small": {
             "preset": "small",
             "pretraining_steps": 4000,
