@@ -38,11 +38,13 @@ from openvima.training import TrainingConfig, train
 
 _CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
 _SETTINGS = {
-    "learning_rate": 7e-4,
+    "learning_rate": 4e-4,
     "warmup_steps": 100,
     "motion_share": 0.2,
     "bystander_share": 0.35,
     "naming_share": 0.3,
+    "reordering_share": 0.3,
+    "stranger_share": 0.6,
     "validation_share": 0.02,
     "validation_episodes": 500,
     "tensorboard": False,
@@ -84,6 +86,11 @@ def _without_loss_of_looks() -> PolicyConfig:
     return replace(config, head=replace(config.head, look_weight=0.0))
 
 
+def _without_referents() -> PolicyConfig:
+    config = small()
+    return replace(config, prompt=replace(config.prompt, referents=False))
+
+
 def _vima() -> PolicyConfig:
     """VIMA with as many parameters as `small`, and its text encoder."""
     text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
@@ -105,9 +112,12 @@ VARIANTS = {
         lambda: replace(small(), comparison=None),
     ),
     "no-looks": Variant("no loss of picking by looks alone", _without_loss_of_looks),
+    "no-referents": Variant("words do not bring pictures along", _without_referents),
     "no-turns": Variant("turns between two images are not estimated", _without_turns),
     "no-motions": Variant("no demonstrations as motions", settings={"motion_share": 0.0}),
     "no-names": Variant("no invented nouns but those of the tasks", settings={"naming_share": 0.0}),
+    "no-reordering": Variant("prompts in the order of the tasks", settings={"reordering_share": 0.0}),
+    "no-strangers": Variant("no objects of other demonstrations in view", settings={"stranger_share": 0.0}),
     "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
     "vima": Variant(
         "VIMA's architecture, table bins, vision transformer trained along",

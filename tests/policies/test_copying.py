@@ -26,7 +26,7 @@ IN_VIEW, AT_FIRST, IN_PROMPT = 0, N, N + NUM_FIRST  # number of the first candid
 def head() -> CopyingHead:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
+        network = CopyingHead(CopyingConfig(hidden_width=16), D).double()
         torch.nn.init.normal_(network.offset.weight, std=0.1)  # it starts at zero
         return network
 
@@ -64,6 +64,8 @@ def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
         prompt_appearance_BMA=looks(batch, M),
         recollection=Recollection(remembered(NUM_FIRST), remembered(NUM_SCENE), torch.arange(T)),
         previous_BTC=drawn(batch, T, 12) * (torch.arange(T) > 0)[:, None],
+        word_looks_BMA=torch.zeros(batch, M, A, dtype=torch.float64),
+        prompt_exists_BM=torch.ones(batch, M, dtype=torch.bool),
     )
 
 
@@ -185,7 +187,8 @@ def test_every_candidate_at_the_demonstrated_place_is_right(head, inputs):
     assert near[..., [AT_FIRST, IN_PROMPT + 1]].all()
     assert is_told.all()
     chances = (torch.softmax(scores, dim=-1) * near).sum(-1)
-    no_others = replace(head.config, offset_weight=0.0, yaw_weight=0.0, look_weight=0.0)
+    others = ("offset_weight", "yaw_weight", "look_weight", "shown_weight")
+    no_others = replace(head.config, **dict.fromkeys(others, 0.0))
     head.config = no_others
     picks = torch.softmax(head.pick(twice), dim=-1)[..., 0]
     loss, _ = head.loss(twice, wanted)
@@ -240,6 +243,8 @@ def test_a_prompt_that_shows_nothing_is_possible(head, inputs):
         prompt_BMD=inputs.prompt_BMD[:, :0],
         prompt_masks_BM=inputs.prompt_masks_BM[:, :0],
         prompt_appearance_BMA=inputs.prompt_appearance_BMA[:, :0],
+        word_looks_BMA=inputs.word_looks_BMA[:, :0],
+        prompt_exists_BM=inputs.prompt_exists_BM[:, :0],
     )
     for name in ("tokens_BKD", "masks_BK", "appearance_BKA", "positions_BK2", "numbers_BK"):
         blank = remembering(blank, "scenes", name, getattr(inputs.recollection.scenes, name)[:, :0])
@@ -248,12 +253,40 @@ def test_a_prompt_that_shows_nothing_is_possible(head, inputs):
 
 
 def test_the_loss_of_looks_teaches_what_is_attended_to_and_not_how_much_looks_count(head, inputs):
+    words = torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A)
+    inputs = replace(inputs, word_looks_BMA=words)
     chances = torch.softmax(head.pick.by_looks(inputs), dim=-1)[..., 0]
     (-chances.log().mean()).backward()
     taught = {name for name, parameter in head.named_parameters() if parameter.grad is not None}
     assert taught == {
-        f"pick.prompt_{name}.{part}" for name in ("query", "key") for part in ("weight", "bias")
+        f"pick.{of}{name}.{part}"
+        for of in ("prompt_", "described.")
+        for name in ("query", "key")
+        for part in ("weight", "bias")
     }
+
+
+@pytest.mark.parametrize(("slot", "counts"), [(2, True), (0, False), (-1, False)])
+def test_a_place_at_another_object_in_view_is_taught_by_looks_too(slot, counts, head, inputs):
+    """Not where the object stays where it is, or goes to no object in view."""
+    wanted = targets_at(inputs, inputs.positions_BTN2[:, :, 2], place_slot=slot)
+    losses = []
+    for weight in (0.0, 1.0):
+        head.config = replace(head.config, look_weight=weight)
+        losses.append(head.loss(inputs, wanted)[0])
+    pick = torch.zeros(B, T, dtype=torch.int64)
+    of_pick = -torch.log_softmax(head.pick.by_looks(inputs), dim=-1)[..., 0].mean()
+    of_place = -torch.log_softmax(head.place.by_looks(inputs, pick), dim=-1)[..., 2].mean()
+    torch.testing.assert_close(losses[1] - losses[0], of_pick + of_place * counts)
+
+
+def test_looks_of_places_are_those_that_the_place_is_scored_by(head, inputs):
+    """What is asked for changes the scores of objects in view by as much as it changes those by looks."""
+    pick, known = torch.zeros(B, T, dtype=torch.int64), head.with_free_points(inputs)
+    other = replace(known, prompt_appearance_BMA=known.prompt_appearance_BMA.flip(1))
+    whole = (head.place(other, pick) - head.place(known, pick))[..., :N]
+    looks = head.place.by_looks(other, pick) - head.place.by_looks(known, pick)
+    torch.testing.assert_close(whole, looks)
 
 
 def test_what_looks_like_both_that_are_asked_for_is_picked_rather_than_what_looks_like_one(head, inputs):
@@ -279,15 +312,49 @@ def test_what_looks_like_both_that_are_asked_for_is_picked_rather_than_what_look
     assert (pick(asking).argmax(-1) == 0).all()
 
 
-def test_words_may_describe_how_the_place_looks(head, inputs):
+@pytest.mark.parametrize("what", ["pick", "place"])
+def test_words_may_describe_how_that_looks_which_is_picked_or_put_at(what, head, inputs):
     pick = torch.zeros(B, T, dtype=torch.int64)
     known = head.with_free_points(inputs)
-    before = head.place(known, pick)
-    with torch.no_grad():
-        head.place.described.bias.copy_(inputs.appearance_BTNA[1, 0, 2])
-    change = (head.place(known, pick) - before)[1, 0, :N]
-    assert change.argmax() == 2
+
+    def scores(words_BMA, is_word_BM):
+        asking = replace(known, word_looks_BMA=words_BMA, prompt_exists_BM=is_word_BM)
+        return head.pick(asking) if what == "pick" else head.place(asking, pick)
+
+    everywhere = inputs.appearance_BTNA[:, 0, 2][:, None].expand(B, M, A)
+    nothing, words = torch.zeros_like(everywhere), torch.ones(B, M, dtype=torch.bool)
+    change = (scores(everywhere, words) - scores(nothing, words))[1, 0, :N]
+    assert change[:3].argmax() == 2  # the fourth does not exist
     assert change[2] > 5
+    # What is no word says nothing.
+    one = words & (torch.arange(M) == 0)
+    unread = everywhere * ~one[..., None]
+    assert torch.equal(scores(unread, one), scores(nothing, one))
+
+
+def test_the_first_asked_object_is_taught_to_be_what_looks_like_the_picked_one(head, inputs):
+    """Where none does, as in the third episode, nothing is taught."""
+    looks = torch.zeros_like(inputs.prompt_appearance_BMA)
+    seen = torch.zeros_like(inputs.appearance_BTNA)
+    seen[:, :, 0, 0] = 1.0
+    looks[0, 1, 0], looks[0, 2, 1] = 1.0, 1.0
+    looks[1, 0, 0], looks[1, 2, 0] = 1.0, 0.99
+    looks[2, :, 1] = 1.0
+    shown = replace(inputs, appearance_BTNA=seen, prompt_appearance_BMA=looks)
+    pick = torch.zeros(B, T, dtype=torch.int64)
+    surprise, is_shown = head.pick.surprise_at_shown(shown, pick)
+    assert is_shown.tolist() == [[True] * T, [True] * T, [False] * T]
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.05)
+    for _ in range(60):
+        optimizer.zero_grad()
+        surprise, _ = head.pick.surprise_at_shown(shown, pick)
+        surprise[is_shown].mean().backward()
+        optimizer.step()
+    asked = torch.softmax(head.pick._asked(shown), dim=-1)[:, :, 0]
+    assert (asked[0, :, 1] > 0.9).all()
+    assert (asked[1, :, [0, 2]].sum(-1) > 0.9).all()
+    hidden = replace(shown, prompt_masks_BM=torch.zeros(B, M, dtype=torch.bool))
+    assert not head.pick.surprise_at_shown(hidden, pick)[1].any()
 
 
 @pytest.mark.parametrize(("kind", "first"), [("first", AT_FIRST), ("scenes", IN_PROMPT)])
@@ -295,7 +362,7 @@ def test_it_learns_to_copy_the_place_of_what_looks_alike_and_does_so_for_looks_n
     """Objects differ from step to step; that a remembered one looks like the picked one stays the same."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
 
     def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
         drawn = drawn_inputs(batch=32, seed=seed)
@@ -368,7 +435,7 @@ def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
     """Tokens and looks are drawn anew, so nothing else tells the objects apart."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D, A).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D).double()
 
     def example(seed: int) -> tuple[HeadInputs, ActionTargets]:
         drawn = drawn_inputs(batch=64, seed=seed)
@@ -389,7 +456,7 @@ def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
 def test_turns_that_the_prompt_shows_are_copied(inputs):
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        head = CopyingHead(CopyingConfig(hidden_width=16), D, A, turn_bins=72).double()
+        head = CopyingHead(CopyingConfig(hidden_width=16), D, turn_bins=72).double()
     torch.nn.init.zeros_(head.yaw.weight)
     torch.nn.init.zeros_(head.yaw.bias)
     turns = torch.zeros(B, NUM_SCENE, 72, dtype=torch.float64)

@@ -26,7 +26,7 @@ def test_the_trunks_of_all_members_are_of_equal_size(size: str) -> None:
     assert max(trunks) < 1.003 * min(trunks)  # self blocks have biases, cross blocks none
 
 
-@pytest.mark.parametrize("name", [name for name in PRESETS if "nano" in name or "2m" in name])
+@pytest.mark.parametrize("name", ["small", *(name for name in PRESETS if "nano" in name or "2m" in name)])
 def test_every_parameter_belongs_to_one_part(name: str) -> None:
     network = outline_network(preset(name))
     for parameter, _ in network.named_parameters():

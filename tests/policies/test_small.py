@@ -1,5 +1,6 @@
 """The network that copies and compares: what it keeps of an episode, and what must not matter to it."""
 
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts, on_table  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
@@ -253,3 +255,29 @@ def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):
     history = batch_histories([[step]], [[numbers]])
     inputs = network(memory, history, features, torch.zeros(1, 1, 12))
     assert network.head.decide(inputs).isfinite().all()
+
+
+def test_roles_do_not_follow_from_names_of_textures_and_looks_of_words_do(network, demos):
+    prompt = demos[4].prompt
+    first, rest = prompt.text.removeprefix("Put the ").split(" object in ", 1)
+    memories = []
+    for named in (first, *(("green", "purple") if first != "green" else ("purple", "green"))):
+        read = Reader.of(network.config.images).read_prompt(
+            replace(prompt, text=f"Put the {named} object in {rest}")
+        )
+        images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
+        batch = batch_prompts([read], [np.arange(len(images)).reshape(2, -1)])
+        with torch.no_grad():
+            memories.append(network.encode_prompts(batch, network.encode_images(images)))
+    _, green, purple = memories
+    torch.testing.assert_close(green.roles_BLD, purple.roles_BLD)
+    assert (green.tokens_BLD - purple.tokens_BLD).abs().max() > 1e-3
+    assert (green.word_looks_BLA - purple.word_looks_BLA).abs().amax(-1).nonzero().tolist() == [[0, 2]]
+    names = [word for word in re.split(r"\W+", rest) if word_ids().get(word) in texture_word_ids()]
+    assert green.word_looks_BLA.abs().amax(-1).count_nonzero() == 1 + len(names)  # no other word has a look
+
+
+def test_words_of_textures_are_those_that_name_them_alone():
+    words = {word for word, number in word_ids().items() if number in texture_word_ids()}
+    assert {"blue", "stripe", "polka", "dot", "paisley", "tiles", "dark"} <= words
+    assert not words & {"and", "object", "the", "texture", "wug", "kobar", "darker"}

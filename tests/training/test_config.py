@@ -19,6 +19,8 @@ BAD = {
     "spurious_probability": (-0.1, 1.1, math.nan),
     "bystander_share": (-0.1, 1.1),
     "naming_share": (-0.1, 1.1, math.nan),
+    "reordering_share": (-0.1, 1.1),
+    "stranger_share": (-0.1, 1.1),
     "pretraining_steps": (-1,),
     "pretraining_scenes": (0,),
     "pretraining_batch": (1,),

@@ -26,6 +26,7 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.inverse_dynamics import motion_prompt  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.retelling import Retelling  # noqa: E402
 from openvima.training.source import ExampleSource, Parts, split_examples, with_boxes_of  # noqa: E402
 from training_examples import train_until  # noqa: E402
 
@@ -87,7 +88,9 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
     batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(examples)
     assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
-    motions = PolicyCollate(Reader(layout), 0.0, with_images=True, motion_share=1.0)(examples)
+    motions = PolicyCollate(Reader(layout), 0.0, with_images=True, retelling=Retelling(motion_share=1.0))(
+        examples
+    )
     shown = [
         motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
         for demo in demos

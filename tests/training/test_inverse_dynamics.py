@@ -23,6 +23,7 @@ from openvima.training.building import build_learner  # noqa: E402
 from openvima.training.dataset import Example, token_kind  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion, motion_prompt, motion_text  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 READERS = {
@@ -69,7 +70,7 @@ def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
 ) -> None:
     reader, demos = READERS[name], demonstrations_of_several_steps
     episodes = [tokens_of(demo, token_kind(reader)) for demo in demos]
-    collate = PolicyCollate(reader, 0.0, with_images=True, motion_share=1.0)
+    collate = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=1.0))
     ours = collate([Example(episode) for episode in episodes])
     read = [reader.read_prompt(motion_prompt(whole_motion(demo), demo.objects)) for demo in demos]
     stack = ImageStack(reader.image_size)
@@ -95,9 +96,11 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
     """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
     reader = READERS["midas-nano"]
     episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps] * 4
-    mixed = PolicyCollate(reader, 0.0, with_images=True, motion_share=0.5)
+    mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
     tasks = prompts_of(PolicyCollate(reader, 0.0, with_images=True), episodes)
-    motions = prompts_of(PolicyCollate(reader, 0.0, with_images=True, motion_share=1.0), episodes)
+    motions = prompts_of(
+        PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=1.0)), episodes
+    )
     with_motions = prompts_of(mixed, episodes, rngs_of(episodes))
     are_motions = [prompt == motion for prompt, motion in zip(with_motions, motions, strict=True)]
     assert 4 < sum(are_motions) < len(episodes) - 4
@@ -116,7 +119,7 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
 def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
     reader = READERS["nano"]
     episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
-    mixed = PolicyCollate(reader, 0.0, with_images=True, motion_share=0.5)
+    mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
     examples = [Example(episode) for episode in episodes]
     together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
     assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
@@ -128,7 +131,9 @@ def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
     reader = READERS["nano"]
     episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
     plain, half, all_of_them = (
-        prompts_of(PolicyCollate(reader, 0.0, with_images=True, motion_share=share), episodes)
+        prompts_of(
+            PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=share)), episodes
+        )
         for share in (0.0, 0.5, 1.0)
     )
     assert half == plain != all_of_them

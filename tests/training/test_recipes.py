@@ -79,9 +79,10 @@ def test_the_small_policy_is_trained_by_one_command(trained) -> None:
         assert main(["train", "--data", "demos", "--out", "run", *words]) == 0
     first, second, third = (resolved(config) for config in trained)
     assert first == second == replace(third, steps=first.steps)
-    assert (first.preset, first.pretraining_steps, first.steps, third.steps) == ("small", 4000, 3000, 9)
+    assert (first.preset, first.pretraining_steps, first.steps, third.steps) == ("small", 4000, 3100, 9)
     assert (first.pretraining_grays, first.pretraining_gaps) == (0.3, 0.35)
     assert (first.batch, first.motion_share, first.naming_share) == (128, 0.2, 0.3)
+    assert (first.reordering_share, first.stranger_share) == (0.3, 0.6)
 
 
 def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for(trained, tmp_path) -> None:

@@ -18,7 +18,8 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.rereading import as_named, without_bystanders  # noqa: E402
+from openvima.training.rereading import as_named, in_any_order, without_bystanders  # noqa: E402
+from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 NAMED = (
@@ -81,11 +82,47 @@ def test_prompts_with_invented_words_or_without_single_objects_stay(task, episod
 
 def test_names_are_read_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    collate = PolicyCollate(Reader("objects"), 0.0, with_images=True, naming_share=1.0)
+    collate = PolicyCollate(Reader("objects"), 0.0, with_images=True, retelling=Retelling(naming_share=1.0))
     plain = PolicyCollate(Reader("objects"), 0.0, with_images=True)
     assert torch.equal(collate(several).prompts.words_BL, plain(several).prompts.words_BL)
     lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
     assert (lengths[0] > lengths[1]).all()
+
+
+@pytest.mark.parametrize("task", ["novel_noun", "novel_adj", "visual_manipulation"])
+def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholder(task, episodes):
+    seen, examples = set(), set()
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        before = as_named(episodes[task], rng)
+        after = in_any_order(before, rng)
+        sentences, images = before.text.split(". "), _images(before)
+        assert all(images[name] == rows for name, rows in _images(after).items())
+        assert after.prompt_counts.sum() == len(after.prompt)
+        found = after.text.removesuffix(".").split(". ")
+        of_before = [sentence.removesuffix(".") for sentence in sentences]
+        assert set(found) <= set(of_before)
+        left_out = set(of_before) - set(found)
+        assert all(" than " in sentence for sentence in left_out)
+        (instruction,) = (k for k, sentence in enumerate(found) if sentence.startswith("Put "))
+        seen.add(instruction)
+        examples.add(sum(" than " in sentence for sentence in found))
+    assert {0, 1, 2} <= seen
+    assert examples == ({1, 2, 3} if task == "novel_adj" else {0})
+
+
+@pytest.mark.parametrize("task", ["twist", "rearrange", "same_shape"])
+def test_prompts_that_explain_nothing_stay_in_order(task, episodes):
+    episode = episodes[task]
+    assert in_any_order(episode, np.random.default_rng(0)) is episode
+
+
+def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        text = in_any_order(as_named(episodes["pick_in_order_then_restore"], rng), rng).text
+        assert ". Finally restore it into its original container." in text
+        assert text.index("Put ") < text.index("Finally")
 
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "pick_in_order_then_restore"])

@@ -13,10 +13,17 @@ def overlaps(some: ObjectViews, others: ObjectViews) -> np.ndarray:
     That is intersection over union of their boxes, in the view in which it is larger; 0 where no view shows
     both.
     """
+    return box_overlaps(some.boxes, some.masks, others.boxes, others.masks)
+
+
+def box_overlaps(
+    some: np.ndarray, some_shown: np.ndarray, others: np.ndarray, others_shown: np.ndarray
+) -> np.ndarray:
+    """Return the same from boxes, (2, N, 4) and (2, M, 4), and where they are shown, (2, N) and (2, M)."""
     ours, theirs = _edges(some)[:, :, None], _edges(others)[:, None]
     first, last = np.maximum(ours[..., :2], theirs[..., :2]), np.minimum(ours[..., 2:], theirs[..., 2:])
     shared = np.prod(np.maximum(last - first, 0), axis=-1)
-    both_shown = some.masks[:, :, None] & others.masks[:, None]
+    both_shown = some_shown[:, :, None] & others_shown[:, None]
     shares = np.where(both_shown, shared / (_areas(ours) + _areas(theirs) - shared), 0.0)
     return shares.max(axis=0)
 
@@ -43,10 +50,10 @@ def slots_of_ids(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
     return slots
 
 
-def _edges(objects: ObjectViews) -> np.ndarray:
+def _edges(boxes: np.ndarray) -> np.ndarray:
     """Left, upper, right and lower edge of the boxes, shape (2, N, 4); a pixel is one wide."""
-    sizes = objects.boxes[..., :1:-1]  # width and height, one pixel short
-    first = objects.boxes[..., :2] - sizes // 2
+    sizes = boxes[..., :1:-1]  # width and height, one pixel short
+    first = boxes[..., :2] - sizes // 2
     return np.concatenate([first, first + sizes + 1], axis=-1)
 
 

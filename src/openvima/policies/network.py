@@ -39,8 +39,10 @@ from openvima.policies.layers.comparison import Comparison, Sights, TurnBetween,
 from openvima.policies.layers.frame_encoder import FrameEncoder
 from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
 from openvima.policies.layers.prompt_encoder import PromptEncoder
+from openvima.policies.layers.referents import referents
 from openvima.policies.layers.trunk import TrunkState, build_trunk
 from openvima.policies.layers.uninitialised import Uninitialised
+from openvima.policies.tokenizer import PADDING_ID, texture_word_ids
 from openvima.scene import END_EFFECTORS
 
 NUM_END_EFFECTORS = len(END_EFFECTORS)
@@ -53,12 +55,14 @@ class Memory:
 
     Args:
         tokens_BLD: Encoded words and images.
-        roles_BLD: The same, encoded without knowing what the objects look like.
+        roles_BLD: The same, encoded without knowing what the objects look like; with word looks, neither from
+            names of textures.
         mask_BL: Which places exist.
-        object_mask_BL: Which of them are images.
+        object_mask_BL: Which of them are images, or words that refer to one.
         appearance_BLA: Appearance of their objects; zero elsewhere.
         sights: What the images show, shapes (B, M, ...), for networks that compare or copy.
         scenes: The same as the head needs it.
+        word_looks_BLA: How what each word describes looks, for heads that copy; zero where none stands.
     """
 
     tokens_BLD: torch.Tensor
@@ -68,6 +72,7 @@ class Memory:
     appearance_BLA: torch.Tensor
     sights: Sights | None = None
     scenes: Remembered | None = None
+    word_looks_BLA: torch.Tensor | None = None
 
     def select(self, rows: Sequence[int]) -> "Memory":
         """Return the prompts of some rows of the batch."""
@@ -80,6 +85,7 @@ class Memory:
             self.appearance_BLA[index],
             self.sights.select(rows) if self.sights else None,
             self.scenes.select(rows) if self.scenes else None,
+            None if self.word_looks_BLA is None else self.word_looks_BLA[index],
         )
 
 
@@ -167,6 +173,11 @@ class PolicyNetwork(nn.Module):
         self.trunk = build_trunk(config.trunk)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head: ActionHead = _head(config)
+        self.word_looks: nn.Linear | None = None
+        if isinstance(self.head, CopyingHead):
+            assert isinstance(images, ObjectEncoderConfig)  # the config has seen to it
+            self.word_looks = nn.Linear(config.prompt.text.width, images.appearance_width, bias=False)
+            nn.init.zeros_(self.word_looks.weight)
         self.compare_within: Comparison | None = None  # the prompt, or what is in view
         self.compare_with_prompt: Comparison | None = None
         if config.comparison:
@@ -196,20 +207,35 @@ class PolicyNetwork(nn.Module):
         if self.compare_within or isinstance(self.head, CopyingHead):
             shown = self._shown(prompts, is_image_BL, features_VSF, looks_SA)
         changes_SD = None if shown is None else shown.changes_SD
-        encoded_BLD = self._read(prompts, features_VSF, changes_SD)
+        refers_BLL = None
+        if self.config.prompt.referents:
+            refers_BLL = referents(prompts.words_BL, prompts.images_BL, prompts.mask_BL)
+            refers_BLL = refers_BLL.to(features_VSF.dtype)
+        encoded_BLD = self._read(prompts, features_VSF, changes_SD, refers_BLL)
         roles_BLD = encoded_BLD
         appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
         if width:
-            roles_BLD = self._read(prompts, torch.zeros_like(features_VSF), changes_SD)
+            # Else a role could be told by which textures had it in training.
+            words_BL = torch.where(self._describes(prompts.words_BL), PADDING_ID, prompts.words_BL)
+            blind = replace(prompts, words_BL=words_BL)
+            roles_BLD = self._read(blind, torch.zeros_like(features_VSF), changes_SD, refers_BLL)
             if len(looks_SA):
                 appearance_BLA = looks_SA[prompts.images_BL.clamp(min=0)] * is_image_BL[..., None]
-        memory = Memory(encoded_BLD, roles_BLD, prompts.mask_BL, is_image_BL, appearance_BLA)
+        shows_BL = is_image_BL
+        if refers_BLL is not None:
+            appearance_BLA = appearance_BLA + refers_BLL @ appearance_BLA
+            shows_BL = is_image_BL | (refers_BLL > 0).any(dim=-1)
+        memory = Memory(encoded_BLD, roles_BLD, prompts.mask_BL, shows_BL, appearance_BLA)
         if shown is None:
             return memory
         place_BMD = shown.order_BM[..., None].expand(-1, -1, encoded_BLD.shape[-1])
         scenes = _remembered(encoded_BLD.gather(1, place_BMD), shown.sights, shown.turns_BMR)
         scenes = replace(scenes, numbers_BK=_scene_numbers(shown.sights))
-        return replace(memory, sights=shown.sights, scenes=scenes)
+        word_looks_BLA = None
+        if self.word_looks is not None:
+            describes_BL1 = self._describes(prompts.words_BL)[..., None]
+            word_looks_BLA = self.word_looks(self.prompt.words(prompts.words_BL)) * describes_BL1
+        return replace(memory, sights=shown.sights, scenes=scenes, word_looks_BLA=word_looks_BLA)
 
     def begin(self, memory: Memory) -> HistoryState:
         """Return the state after the prompt and before the first step."""
@@ -335,6 +361,8 @@ class PolicyNetwork(nn.Module):
             # The first component is told at the query, each other one at the one before it.
             components_BTCD=torch.cat([query_BT1D, outputs[-1][:, :, :-1]], dim=2) if after else None,
             recollection=self._recollection(memory, state, history.steps_BT.shape[1]),
+            word_looks_BMA=memory.word_looks_BLA,
+            prompt_exists_BM=memory.mask_BL,
         )
         return inputs, state
 
@@ -378,13 +406,26 @@ class PolicyNetwork(nn.Module):
             read_BT = read_BT - history.masks_BTVN.shape[-1] + history.counts_BT.clamp(min=1)
         return slots_BTQD, mask_BTQ, read_BT
 
+    def _describes(self, words_BL: torch.Tensor) -> torch.Tensor:
+        """Which words say how something looks, (B, L): in our own vocabulary names of textures.
+
+        Other words may not have looks: they would be those of what the training told of in such words.
+        """
+        if self.word_looks is None or self.config.prompt.tokenizer != "closed":
+            return torch.zeros_like(words_BL, dtype=torch.bool)
+        return torch.isin(words_BL, torch.tensor(sorted(texture_word_ids()), device=words_BL.device))
+
     def _read(
-        self, prompts: PromptBatch, features_VSF: torch.Tensor, changes_SD: torch.Tensor | None
+        self,
+        prompts: PromptBatch,
+        features_VSF: torch.Tensor,
+        changes_SD: torch.Tensor | None,
+        refers_BLL: torch.Tensor | None,
     ) -> torch.Tensor:
         tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
         if changes_SD is not None:
             tokens_IE = tokens_IE + changes_SD
-        return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE)
+        return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE, refers_BLL)
 
     def _shown(
         self,
@@ -574,5 +615,5 @@ def _head(config: PolicyConfig) -> ActionHead:
     if isinstance(head, CopyingConfig):
         assert isinstance(config.images, ObjectEncoderConfig)  # the config has seen to it
         images = config.images
-        return CopyingHead(head, width, images.appearance_width, images.turn_bins if config.comparison else 0)
+        return CopyingHead(head, width, images.turn_bins if config.comparison else 0)
     return BinsHead(head, width) if isinstance(head, BinsConfig) else PointingHead(head, width)

@@ -46,7 +46,7 @@ def nano_bins() -> "PolicyConfig":
 
 
 def small() -> "PolicyConfig":
-    """8.4 M parameters: it copies places that it has seen, and compares objects with each other."""
+    """8.5 M parameters: it copies places that it has seen, and compares objects with each other."""
     from openvima.policies.config import PolicyConfig
     from openvima.policies.heads.copying import CopyingConfig
     from openvima.policies.layers.comparison import ComparisonConfig
@@ -69,7 +69,7 @@ def small() -> "PolicyConfig":
             crop_dropout=0.35,
             turn_bins=72,
         ),
-        prompt=PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size()),
+        prompt=PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size(), referents=True),
         trunk=DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
         head=CopyingConfig(),
         action_width=64,

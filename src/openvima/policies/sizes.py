@@ -14,7 +14,7 @@ PARTS = {
     "images": ("images.", "end_effectors.", "observation_out.", "compare_"),
     "trunk": ("trunk.self_blocks.", "trunk.cross_blocks."),
     "actions": ("actions.",),
-    "head": ("head.",),
+    "head": ("head.", "word_looks."),
     "positions": ("trunk.positions.", "trunk.prompt_positions.", "trunk.separator", "query"),
 }
 

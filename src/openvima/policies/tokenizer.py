@@ -10,6 +10,7 @@ from functools import cache
 from importlib import resources
 from typing import Protocol
 
+from openvima.catalog import TEXTURES
 from openvima.errors import PromptError
 
 PADDING_ID, END_ID = 0, 1
@@ -24,6 +25,13 @@ def word_ids() -> dict[str, int]:
     """Return every word and punctuation mark with its id; numbers from 0 to 360 lie below them."""
     text = resources.files("openvima.policies").joinpath("vocabulary.txt").read_text(encoding="utf-8")
     return {word: _FIRST_WORD_ID + index for index, word in enumerate(text.split())}
+
+
+@cache
+def texture_word_ids() -> frozenset[int]:
+    """Return the ids of the words that textures are named by, such as "blue" and "stripe"."""
+    words = {word for name in TEXTURES for word in name.split()} - {"and"}
+    return frozenset(word_ids()[word] for word in words)
 
 
 def vocabulary_size() -> int:

@@ -17,6 +17,7 @@ from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.config import DETECTED_SHARE, MATCHING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
+from openvima.training.retelling import Retelling
 from openvima.training.run_folder import flattened
 from openvima.training.schedule import step_seed
 
@@ -27,6 +28,8 @@ _OF_PRESETS = (
     "motion_share",
     "bystander_share",
     "naming_share",
+    "reordering_share",
+    "stranger_share",
     "autoregressive",
     "visual_residual",
 )
@@ -64,7 +67,7 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
         )
     if config.t5 is not None and not reads_with_t5:
         raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
-    for name in ("bystander_share", "naming_share"):
+    for name in ("bystander_share", "naming_share", "stranger_share"):
         if getattr(config, name) and not isinstance(images, ObjectEncoderConfig):
             raise ConfigError(
                 f"{name} is {getattr(config, name):g}, but preset {config.preset!r} sees whole frames; it "
@@ -126,9 +129,12 @@ def build_learner(config: TrainingConfig) -> Learner:
         network,
         reader,
         spurious_probability=config.spurious_probability,
-        motion_share=config.motion_share,
-        bystander_share=config.bystander_share,
-        naming_share=config.naming_share,
+        retelling=Retelling(
+            motion_share=config.motion_share,
+            bystander_share=config.bystander_share,
+            naming_share=config.naming_share,
+            reordering_share=config.reordering_share,
+        ),
     )
 
 

@@ -27,6 +27,8 @@ _BOUNDS: dict[str, tuple[float, float | None]] = {
     "motion_share": (0, 1),
     "bystander_share": (0, 1),
     "naming_share": (0, 1),
+    "reordering_share": (0, 1),
+    "stranger_share": (0, 1),
     "detected_share": (0, 1),
     "pretraining_steps": (0, None),
     "pretraining_scenes": (1, None),
@@ -84,6 +86,10 @@ class TrainingConfig:
             out of view, and how probable that pictures of the motion leave it out. Needs true boxes.
         naming_share: Share of demonstrations whose prompts get invented nouns for objects: "This is a wug
             {image}." Those that have invented words of their own stay as they are.
+        reordering_share: Share of demonstrations in whose prompts sentences that explain invented words come
+            in any order, and of several comparisons perhaps only some.
+        stranger_share: Share of the demonstrations of five tasks, whose prompts show whatever matters, into
+            whose view up to three objects of another demonstration come.
         boxes: Detector whose boxes part of the demonstrations are shown with, images of prompts included:
             "detector" for the one that comes with the package, "detector=folder" for another trained one, or
             "module:function" or "file.py:function", which makes an `ObjectFinder`.
@@ -155,6 +161,8 @@ class TrainingConfig:
     motion_share: float = 0.0
     bystander_share: float = 0.0
     naming_share: float = 0.0
+    reordering_share: float = 0.0
+    stranger_share: float = 0.0
     boxes: str | None = None
     detected_share: float | None = None
     pretraining_steps: int | None = None

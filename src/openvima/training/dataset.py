@@ -39,11 +39,13 @@ class Example:
         tokens: The demonstration.
         base: Images of the stack before its own: its image n is number `base + n` there, and 0 stays 0.
         row: Its number among all demonstrations.
+        other: Another one, from which objects may be borrowed.
     """
 
     tokens: TokenEpisode
     base: int = 0
     row: int = 0
+    other: "Example | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

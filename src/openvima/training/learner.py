@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from openvima.data.tokens.episode import TokenEpisode, TokenKind
+from openvima.data.tokens.episode import TokenKind
 from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.checkpoint import load_weights, write_checkpoint
@@ -20,8 +20,7 @@ from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
 from openvima.training.collate import Collator
 from openvima.training.dataset import Batch, Example, stack_images, token_kind
-from openvima.training.inverse_dynamics import as_motion
-from openvima.training.rereading import as_named, without_bystanders
+from openvima.training.retelling import AS_TOLD, Retelling
 
 # From examples and, while training, one generator for each of them, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -85,10 +84,7 @@ class PolicyLearner(Learner):
         network: The network; it is trained in place.
         reader: How it sees prompts and observations.
         spurious_probability: How often each view of each step shows an object that is none.
-        motion_share: Share of demonstrations that are read as motions, see `as_motion`; the others keep the
-            prompts of their tasks.
-        bystander_share: How probable it is that motions leave an object out, see `without_bystanders`.
-        naming_share: Share of the others whose objects get names, see `as_named`.
+        retelling: How demonstrations are told otherwise.
     """
 
     def __init__(
@@ -97,9 +93,7 @@ class PolicyLearner(Learner):
         reader: Reader,
         *,
         spurious_probability: float = 0.0,
-        motion_share: float = 0.0,
-        bystander_share: float = 0.0,
-        naming_share: float = 0.0,
+        retelling: Retelling = AS_TOLD,
     ) -> None:
         super().__init__()
         self.network = network
@@ -107,18 +101,13 @@ class PolicyLearner(Learner):
         self.token_kind = token_kind(reader)
         self.score = network.head.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
-        self._spurious_probability, self._motion_share = spurious_probability, motion_share
-        self._bystander_share, self._naming_share = bystander_share, naming_share
+        self._spurious_probability, self._retelling = spurious_probability, retelling
 
     def collator(self) -> "PolicyCollate":
         """Return what makes batches; see `Learner`."""
+        with_images = self.features is None
         return PolicyCollate(
-            self.reader,
-            self._spurious_probability,
-            with_images=self.features is None,
-            motion_share=self._motion_share,
-            bystander_share=self._bystander_share,
-            naming_share=self._naming_share,
+            self.reader, self._spurious_probability, with_images=with_images, retelling=self._retelling
         )
 
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -155,10 +144,7 @@ class PolicyCollate:
         spurious_probability: How often each view of each step shows an object that is none.
         with_images: Put the images that are used into the batch, each once. Without, numbers count through
             the images of all demonstrations.
-        motion_share: Share of demonstrations that are read as motions. When validating they all are if it is
-            1, and else none.
-        bystander_share: As in `PolicyLearner`; not when validating.
-        naming_share: As in `PolicyLearner`; not when validating.
+        retelling: How demonstrations are told otherwise; when validating, as motions if all are, else not.
     """
 
     def __init__(
@@ -167,14 +153,11 @@ class PolicyCollate:
         spurious_probability: float,
         *,
         with_images: bool,
-        motion_share: float = 0.0,
-        bystander_share: float = 0.0,
-        naming_share: float = 0.0,
+        retelling: Retelling = AS_TOLD,
     ) -> None:
         self._collate = Collator(reader)
         self._probability, self._with_images = spurious_probability, with_images
-        self._motion_share = motion_share
-        self._bystander_share, self._naming_share = bystander_share, naming_share
+        self._retelling = retelling
 
     def __call__(
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
@@ -182,34 +165,13 @@ class PolicyCollate:
         """Make a batch; see `Learner.collator`."""
         reader, stack = self._collate.reader, None
         if self._with_images:
-            examples, stack = stack_images([example.tokens for example in examples], reader)
-        examples = self._with_prompts(examples, rngs)
+            examples, stack = _stacked(examples, reader)
+        drawn = [None] * len(examples) if rngs is None else rngs
+        examples = [self._retelling(example, rng) for example, rng in zip(examples, drawn, strict=True)]
         batch = self._collate(examples)
         if rngs is not None:
             batch = augmented(batch, reader.layout, probability=self._probability, rngs=rngs)
         return batch if stack is None else _with_used_images(batch, stack)
-
-    def _with_prompts(
-        self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None
-    ) -> Sequence[Example]:
-        """Read as many as are wanted as motions; a demonstration has either prompt, never parts of both."""
-        if rngs is None:
-            return (
-                examples if self._motion_share < 1 else [_reread(example, as_motion) for example in examples]
-            )
-        return [_reread(example, self._told, rng) for example, rng in zip(examples, rngs, strict=True)]
-
-    def _told(self, tokens: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
-        share = self._motion_share
-        if share == 1 or (share and rng.random() < share):
-            motion = as_motion(tokens)
-            return without_bystanders(motion, self._bystander_share, rng) if self._bystander_share else motion
-        is_named = self._naming_share and rng.random() < self._naming_share
-        return as_named(tokens, rng) if is_named else tokens
-
-
-def _reread(example: Example, change: Callable[..., TokenEpisode], *given: np.random.Generator) -> Example:
-    return replace(example, tokens=change(example.tokens, *given))
 
 
 def make_learner(name: str) -> Learner:
@@ -250,6 +212,17 @@ def read_tensors(file: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(
             f"{file} cannot be read ({error}); delete {file.parent} and repeat the command."
         ) from error
+
+
+def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example], torch.Tensor]:
+    """Put the images of demonstrations into one stack, and of those from which they borrow objects."""
+    others = [example.other for example in examples if example.other is not None]
+    stacked, stack = stack_images([example.tokens for example in (*examples, *others)], reader)
+    behind = iter(stacked[len(examples) :])
+    return [
+        replace(ours, other=None if example.other is None else next(behind))
+        for example, ours in zip(examples, stacked, strict=False)
+    ], stack
 
 
 def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:

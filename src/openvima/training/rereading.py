@@ -4,6 +4,7 @@
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 
 MOST_NAMES = 2
 DEFINITION = "This is a {noun} {image}."
+_SENTENCE_END = re.compile(r"(?<=\.) ")
+_IS_COMPARISON = re.compile(r"\} is \w+ than \{")
 _INVENTED = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
 _DETERMINED = ("the", "same", "any", "all")  # words after which a noun needs no article
 
@@ -36,7 +39,7 @@ def as_named(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
     text = episode.text
     for name, noun in zip(chosen, nouns, strict=False):
         text = re.sub(rf"(\w+) \{{{name}\}}", lambda found, noun=noun: _noun_phrase(found[1], noun), text)
-    parts = dict(zip(names, np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1]), strict=True))
+    parts = _parts(episode)
     if rng.random() < 0.5:
         others = _others_in_view(episode, parts[chosen[0]], rng)[: len(NOUNS) - count]
         parts |= {f"other_{number}": rows for number, rows in enumerate(others)}
@@ -45,6 +48,42 @@ def as_named(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
         DEFINITION.format(noun=noun, image=f"{{{name}}}") for name, noun in zip(chosen, nouns, strict=False)
     ]
     text = " ".join([*(defined[int(number)] for number in rng.permutation(len(defined))), text])
+    return _with_text(episode, text, parts)
+
+
+def in_any_order(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
+    """Return the same demonstration with the sentences that explain invented words in any order.
+
+    Definitions and comparisons ("{a} is kobar than {b}.") may then come after the instruction, and of several
+    comparisons perhaps only some are left, one at least. So what an image is for has to be read from the
+    words around it and does not follow from its place. Other prompts stay as they are.
+    """
+    explaining, comparisons, instruction = [], [], []
+    for sentence in _SENTENCE_END.split(episode.text):
+        if _IS_COMPARISON.search(sentence):
+            comparisons.append(sentence)
+        elif sentence.startswith(DEFINITION.partition("{")[0]):
+            explaining.append(sentence)
+        else:
+            instruction.append(sentence)
+    if comparisons:
+        kept = rng.permutation(len(comparisons))[: int(rng.integers(1, len(comparisons) + 1))]
+        explaining += [comparisons[int(number)] for number in kept]
+    if not explaining:
+        return episode
+    blocks = [*explaining, " ".join(instruction)]
+    text = " ".join(blocks[int(number)] for number in rng.permutation(len(blocks)))
+    return _with_text(episode, text, _parts(episode))
+
+
+def _parts(episode: TokenEpisode) -> dict[str, np.ndarray]:
+    """Rows of the objects of each prompt image, by its name."""
+    rows = np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1])
+    return dict(zip(image_names(episode.text), rows, strict=True))
+
+
+def _with_text(episode: TokenEpisode, text: str, parts: Mapping[str, np.ndarray]) -> TokenEpisode:
+    """The demonstration with another prompt, which shows some of these images."""
     in_order = [parts[name] for name in image_names(text)]
     return replace(
         episode,

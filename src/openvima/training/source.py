@@ -1,7 +1,7 @@
 """The demonstrations of a run, out of the token cache: those to learn from, and those kept for validation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ from openvima.policies.inputs import Reader
 from openvima.training.dataset import Example
 from openvima.training.learner import Collate
 from openvima.training.lots import lots_of
+from openvima.training.strangers import receives_strangers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +59,8 @@ class Parts:
         count: Make exactly so many parts, whatever the lengths; None makes as many as are useful.
         detected: The same demonstrations with the boxes of a detector; see `with_boxes_of`.
         detected_share: How many are shown with these instead.
+        strangers: Where objects come from that are shown in demonstrations of others; see `with_strangers`.
+        stranger_share: How many demonstrations that can show such ones do.
     """
 
     collate: Collate
@@ -66,6 +69,8 @@ class Parts:
     count: int | None = None
     detected: ExampleSource | None = None
     detected_share: float = 0.0
+    strangers: ExampleSource | None = None
+    stranger_share: float = 0.0
 
     def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
         """Return the batches of one step, each with its number of steps in demonstrations."""
@@ -77,10 +82,13 @@ class Parts:
         return parts
 
     def _shown(self, example: Example, rng: np.random.Generator) -> Example:
-        """Draw whose boxes an example is shown with; it has equally many steps with either."""
-        if self.detected is None or rng.random() >= self.detected_share:
+        """Draw whose boxes an example is shown with, and what else; it has equally many steps with any."""
+        if self.detected is not None and rng.random() < self.detected_share:
+            example = self.detected.example(example.row)
+        source = self.strangers
+        if source is None or not receives_strangers(example.tokens) or rng.random() >= self.stranger_share:
             return example
-        return self.detected.example(example.row)
+        return replace(example, other=source[int(rng.integers(len(source)))])
 
     def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
         if self.count is not None:

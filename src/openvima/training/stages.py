@@ -192,7 +192,17 @@ class Cloning:
         # Sharded weights are gathered at every pass, so all processes must make equally many.
         count = min(config.accumulate, ours) if self._parallel.is_sharded else None
         share = config.detected_share or 0.0
-        parts = Parts(self._learner.collator(), config.seed, largest, count, self._detected, share)
+        strangers = self._training if config.stranger_share else None
+        parts = Parts(
+            self._learner.collator(),
+            config.seed,
+            largest,
+            count,
+            self._detected,
+            share,
+            strangers,
+            config.stranger_share,
+        )
         stream = BatchStream(self._training, self._order, first=step, transform=parts)
         return iter(batches_of(stream, num_workers=min(config.loader_workers, _num_processors())))
 

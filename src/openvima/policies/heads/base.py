@@ -108,13 +108,15 @@ class HeadInputs:
         grasps_BTN2: Table points under the objects' most interior pixels, metres; in float32 at least.
         lifts_BT: Whether the tool lifts what it picks, which then moves rigidly with it; else it pushes.
         prompt_BMD: Encoded prompt, one row for each place.
-        prompt_masks_BM: Which of these places are objects.
+        prompt_masks_BM: Which of these places are objects, or stand for one.
         prompt_appearance_BMA: Appearance of the prompt's objects.
         components_BTCD: Output of the decoder from which each component of the step's action is told, given
             those before it. Only with a token for each component, and where whole histories are read.
         recollection: What was seen elsewhere and before. Only with a head that copies places.
         previous_BTC: The action before each step, metres and quaternions; zero where there was none. Not with
             a token for each component.
+        word_looks_BMA: How what each word of the prompt describes looks. Only with a head that copies places.
+        prompt_exists_BM: Which places of the prompt exist.
     """
 
     query_BTD: torch.Tensor
@@ -130,6 +132,8 @@ class HeadInputs:
     components_BTCD: torch.Tensor | None = None
     recollection: Recollection | None = None
     previous_BTC: torch.Tensor | None = None
+    word_looks_BMA: torch.Tensor | None = None
+    prompt_exists_BM: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

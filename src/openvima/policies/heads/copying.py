@@ -40,6 +40,7 @@ from openvima.policies.heads.candidates import (
     token_at,
     tokens_of_remembered,
 )
+from openvima.policies.heads.description import Description
 from openvima.policies.heads.pointing import (
     OFFSET_UNIT_M,
     Pointer,
@@ -70,8 +71,11 @@ class CopyingConfig:
         num_yaw_bins: Classes of the turn between pick and place, over a full circle; bin 0 means no turn.
         offset_weight: Weight of the offset's loss against the pointers'.
         yaw_weight: Weight of the yaw's loss.
-        look_weight: Weight of the loss of picking by looks alone. It teaches which object of the prompt is
-            meant; known objects can be found without, which is no help with novel ones.
+        look_weight: Weight of the losses of picking, and of placing at an object in view, by looks alone.
+            They teach which object of the prompt is meant, and what words describe; known objects can be
+            found without, which is no help with novel ones.
+        shown_weight: Weight of the loss of asking for the prompt object that looks most like the picked one,
+            where one does. Else what else the prompt shows may serve as well, and not with other prompts.
         num_asked: Objects of the prompt that the pick is compared with at once.
         num_numbers: Images of a prompt, and steps, that are told apart by their number; later ones count as
             the last of these.
@@ -82,6 +86,7 @@ class CopyingConfig:
     offset_weight: float = 2.0
     yaw_weight: float = 0.5
     look_weight: float = 0.5
+    shown_weight: float = 0.5
     num_asked: int = 2
     num_numbers: int = 16
 
@@ -111,12 +116,12 @@ class CopyingHead(ActionHead):
     as the head has.
     """
 
-    def __init__(self, config: CopyingConfig, width: int, appearance_width: int, turn_bins: int = 0) -> None:
+    def __init__(self, config: CopyingConfig, width: int, turn_bins: int = 0) -> None:
         super().__init__()
         self.config = config
         self.shown_turn = ShownTurn(width) if turn_bins == config.num_yaw_bins else None
         self.pick = PickPointer(config, width)
-        self.place = PlacePointer(config, width, appearance_width)
+        self.place = PlacePointer(config, width)
         self.free = FreePoints(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
         self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
@@ -128,13 +133,13 @@ class CopyingHead(ActionHead):
     def loss(
         self, inputs: HeadInputs, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Cross-entropy of both pointers, of the looks and of the yaw, and Huber loss of the offset.
+        """Cross-entropy of both pointers, also by looks alone, and of the yaw, and Huber loss of the offset.
 
         Every candidate at the demonstrated place is right: the loss is that of their chances together. Where
         there is none, the object that the demonstration names is, and the offset has to lead from there to
         the place. If none is named, the nearest free point is right; metrics leave out such a step.
         """
-        inputs = self.with_free_points(inputs)
+        inputs, config = self.with_free_points(inputs), self.config
         has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
         pick_scores, place_scores = self.pick(inputs), self.place(inputs, pick)
         goal = self._goal(inputs, targets, pick)
@@ -147,12 +152,17 @@ class CopyingHead(ActionHead):
         yaw = yaw_bin(turn_of(targets.actions_BTC), self.config.num_yaw_bins)
         surprise = place_scores.logsumexp(-1) - right_scores.logsumexp(-1)
         by_looks = self.pick.by_looks(inputs)
+        at_shown, is_shown_BT = self.pick.surprise_at_shown(inputs, pick)
+        has_other = has_pick & (targets.place_BT >= 0) & (targets.place_BT != pick)
+        beside, place_by_looks = targets.place_BT.clamp(min=0), self.place.by_looks(inputs, pick)
         losses = {
             "pick": masked_mean(cross_entropy(pick_scores, pick), has_pick),
-            "look": masked_mean(cross_entropy(by_looks, pick), has_pick) * self.config.look_weight,
+            "look": masked_mean(cross_entropy(by_looks, pick), has_pick) * config.look_weight,
+            "shown": masked_mean(at_shown, has_pick & is_shown_BT) * config.shown_weight,
+            "place_look": masked_mean(cross_entropy(place_by_looks, beside), has_other) * config.look_weight,
             "place": masked_mean(surprise, has_pick),
-            "offset": masked_mean(offset_loss(offset, true_offset), has_pick) * self.config.offset_weight,
-            "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * self.config.yaw_weight,
+            "offset": masked_mean(offset_loss(offset, true_offset), has_pick) * config.offset_weight,
+            "yaw": masked_mean(cross_entropy(yaw_scores, yaw), has_pick) * config.yaw_weight,
         }
         metrics = pointing_metrics(
             (pick_scores, place_scores, yaw_scores),
@@ -218,7 +228,14 @@ class PickPointer(Pointer):
 
     def __init__(self, config: CopyingConfig, width: int) -> None:
         super().__init__(width, config.num_asked)
+        self.described = Description(width)
         self.lying = mlp((10, config.hidden_width, width))
+
+    def _looks(self, inputs: HeadInputs, sharpness_BTH: torch.Tensor) -> torch.Tensor:
+        """As objects of the prompt look that the query attends to, and as words say."""
+        described_BTA = self.described(inputs, inputs.query_BTD)
+        alike_BTN = (inputs.appearance_BTNA @ described_BTA[..., None]).squeeze(-1)
+        return super()._looks(inputs, sharpness_BTH) + sharpness_BTH.sum(dim=-1, keepdim=True) * alike_BTN
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return what is known of the objects and of how they lie, (B, T, N, D)."""
@@ -271,7 +288,7 @@ class PlacePointer(nn.Module):
     the query attends to, or words: "… into the blue object."
     """
 
-    def __init__(self, config: CopyingConfig, width: int, appearance_width: int) -> None:
+    def __init__(self, config: CopyingConfig, width: int) -> None:
         super().__init__()
         self.context = nn.Linear(2 * width, width)
         self.steps = nn.Embedding(config.num_numbers, width)
@@ -280,9 +297,7 @@ class PlacePointer(nn.Module):
         self.keys = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
         self.prompt_query = nn.Linear(width, width)
         self.prompt_key = nn.Linear(width, width)
-        self.described = nn.Linear(width, appearance_width)  # how what words ask for looks
-        nn.init.zeros_(self.described.weight)
-        nn.init.zeros_(self.described.bias)
+        self.described = Description(width)
         # For each kind of candidate: how much either likeness counts, and how much the kind is wanted.
         self.alike, self.asked, self.kind = (nn.Linear(width, len(KINDS)) for _ in range(3))
         self.geometry = nn.Linear(width, NUM_GEOMETRY)
@@ -297,15 +312,16 @@ class PlacePointer(nn.Module):
     def forward(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Return scores, shape (B, T, C); candidates that do not exist score the most negative number."""
         kept, last = recollection_of(inputs), self.steps.num_embeddings - 1
-        picked_BTD, scale = at(inputs.objects_BTND, pick_BT), inputs.query_BTD.shape[-1] ** -0.5
-        context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
-        context_BTD = torch.relu(context_BTD + self.steps(kept.steps_T.clamp(max=last)))
-        query_BTD = self.query(context_BTD) * scale
+        context_BTD = self._context(inputs, pick_BT)
+        query_BTD = self.query(context_BTD) * inputs.query_BTD.shape[-1] ** -0.5
         numbers_BK = torch.cat([part.numbers_BK for part in kept.parts], dim=1)
         kept_BKD = tokens_of_remembered(self.keys, kept) + self.images(numbers_BK.clamp(max=last))
         keys_BTND = self.keys[0](inputs.objects_BTND)
         scores_BTC = products(query_BTD, keys_BTND, kept_BKD)
-        alike_BTC, asked_BTC = self._likeness(inputs, pick_BT, context_BTD, scale)
+        kept_BKA = torch.cat([part.appearance_BKA for part in kept.parts], dim=1)
+        picked_BTA = at(inputs.appearance_BTNA, pick_BT)
+        alike_BTC = products(picked_BTA, inputs.appearance_BTNA, kept_BKA)
+        asked_BTC = products(self._asked_look(inputs, context_BTD), inputs.appearance_BTNA, kept_BKA)
         kinds_C = kinds_of(inputs)
         scores_BTC = scores_BTC + F.softplus(self.alike(context_BTD))[..., kinds_C] * alike_BTC
         scores_BTC = scores_BTC + F.softplus(self.asked(context_BTD))[..., kinds_C] * asked_BTC
@@ -316,17 +332,28 @@ class PlacePointer(nn.Module):
         scores_BTC = scores_BTC + self.same(context_BTD) * picked_BTC
         return scores_BTC.masked_fill(~candidate_masks(inputs), torch.finfo(scores_BTC.dtype).min)
 
-    def _likeness(
-        self, inputs: HeadInputs, pick_BT: torch.Tensor, context_BTD: torch.Tensor, scale: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """How much candidates look like the picked object and like what is asked for, both (B, T, C)."""
-        kept_BKA = torch.cat([part.appearance_BKA for part in recollection_of(inputs).parts], dim=1)
-        picked_BTA = at(inputs.appearance_BTNA, pick_BT)
-        asked_BTA = self.described(context_BTD)
-        if inputs.prompt_BMD.shape[1]:
-            asked_BTM = self.prompt_query(context_BTD) @ self.prompt_key(inputs.prompt_BMD).mT * scale
-            hidden = torch.finfo(asked_BTM.dtype).min
-            asked_BTM = torch.softmax(asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden), dim=-1)
-            asked_BTA = asked_BTA + asked_BTM @ inputs.prompt_appearance_BMA
-        alike_BTC = products(picked_BTA, inputs.appearance_BTNA, kept_BKA)
-        return alike_BTC, products(asked_BTA, inputs.appearance_BTNA, kept_BKA)
+    def by_looks(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Return scores (B, T, N) of objects in view, by likeness to what is asked for alone."""
+        context_BTD = self._context(inputs, pick_BT)
+        look_BTA = self._asked_look(inputs, context_BTD)
+        scores_BTN = (inputs.appearance_BTNA @ look_BTA[..., None]).squeeze(-1)
+        scores_BTN = scores_BTN * F.softplus(self.asked(context_BTD))[..., :1].detach()
+        return scores_BTN.masked_fill(~inputs.masks_BTN, torch.finfo(scores_BTN.dtype).min)
+
+    def _context(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """What decides on the place: what is asked for, for which object, and at which step, (B, T, D)."""
+        steps_T = recollection_of(inputs).steps_T.clamp(max=self.steps.num_embeddings - 1)
+        picked_BTD = at(inputs.objects_BTND, pick_BT)
+        context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
+        return torch.relu(context_BTD + self.steps(steps_T))
+
+    def _asked_look(self, inputs: HeadInputs, context_BTD: torch.Tensor) -> torch.Tensor:
+        """How what is asked for looks, (B, T, A): as words say, and as the prompt object attended to."""
+        look_BTA = self.described(inputs, context_BTD)
+        if not inputs.prompt_BMD.shape[1]:
+            return look_BTA
+        asked_BTM = self.prompt_query(context_BTD) @ self.prompt_key(inputs.prompt_BMD).mT
+        asked_BTM = asked_BTM * context_BTD.shape[-1] ** -0.5
+        hidden = torch.finfo(asked_BTM.dtype).min
+        asked_BTM = asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden)
+        return look_BTA + torch.softmax(asked_BTM, dim=-1) @ inputs.prompt_appearance_BMA

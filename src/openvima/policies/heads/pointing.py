@@ -25,6 +25,8 @@ from openvima.policies.heads.base import (
 from openvima.policies.layers.mlp import mlp
 
 OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
+_ALIKE = 0.3  # cosine of embeddings from which on two pictures may show the same object
+_NEARLY_ALIKE = 0.1  # a difference of cosines that says little
 RIGHT_OFFSET_M = 0.02  # a place this near to the demonstrated one counts as right in the metrics
 
 
@@ -159,6 +161,25 @@ class Pointer(nn.Module):
         """Return the scores by looks alone, as `forward`; their gradient goes to what is attended to."""
         return self._existing(self._looks(inputs, self._sharpness(inputs).detach()), inputs)
 
+    def surprise_at_shown(
+        self, inputs: HeadInputs, pick_BT: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """How surprised the first of the H is that the prompt object most like the picked one is meant.
+
+        Returns:
+            Negative log-likelihoods, and whether the prompt shows an object that is like it at all, both
+            (B, T). Prompt objects that look nearly as much like it count as nearly as right.
+        """
+        if not inputs.prompt_BMD.shape[1]:
+            return torch.zeros_like(inputs.query_BTD[..., 0]), torch.zeros_like(pick_BT, dtype=torch.bool)
+        picked_BTA = at(inputs.appearance_BTNA, pick_BT)
+        alike_BTM = (picked_BTA @ inputs.prompt_appearance_BMA.mT).detach()
+        alike_BTM = alike_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], -1.0)
+        most_BT1 = alike_BTM.amax(dim=-1, keepdim=True)
+        chances_BTM = torch.log_softmax(self._asked(inputs)[:, :, 0], dim=-1)
+        right_BTM = chances_BTM + (alike_BTM - most_BT1) / _NEARLY_ALIKE
+        return -right_BTM.logsumexp(dim=-1), most_BT1.squeeze(-1) > _ALIKE
+
     def _sharpness(self, inputs: HeadInputs) -> torch.Tensor:
         return F.softplus(self.sharpness(inputs.query_BTD))
 
@@ -166,14 +187,17 @@ class Pointer(nn.Module):
         """How much objects look like the H prompt objects that the query attends to, (B, T, N)."""
         if not inputs.prompt_BMD.shape[1]:
             return torch.zeros_like(inputs.appearance_BTNA[..., 0])
-        scale = inputs.query_BTD.shape[-1] ** -0.5
-        query_BTHD = self.prompt_query(inputs.query_BTD).unflatten(-1, (self.num_asked, -1))
-        asked_BTHM = query_BTHD @ self.prompt_key(inputs.prompt_BMD)[:, None].mT * scale
-        hidden = torch.finfo(asked_BTHM.dtype).min
-        asked_BTHM = asked_BTHM.masked_fill(~inputs.prompt_masks_BM[:, None, None], hidden)
-        look_BTHA = torch.softmax(asked_BTHM, dim=-1) @ inputs.prompt_appearance_BMA[:, None]
+        look_BTHA = torch.softmax(self._asked(inputs), dim=-1) @ inputs.prompt_appearance_BMA[:, None]
         look_BTA = (sharpness_BTH[..., None] * look_BTHA).sum(dim=2)
         return (inputs.appearance_BTNA @ look_BTA[..., None]).squeeze(-1)
+
+    def _asked(self, inputs: HeadInputs) -> torch.Tensor:
+        """How much the query asks for each object of the prompt, scores (B, T, H, M)."""
+        query_BTHD = self.prompt_query(inputs.query_BTD).unflatten(-1, (self.num_asked, -1))
+        asked_BTHM = query_BTHD @ self.prompt_key(inputs.prompt_BMD)[:, None].mT
+        asked_BTHM = asked_BTHM * inputs.query_BTD.shape[-1] ** -0.5
+        hidden = torch.finfo(asked_BTHM.dtype).min
+        return asked_BTHM.masked_fill(~inputs.prompt_masks_BM[:, None, None], hidden)
 
     def _existing(self, scores_BTN: torch.Tensor, inputs: HeadInputs) -> torch.Tensor:
         return scores_BTN.masked_fill(~inputs.masks_BTN, torch.finfo(scores_BTN.dtype).min)

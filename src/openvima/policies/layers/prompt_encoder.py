@@ -29,6 +29,8 @@ class PromptEncoderConfig:
             a frozen one. None trains all of it, position biases included.
         visual_residual: Add what goes into the text encoder for an image to what comes out at that place, so
             that what an object looks like reaches the trunk even through a text encoder that knows words.
+        referents: Words bring along the pictures that stood behind the same word before: "This is a wug
+            {image}. Put the wug …"
     """
 
     text: TextEncoderConfig
@@ -38,6 +40,7 @@ class PromptEncoderConfig:
     train_words: bool = True
     trained_layers: int | None = None
     visual_residual: bool = False
+    referents: bool = False
 
     def __post_init__(self) -> None:
         if self.tokenizer not in ("closed", "t5"):
@@ -64,6 +67,8 @@ class PromptEncoder(nn.Module):
         self.images = mlp((image_token_width, config.image_width, config.image_width, words))
         self.text = TextEncoder(config.text)
         self.visual_residual = config.visual_residual
+        # How much a word stands for its picture.
+        self.refers = nn.Linear(words, 1) if config.referents else None
         # The published 768-wide policies have no layer here, since both widths are equal.
         self.out = nn.Identity() if words == width else nn.Linear(words, width, bias=False)
         self._freeze(config)
@@ -74,6 +79,7 @@ class PromptEncoder(nn.Module):
         images_BL: torch.Tensor,
         mask_BL: torch.Tensor,
         image_tokens_IE: torch.Tensor,
+        refers_BLL: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Encode prompts.
 
@@ -82,6 +88,8 @@ class PromptEncoder(nn.Module):
             images_BL: Row of the image token that stands at a place; negative where a word stands.
             mask_BL: Which places are valid.
             image_tokens_IE: Image tokens.
+            refers_BLL: Which places each word refers to, see `referents`; only where words bring along
+                pictures.
 
         Returns:
             Shape (B, L, D); masked places are finite and mean nothing.
@@ -91,7 +99,11 @@ class PromptEncoder(nn.Module):
             return self.out(self.text(tokens_BLW, mask_BL))
         is_image_BL1 = (images_BL >= 0)[..., None]
         chosen_BLW = self.images(image_tokens_IE)[images_BL.clamp(min=0)]
-        encoded_BLW = self.text(torch.where(is_image_BL1, chosen_BLW, tokens_BLW), mask_BL)
+        tokens_BLW = torch.where(is_image_BL1, chosen_BLW, tokens_BLW)
+        if self.refers is not None and refers_BLL is not None:
+            brought_BLW = refers_BLL @ chosen_BLW
+            tokens_BLW = tokens_BLW + torch.sigmoid(self.refers(tokens_BLW)) * brought_BLW
+        encoded_BLW = self.text(tokens_BLW, mask_BL)
         if self.visual_residual:
             encoded_BLW = encoded_BLW + chosen_BLW * is_image_BL1
         return self.out(encoded_BLW)
