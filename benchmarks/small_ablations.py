@@ -137,6 +137,7 @@ def main() -> int:
     parser.add_argument("--only", default=",".join(VARIANTS), help="variants, with commas in between")
     parser.add_argument("--name", default="", help="name in the table, instead of the variant's")
     parser.add_argument("--what", default="", help="what it is, in a few words, instead of the variant's")
+    parser.add_argument("--seed", type=int, default=0, help="of first weights, order and augmentation")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--episodes", type=int, default=40, help="for each task and level")
     parser.add_argument("--levels", default="L1,L3,L4")
@@ -157,13 +158,14 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
     PRESETS[preset] = variant.sizes
     settings = {**_SETTINGS, **variant.settings}
     if variant.crops:
-        settings |= {"init": str(_begin(variant.sizes(), given.crops, folder / "init"))}
+        settings |= {"init": str(_begin(variant.sizes(), given.crops, folder / "init", given.seed))}
     else:
         settings |= {"pretraining_steps": 0}
     config = TrainingConfig(
         data=given.data,
         out=folder / "run",
         preset=preset,
+        seed=given.seed,
         steps=given.steps,
         checkpoint_every=min(200, given.steps),
         **settings,
@@ -187,15 +189,16 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
         "what": given.what or variant.what,
         "demonstrations": len(Dataset(given.data)),
         "steps": given.steps,
+        "seed": given.seed,
         "parameters": sum(p.numel() for p in build_network(variant.sizes(), seed=0).parameters()),
         "minutes": round(minutes, 1),
         "evaluation": os.fspath(folder / "evaluation" / "results.json"),
     }
 
 
-def _begin(sizes: PolicyConfig, crops: Path, folder: Path) -> Path:
+def _begin(sizes: PolicyConfig, crops: Path, folder: Path, seed: int) -> Path:
     """Write fresh weights with the crop encoder of another run, to begin with."""
-    network = build_network(sizes, seed=0)
+    network = build_network(sizes, seed=seed)
     own, other = network.state_dict(), load_file(find_checkpoint(str(crops)) / WEIGHTS_FILE)
     matched = {name: other[name] for name in own if name.startswith(_CROPS)}
     network.load_state_dict({**own, **matched})

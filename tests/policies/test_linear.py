@@ -19,11 +19,11 @@ def layer() -> Linear:
 
 
 def assert_right(layer: Linear, rows: int = 5) -> None:
-    """The layer agrees with the plain product in inference mode."""
+    """The layer agrees with the plain product in inference mode, but for rounding."""
     x = torch.randn(1, rows, layer.in_features, dtype=layer.weight.dtype)
     expected = F.linear(x, layer.weight, layer.bias).detach()
     with torch.inference_mode():
-        torch.testing.assert_close(layer(x), expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(layer(x), expected, rtol=0, atol=5e-6 * float(expected.abs().max()))
 
 
 @pytest.mark.parametrize("rows", [1, 2, 15, 128, 129])
