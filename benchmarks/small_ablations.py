@@ -3,9 +3,9 @@ r"""What the parts of the preset `small` are worth, and what more demonstrations
     python benchmarks/small_ablations.py --data train400 --crops crops --out ablations \
         --only full,no-comparison
 
-Every variant is trained with the same number of steps, then plays the same evaluation episodes. Those that
-match looks begin with the crop encoder of the run `--crops`, which stays as it is; so differences are those
-of cloning. Repeating a command continues it.
+Every variant is trained with the same number of steps, then plays the same evaluation episodes. Most begin
+with the crop encoder of the run `--crops`, which stays as it is; so differences are those of cloning. Two
+match looks for a short time of their own, with and without random ones. Repeating a command continues it.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from openvima.policies.layers.text_encoder import TextEncoderConfig
 from openvima.policies.network import build_network
 from openvima.policies.presets import PRESETS, small
 from openvima.training import TrainingConfig, train
+from openvima.training.recipes import RECIPES
 
 _CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
 _SETTINGS = {
@@ -49,6 +50,11 @@ _SETTINGS = {
     "validation_episodes": 500,
     "tensorboard": False,
 }
+_MATCHING = {
+    **{name: value for name, value in RECIPES["small"].items() if name.startswith("pretraining_")},
+    "pretraining_steps": 1000,
+    "pretraining_scenes": 4000,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +65,7 @@ class Variant:
         what: In a few words.
         sizes: Makes the network's sizes.
         settings: Settings of training that differ.
-        crops: Whether it begins with crops that have been matched.
+        crops: Whether it begins with crops that another run has matched.
     """
 
     what: str
@@ -119,6 +125,12 @@ VARIANTS = {
     "no-reordering": Variant("prompts in the order of the tasks", settings={"reordering_share": 0.0}),
     "no-strangers": Variant("no objects of other demonstrations in view", settings={"stranger_share": 0.0}),
     "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
+    "short-matching": Variant("looks matched in 1,000 steps of its own", settings=_MATCHING, crops=False),
+    "no-random-looks": Variant(
+        "the same without random looks",
+        settings={**_MATCHING, "pretraining_random_looks": 0.0},
+        crops=False,
+    ),
     "vima": Variant(
         "VIMA's architecture, table bins, vision transformer trained along",
         _vima,
@@ -156,11 +168,9 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
     variant, folder = VARIANTS[name], given.out / (given.name or name)
     preset = f"small-{name}"
     PRESETS[preset] = variant.sizes
-    settings = {**_SETTINGS, **variant.settings}
+    settings = {"pretraining_steps": 0, **_SETTINGS, **variant.settings}
     if variant.crops:
         settings |= {"init": str(_begin(variant.sizes(), given.crops, folder / "init", given.seed))}
-    else:
-        settings |= {"pretraining_steps": 0}
     config = TrainingConfig(
         data=given.data,
         out=folder / "run",
