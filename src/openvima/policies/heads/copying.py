@@ -40,7 +40,7 @@ from openvima.policies.heads.candidates import (
     token_at,
     tokens_of_remembered,
 )
-from openvima.policies.heads.description import Description
+from openvima.policies.heads.description import Description, attended
 from openvima.policies.heads.pointing import (
     OFFSET_UNIT_M,
     Pointer,
@@ -352,8 +352,5 @@ class PlacePointer(nn.Module):
         look_BTA = self.described(inputs, context_BTD)
         if not inputs.prompt_BMD.shape[1]:
             return look_BTA
-        asked_BTM = self.prompt_query(context_BTD) @ self.prompt_key(inputs.prompt_BMD).mT
-        asked_BTM = asked_BTM * context_BTD.shape[-1] ** -0.5
-        hidden = torch.finfo(asked_BTM.dtype).min
-        asked_BTM = asked_BTM.masked_fill(~inputs.prompt_masks_BM[:, None], hidden)
-        return look_BTA + torch.softmax(asked_BTM, dim=-1) @ inputs.prompt_appearance_BMA
+        query_BTD, key_BMD = self.prompt_query(context_BTD), self.prompt_key(inputs.prompt_BMD)
+        return look_BTA + attended(query_BTD, key_BMD, inputs.prompt_masks_BM, inputs.prompt_appearance_BMA)

@@ -25,6 +25,13 @@ class Description(nn.Module):
         """Return the mean look of the words that are attended to at each step, (B, T, A)."""
         looks_BMA, masks_BM = inputs.word_looks_BMA, inputs.prompt_exists_BM
         assert looks_BMA is not None and masks_BM is not None  # the network tells heads that copy
-        scores_BTM = self.query(context_BTD) @ self.key(inputs.prompt_BMD).mT * context_BTD.shape[-1] ** -0.5
-        scores_BTM = scores_BTM.masked_fill(~masks_BM[:, None], torch.finfo(scores_BTM.dtype).min)
-        return torch.softmax(scores_BTM, dim=-1) @ looks_BMA
+        return attended(self.query(context_BTD), self.key(inputs.prompt_BMD), masks_BM, looks_BMA)
+
+
+def attended(
+    query_BTD: torch.Tensor, key_BMD: torch.Tensor, masks_BM: torch.Tensor, looks_BMA: torch.Tensor
+) -> torch.Tensor:
+    """Return the mean look of the places of the prompt that are attended to, (B, T, A)."""
+    scores_BTM = query_BTD @ key_BMD.mT * query_BTD.shape[-1] ** -0.5
+    scores_BTM = scores_BTM.masked_fill(~masks_BM[:, None], torch.finfo(scores_BTM.dtype).min)
+    return torch.softmax(scores_BTM, dim=-1) @ looks_BMA
