@@ -198,6 +198,7 @@ class PolicyNetwork(nn.Module):
         """
         features_VSF = features_KF[prompts.crops_VS]
         is_image_BL = (prompts.images_BL >= 0) & prompts.mask_BL
+        describes_BL = self._describes(prompts.words_BL)
         width = _appearance_width(self.config)
         looks_SA = features_VSF.new_zeros(prompts.masks_VS.shape[1], width)
         if width and len(looks_SA):
@@ -216,7 +217,7 @@ class PolicyNetwork(nn.Module):
         appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
         if width:
             # Else a role could be told by which textures had it in training.
-            words_BL = torch.where(self._describes(prompts.words_BL), PADDING_ID, prompts.words_BL)
+            words_BL = torch.where(describes_BL, PADDING_ID, prompts.words_BL)
             blind = replace(prompts, words_BL=words_BL)
             roles_BLD = self._read(blind, torch.zeros_like(features_VSF), changes_SD, refers_BLL)
             if len(looks_SA):
@@ -233,8 +234,7 @@ class PolicyNetwork(nn.Module):
         scenes = replace(scenes, numbers_BK=_scene_numbers(shown.sights))
         word_looks_BLA = None
         if self.word_looks is not None:
-            describes_BL1 = self._describes(prompts.words_BL)[..., None]
-            word_looks_BLA = self.word_looks(self.prompt.words(prompts.words_BL)) * describes_BL1
+            word_looks_BLA = self.word_looks(self.prompt.words(prompts.words_BL)) * describes_BL[..., None]
         return replace(memory, sights=shown.sights, scenes=scenes, word_looks_BLA=word_looks_BLA)
 
     def begin(self, memory: Memory) -> HistoryState:

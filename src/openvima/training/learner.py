@@ -218,10 +218,10 @@ def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example]
     """Put the images of demonstrations into one stack, and of those from which they borrow objects."""
     others = [example.other for example in examples if example.other is not None]
     stacked, stack = stack_images([example.tokens for example in (*examples, *others)], reader)
-    behind = iter(stacked[len(examples) :])
+    own, behind = stacked[: len(examples)], iter(stacked[len(examples) :])
     return [
         replace(ours, other=None if example.other is None else next(behind))
-        for example, ours in zip(examples, stacked, strict=False)
+        for example, ours in zip(examples, own, strict=True)
     ], stack
 
 
