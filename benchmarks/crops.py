@@ -22,7 +22,7 @@ import numpy as np
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import TEXTURE_SETS, tasks_at
 from openvima.policies.checkpoint import load_network
-from openvima.policies.layers.object_encoder import ObjectEncoder
+from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.training.pretrain import (

@@ -36,9 +36,9 @@ from PIL import Image
 from openvima.data import Dataset, Demonstration, ShardWriter, rollout_oracle
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
+from openvima.data.object_cache.cache import open_object_cache
 from openvima.data.records import package_versions
 from openvima.data.schema import ARRAYS, VIEWS
-from openvima.data.tokens.cache import open_tokens
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError, SamplingError
 from openvima.tasks import list_tasks
@@ -281,7 +281,7 @@ def anonymous_megabytes() -> float:
 def measure_tokens(folders: Sequence[Path], num_rounds: int) -> Numbers:
     """Make the token caches of data folders, and read their episodes in random order, the folders mixed."""
     datasets = [Dataset(folder) for folder in folders]
-    making, caches = timed(lambda: [open_tokens(dataset) for dataset in datasets])
+    making, caches = timed(lambda: [open_object_cache(dataset) for dataset in datasets])
     episodes = [(cache, number) for cache in caches for number in range(len(cache))]
     order = np.random.default_rng(0).permutation(len(episodes)).tolist()
     num_steps = sum(int(dataset.index.column("steps").to_numpy().sum()) for dataset in datasets)

@@ -26,11 +26,11 @@ import numpy as np
 import torch
 
 from openvima.data.records import rollout_oracle
-from openvima.detection import PACKAGED, detector_config, load_detector
-from openvima.detection.augment import augmented
-from openvima.detection.detector import FrameDetector
-from openvima.detection.frames import Frame, frame_of
-from openvima.detection.network import MaskRCNN
+from openvima.detector import PACKAGED, detector_config, load_detector
+from openvima.detector.augment import augmented
+from openvima.detector.detector import FrameDetector
+from openvima.detector.frames import Frame, frame_of
+from openvima.detector.network import MaskRCNN
 from openvima.env import TabletopEnv
 from openvima.policies.detection import DetectedObjects
 from openvima.render.camera import VIEWS
@@ -105,14 +105,14 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     frames = [frame for observation in observations for frame in frames_of(observation)]
     shown = statistics.mean(len(frame.boxes) for frame in frames)
     detector, whose = detector_to_measure(options.detector, options.preset, round(shown))
-    finder, step = DetectedObjects(detector), training_step(options.preset, frames)
+    extractor, step = DetectedObjects(detector), training_step(options.preset, frames)
     times: dict[str, list[float]] = {"detect": [], "find": [], "train": []}
     for number in range(options.rounds + 1):
         detect, find = [], []
         for observation in observations:
             pair = [observation["rgb"][view] for view in VIEWS]
             detect.append(seconds(lambda pair=pair: [detector.detect(rgb, "") for rgb in pair]))
-            find.append(seconds(lambda observation=observation: finder.in_observation(observation)))
+            find.append(seconds(lambda observation=observation: extractor.in_observation(observation)))
         train = seconds(step)
         if number:
             times["detect"] += detect

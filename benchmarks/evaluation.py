@@ -29,13 +29,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 
 from openvima.env import TabletopEnv
-from openvima.env.setup import Setup
-from openvima.evaluation.players import PolicyPlayer
-from openvima.evaluation.protocol import PRECISIONS, Batch
+from openvima.env.config import EnvConfig
+from openvima.evaluation.config import PRECISIONS, Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PolicyPlayer
 from openvima.evaluation.runner import Job
-from openvima.policies.acting import NetworkPolicy
+from openvima.policies.inference import NetworkPolicy
 from openvima.policies.inputs import EpisodeReader, Reader
 from openvima.policies.network import PolicyNetwork
 from openvima.render.rasteriser import Rasteriser
@@ -50,7 +50,7 @@ LEVEL = "L1"
 MIN_EPISODES = 4  # of a task in one round, where a batch is smaller
 OTHER = "transfer"
 PHASES: dict[str, list[tuple[Any, str]]] = {  # phase → owner and name of the functions that it consists of
-    "simulation": [(Setup, "make"), (TabletopEnv, "reset"), (TabletopEnv, "step")],
+    "simulation": [(EnvConfig, "make"), (TabletopEnv, "reset"), (TabletopEnv, "step")],
     "rendering": [(Rasteriser, "scene"), (Rasteriser, "prompt")],
     "seeing": [(Reader, "read_prompt"), (EpisodeReader, "read_step")],
     "inference": [

@@ -13,7 +13,7 @@ from pathlib import Path
 from openvima.catalog import LEVELS
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 
-RECORD = Path(__file__).parents[1] / "src/openvima/tasks/measured_oracle.json"
+RECORD = Path(__file__).parents[1] / "src/openvima/tasks/oracle_success.json"
 
 
 def counts(results: Results) -> dict[str, dict[str, dict[str, int]]]:

@@ -34,18 +34,18 @@ import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from openvima.data.object_cache.episode import preprocess
 from openvima.data.records import Demonstration, rollout_oracle
-from openvima.data.tokens.episode import tokens_of
 from openvima.env import TabletopEnv
 from openvima.perception.image_stack import ImageStack
 from openvima.policies import preset
-from openvima.policies.acting import NetworkPolicy
 from openvima.policies.heads.base import ACTION_WIDTH, ActionTargets
+from openvima.policies.inference import NetworkPolicy
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts
 from openvima.policies.network import PolicyNetwork, outline_network
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
 from openvima.training.collate import Collator
-from openvima.training.dataset import stack_images, token_kind
+from openvima.training.dataset import input_kind, stack_images
 from sim import circumstances
 
 HISTORY = 5
@@ -150,10 +150,12 @@ class Training:
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
         reader = Reader.of(network.config.images, tokenizer_of(network))
-        episodes = [tokens_of(demo, token_kind(reader)) for demo in demos]
+        episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
         examples, images = stack_images(episodes, reader)
         batch = Collator(reader)(examples)
-        used = torch.cat([batch.prompts.crops_VS.flatten(), batch.history.crops_BTVN.flatten()]).unique()
+        used = torch.cat(
+            [batch.prompts.crop_index_VS.flatten(), batch.history.crop_index_BTVN.flatten()]
+        ).unique()
         self._used, self._images = used.to(device), images[used].to(device)
         self._num_images = len(images)
         self._prompts, self._history = batch.prompts.to(device), batch.history.to(device)

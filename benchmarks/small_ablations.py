@@ -19,10 +19,10 @@ from typing import Any
 
 from safetensors.torch import load_file
 
+from openvima.atomic_io import atomic_write_file
 from openvima.cli.progress import progress_bar
 from openvima.data import Dataset
 from openvima.evaluation import EvaluationConfig, evaluate
-from openvima.files import write_whole
 from openvima.policies.base import WEIGHTS_FILE, find_checkpoint
 from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.config import PolicyConfig
@@ -30,9 +30,9 @@ from openvima.policies.families.common import SIZES
 from openvima.policies.families.vima import vima
 from openvima.policies.heads.copying import CopyingConfig
 from openvima.policies.heads.pointing import PointingConfig
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.text_encoder import TextEncoderConfig
 from openvima.policies.network import build_network
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.presets import PRESETS, small
 from openvima.training import TrainingConfig, train
 from openvima.training.recipes import RECIPES
@@ -159,7 +159,7 @@ def main() -> int:
             parser.error(f"there is no variant {name!r}; allowed: {', '.join(VARIANTS)}.")
     for name in given.only.split(","):
         row = _measure(given, name)
-        write_whole(given.out / f"{row['name']}.json", json.dumps(row, indent=2) + "\n")
+        atomic_write_file(given.out / f"{row['name']}.json", json.dumps(row, indent=2) + "\n")
         print(row)
     return 0
 

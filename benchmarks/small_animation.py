@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from openvima.env import Setup
+from openvima.atomic_io import atomic_write_file
+from openvima.env import EnvConfig
 from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
 from openvima.errors import ConfigError, OpenVimaError
+from openvima.evaluation.config import Batch
 from openvima.evaluation.film import Artist
-from openvima.evaluation.players import Player, load_player
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
-from openvima.evaluation.protocol import Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.files import write_whole
+from openvima.evaluation.rollout_policies import Player, load_player
 from openvima.scene import RenderedPrompt
 from openvima.sim.ur5 import HOME
 from openvima.tasks import task_spec
@@ -106,7 +106,7 @@ def play_shown(player: Player, wanted: Wanted, *, first_seed: int, width: int) -
     Raises:
         ConfigError: The policy solves none of the first 50.
     """
-    env = Setup().make(wanted.task, wanted.level, domain="user", realtime=True)
+    env = EnvConfig().make(wanted.task, wanted.level, domain="user", realtime=True)
     artist = Artist(env, ENLARGE)
     seeds = [wanted.seed] if wanted.seed is not None else range(first_seed, first_seed + MAX_TRIES)
     for seed in seeds:
@@ -286,7 +286,13 @@ def main() -> None:
         width = (options.width - GAP * (options.columns - 1)) // options.columns
         first = wanted[0]
         batch = Batch(
-            options.policy, options.policy, first.task, first.level, first_seed=0, episodes=1, setup=Setup()
+            options.policy,
+            options.policy,
+            first.task,
+            first.level,
+            first_seed=0,
+            episodes=1,
+            setup=EnvConfig(),
         )
         player = load_player(batch)
         played = [play_shown(player, entry, first_seed=options.seed, width=width) for entry in wanted]
@@ -294,7 +300,7 @@ def main() -> None:
         parser.error(str(error))
     frames = compose(played, columns=options.columns, rows=options.rows, width=width)
     content = encoded(frames, kind, options.quality)
-    write_whole(options.out, content)
+    atomic_write_file(options.out, content)
     for scenes in played:
         ended = f"solved in {scenes.outcome.steps}" if scenes.outcome.success else scenes.outcome.reason
         print(f"{scenes.wanted.task}:{scenes.wanted.level}:{scenes.wanted.seed}  {ended}")

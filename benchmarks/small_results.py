@@ -20,15 +20,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import atomic_write_file
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.comparison import Comparison
 from openvima.evaluation.report.paper import Estimate, Line, Table, markdown, paper_tables
 from openvima.evaluation.report.published import PublishedModel, leading_models, published_models
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
-from openvima.files import write_whole
 from openvima.policies import preset
-from openvima.policies.sizes import policy_size
+from openvima.policies.parameter_counts import policy_size
 from sim import circumstances
 from small_figures import save_all
 from small_findings import (
@@ -273,7 +273,7 @@ def write(findings: Findings, out: Path, images: Path, pages: Sequence[Path], wh
         where: Machine, versions and commit, as of `sim.circumstances`.
     """
     content = json.dumps(record(findings) | where, indent=2, ensure_ascii=False) + "\n"
-    write_whole(out.with_suffix(".json"), content)
+    atomic_write_file(out.with_suffix(".json"), content)
     drawn = save_all(findings, images)
     if (images / _ANIMATION).exists():
         drawn["animation"] = images / _ANIMATION
@@ -282,14 +282,14 @@ def write(findings: Findings, out: Path, images: Path, pages: Sequence[Path], wh
     if not page.exists():
         places = {name: f"{MARK.format(name=name)}\n{END.format(name=name)}" for name in made}
         command = f"python benchmarks/small_results.py EVALUATION --trainings FILES --out {out}"
-        write_whole(page, _PAGE.format(**places, command=command, **where))
+        atomic_write_file(page, _PAGE.format(**places, command=command, **where))
     for path in (*pages, page):
         figures = {
             f"{name}-figure": f"![{_FIGURES[name]}]({Path(os.path.relpath(file, path.parent)).as_posix()})"
             for name, file in drawn.items()
         }
         figures |= {f"{name}-figure": "" for name in _FIGURES if name not in drawn}
-        write_whole(path, fill(path.read_text(encoding="utf-8"), made | figures, where=str(path)))
+        atomic_write_file(path, fill(path.read_text(encoding="utf-8"), made | figures, where=str(path)))
 
 
 def main() -> None:

@@ -29,9 +29,9 @@ import numpy as np
 from openvima.catalog import Assets
 from openvima.env import TabletopEnv
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Scene
-from openvima.sim.blade import SWEEP_M_S
 from openvima.sim.model import FLOOR_Z_M, TICK_S
 from openvima.sim.settling import SETTLE_LIMIT_TICKS
+from openvima.sim.spatula import SWEEP_M_S
 from openvima.sim.world import Execution, World
 from openvima.tasks import list_tasks, task_spec
 

@@ -41,9 +41,9 @@ class Matcher(Learner):
 
     def forward(self, batch):
         """Cross-entropy of the object to pick and of the one to place it on."""
-        looks = self.looks(batch.images, batch.history.crops_BTVN.movedim(2, -1))  # (B, T, N, 64)
-        wanted = self.looks(batch.images, batch.prompts.crops_VS.T)  # one row an object of the prompts
-        rows = batch.prompts.images_BL  # which of them stands where in each prompt; negative for words
+        looks = self.looks(batch.images, batch.history.crop_index_BTVN.movedim(2, -1))  # (B, T, N, 64)
+        wanted = self.looks(batch.images, batch.prompts.crop_index_VS.T)  # one row an object of the prompts
+        rows = batch.prompts.object_index_BL  # which of them stands where in each prompt; negative for words
         first, last = (wanted[torch.stack([row[row >= 0][end] for row in rows])] for end in (0, -1))
         hidden = ~batch.history.masks_BTVN.any(dim=2)
         losses, metrics = [], {}

@@ -7,9 +7,9 @@ import torch
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.common import Size
 from openvima.policies.families.vima import vima
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-from openvima.policies.layers.text_encoder import TextEncoderConfig
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.published import to_published
 
 VOCABULARY_SIZE = 160

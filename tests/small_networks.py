@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from openvima.policies import preset
 from openvima.policies.config import PolicyConfig
-from openvima.policies.layers.comparison import ComparisonConfig
-from openvima.policies.layers.conv_encoder import ConvConfig
+from openvima.policies.nn.comparison import ComparisonConfig
+from openvima.policies.nn.conv_encoder import ConvConfig
 
 
 def narrow_small(width: int = 32, crop_width: int = 4) -> PolicyConfig:

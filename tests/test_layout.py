@@ -20,7 +20,7 @@ ORDER = (
     "env",
     "data",
     "policies",
-    "detection",
+    "detector",
     "serving",
     "training",
     "evaluation",
@@ -35,7 +35,7 @@ FORBIDDEN = {
     "tasks": {"mujoco", "torch", "openvima.sim"},
     "env": {"torch"},
     "policies": {"mujoco", "openvima.sim", "openvima.env"},
-    "detection": {"mujoco", "openvima.sim", "openvima.env"},
+    "detector": {"mujoco", "openvima.sim", "openvima.env"},
     "serving": {"mujoco", "torch", "openvima.sim", "openvima.env"},
     "training": {"mujoco", "openvima.sim", "openvima.env"},
 }

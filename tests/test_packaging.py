@@ -11,7 +11,7 @@ import openvima
 ROOT = Path(__file__).parents[1]
 POLICY_FILES = {"model.safetensors", "config.yaml", "MODEL_CARD.md", "training_data.json"}
 TRAINED = {
-    *(f"openvima/detection/trained/{name}" for name in ("model.safetensors", "config.yaml")),
+    *(f"openvima/detector/trained/{name}" for name in ("model.safetensors", "config.yaml")),
     *(f"openvima/policies/trained/openvima-small/{name}" for name in POLICY_FILES),
 }
 
@@ -42,7 +42,7 @@ def test_a_wheel_holds_the_trained_detector_and_policy(project: Path, tmp_path: 
 
 def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
     pytest.importorskip("torch")
-    from openvima.detection import PACKAGED, load_detector
+    from openvima.detector import PACKAGED, load_detector
 
     assert {file.name for file in PACKAGED.iterdir()} == {"model.safetensors", "config.yaml"}
     assert sum(file.stat().st_size for file in PACKAGED.iterdir()) <= 8e6
@@ -50,7 +50,7 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
 
 
 def test_the_policy_in_the_package_is_small_and_whole() -> None:
-    from openvima.policies.packaged import PACKAGED, SMALL
+    from openvima.policies.bundled import PACKAGED, SMALL
 
     policy = PACKAGED[SMALL]
     assert {file.name for file in policy.folder.iterdir()} == POLICY_FILES

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from openvima.data import Demonstration
-from openvima.data.tokens.episode import tokens_of
+from openvima.data.object_cache.episode import preprocess
 from openvima.policies.inputs import Reader
 from openvima.training import TrainingConfig, train
-from openvima.training.dataset import Example, stack_images, token_kind
+from openvima.training.dataset import Example, input_kind, stack_images
 from openvima.training.source import ExampleSource
 
 
 def examples_of(demos: Iterable[Demonstration], reader: Reader):
     """Examples that share a stack of images, and the stack."""
-    return stack_images([tokens_of(demo, token_kind(reader)) for demo in demos], reader)
+    return stack_images([preprocess(demo, input_kind(reader)) for demo in demos], reader)
 
 
 def source_of(demos: Iterable[Demonstration], reader: Reader) -> ExampleSource:
     """The same as if they had come out of a token cache."""
-    episodes = [tokens_of(demo, token_kind(reader)) for demo in demos]
+    episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
     counts = np.array([len(episode.images) for episode in episodes])
     lengths = np.array([[len(episode.steps), len(episode.objects)] for episode in episodes])
     return ExampleSource(episodes, np.arange(len(episodes)), np.cumsum(counts) - counts, lengths)

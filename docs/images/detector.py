@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import openvima
-from openvima.detection.anchors import pyramid_anchors
-from openvima.detection.config import FIRST_STRIDE, small
-from openvima.detection.frames import Frame, frame_of
-from openvima.detection.masks import cut_masks, paste_masks
-from openvima.detection.matching import match
-from openvima.detection.proposals import BACKGROUND_OVERLAP
-from openvima.detection.roi_align import box_levels
+from openvima.detector.anchors import pyramid_anchors
+from openvima.detector.config import FIRST_STRIDE, small
+from openvima.detector.frames import Frame, frame_of
+from openvima.detector.masks import cut_masks, paste_masks
+from openvima.detector.matching import match
+from openvima.detector.proposals import BACKGROUND_OVERLAP
+from openvima.detector.roi_align import box_levels
 from openvima.render.camera import FRONT
 from openvima.scene import FIRST_OBJECT_ID
 

@@ -21,7 +21,7 @@ from openvima.policies import preset
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
 from openvima.policies.heads.bins import NUM_BINS, encode_bins
 from openvima.policies.inputs import WORD, Reader
-from openvima.policies.layers.trunk import PrefixConfig
+from openvima.policies.nn.trunk import PrefixConfig
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.scene import PromptImage, RenderedPrompt
 

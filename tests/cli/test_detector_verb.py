@@ -12,10 +12,10 @@ pytest.importorskip("pycocotools")
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.data import GenerateConfig, generate  # noqa: E402
-from openvima.detection import config as sizes  # noqa: E402
-from openvima.detection.checkpoint import load_network, save_network  # noqa: E402
-from openvima.detection.config import BackboneConfig, DetectorConfig  # noqa: E402
-from openvima.detection.network import MaskRCNN  # noqa: E402
+from openvima.detector import config as sizes  # noqa: E402
+from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
+from openvima.detector.config import BackboneConfig, DetectorConfig  # noqa: E402
+from openvima.detector.network import MaskRCNN  # noqa: E402
 from openvima.policies.devices import torch_threads  # noqa: E402
 
 
@@ -97,7 +97,7 @@ def test_scores_do_not_depend_on_the_number_of_threads(detector, data, capsys):
 
 
 def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
-    from openvima.detection import detectron2
+    from openvima.detector import detectron2
 
     monkeypatch.setattr(detectron2, "load_detectron2", lambda file: MaskRCNN(tiny))
     words = ["detector", "convert", "weights.pth", str(tmp_path / "converted")]

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from openvima.data import Dataset, Demonstration, GenerateConfig, GenerationProgress, generate, trials
+from openvima.data import (
+    Dataset,
+    Demonstration,
+    GenerateConfig,
+    GenerationProgress,
+    generate,
+    oracle_rollouts,
+)
 from openvima.data.encoding import Skipped
 from openvima.data.planning import SEEDS_PER_EPISODE, SPARE_SEEDS
 from openvima.data.subsets import SubsetConfig, sample
@@ -129,7 +136,7 @@ def test_seeds_that_fail_are_skipped_and_counted(tmp_path: Path, monkeypatch: py
 def test_a_task_that_the_oracle_cannot_solve_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "attempt", lambda env, seed: Skipped(seed, "no_action", "it fell"))
+    monkeypatch.setattr(oracle_rollouts, "attempt", lambda env, seed: Skipped(seed, "no_action", "it fell"))
     with pytest.raises(OracleError, match=r"solved 0 of 20 episodes of 'rotate'.*it fell"):
         generate(config(tmp_path))
     assert contents(tmp_path) == {}
@@ -138,7 +145,7 @@ def test_a_task_that_the_oracle_cannot_solve_is_given_up(
 @pytest.fixture
 def clumsy(monkeypatch: pytest.MonkeyPatch) -> None:
     """An oracle that spoils seed 0, does not end seeds 1 and 20, and is at a loss at seed 2."""
-    rollout = trials.rollout_oracle
+    rollout = oracle_rollouts.rollout_oracle
 
     def sometimes(env: TabletopEnv, seed: int) -> Demonstration:
         if seed == 2:
@@ -147,7 +154,7 @@ def clumsy(monkeypatch: pytest.MonkeyPatch) -> None:
         outcomes = {0: Outcome(False, True, "it fell"), 1: Outcome(), 20: Outcome()}
         return replace(demo, outcome=outcomes.get(seed, demo.outcome))
 
-    monkeypatch.setattr(trials, "rollout_oracle", sometimes)
+    monkeypatch.setattr(oracle_rollouts, "rollout_oracle", sometimes)
 
 
 @pytest.mark.usefixtures("clumsy")

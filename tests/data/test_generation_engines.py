@@ -8,10 +8,10 @@ from types import ModuleType
 import pytest
 
 import worker_jobs
-from openvima.cluster import on_cluster
 from openvima.data import GenerateConfig, GenerationProgress, generate, plan
 from openvima.data.resuming import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
+from openvima.ray_backend import on_cluster
 from small_data_sets import contents
 from small_generations import config
 

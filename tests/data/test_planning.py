@@ -8,7 +8,7 @@ import pytest
 
 from openvima.data import GenerateConfig, plan
 from openvima.data.planning import MAX_EPISODES, MAX_FIRST_SEED, shard_episodes
-from openvima.env import Setup
+from openvima.env import EnvConfig
 from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks.seeding import MAX_SEED
 from small_generations import config
@@ -69,7 +69,7 @@ def test_settings_survive_their_record(tmp_path: Path) -> None:
         tmp_path,
         level="L1",
         start_seed=5,
-        setup=Setup(compat=True, difficulty="hard"),
+        setup=EnvConfig(compat=True, difficulty="hard"),
         compression="zstd",
         images=False,
     )

@@ -17,12 +17,12 @@ from openvima.data import (
     ShardWriter,
     VerifyConfig,
     generate,
+    oracle_rollouts,
     repair,
-    trials,
     verify,
 )
 from openvima.data.encoding import ShardInfo
-from openvima.data.tokens.cache import open_tokens
+from openvima.data.object_cache.cache import open_object_cache
 from openvima.env import TabletopEnv
 from openvima.errors import DatasetError, OpenVimaError, ShardError
 from openvima.scene import Outcome
@@ -43,13 +43,13 @@ def _fail_seed_1(env: TabletopEnv, seed: int) -> object:
     return dataclasses.replace(trial, outcome=Outcome(failure=True, reason="it fell"))
 
 
-_attempt = trials.attempt
+_attempt = oracle_rollouts.attempt
 
 
 @pytest.fixture(autouse=True)
 def seed_1_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that there are failed episodes to keep."""
-    monkeypatch.setattr(trials, "attempt", _fail_seed_1)
+    monkeypatch.setattr(oracle_rollouts, "attempt", _fail_seed_1)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole")
     config = GenerateConfig(out=out, tasks=TASKS, episodes=3, shard_size=2, keep_failed=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trials, "attempt", _fail_seed_1)
+        patch.setattr(oracle_rollouts, "attempt", _fail_seed_1)
         return generate(config)
 
 
@@ -189,7 +189,7 @@ def test_a_shard_that_comes_out_otherwise_replaces_nothing(
 ) -> None:
     flip(folder / FIRST, 9000)
     before = contents(folder)
-    monkeypatch.setattr(trials, "attempt", _attempt)  # so that seed 1 is solved
+    monkeypatch.setattr(oracle_rollouts, "attempt", _attempt)  # so that seed 1 is solved
     with pytest.raises(DatasetError, match=r"generated again, but not with the bytes"):
         repair(folder, LOOK)
     assert contents(folder) == before
@@ -319,7 +319,7 @@ def test_records_without_anything_that_says_what_they_are_stay_where_they_are(me
 def test_tokens_that_are_not_those_of_the_demonstrations_are_found_and_deleted(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    first, second = (path for path in sorted(open_tokens(Dataset(folder)).folder.glob("rotate-*")))
+    first, second = (path for path in sorted(open_object_cache(Dataset(folder)).folder.glob("rotate-*")))
     num_files = len(list(folder.glob("*.arrow")))
     assert main(["data", "verify", str(folder), "--replay", "0"]) == 0
     assert f"0 played again, {num_files} files of tokens compared\n" in capsys.readouterr().out
@@ -330,7 +330,7 @@ def test_tokens_that_are_not_those_of_the_demonstrations_are_found_and_deleted(
     done = repair(folder, LOOK)
     assert done.after.is_clean, done.after.problems
     assert done.deleted == tuple(names)
-    open_tokens(Dataset(folder))
+    open_object_cache(Dataset(folder))
     assert verify(folder, LOOK).is_clean
 
 

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.batching import BatchOrder  # noqa: E402
-from openvima.data.tokens.cache import open_tokens  # noqa: E402
+from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, tensors_of  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 
@@ -132,7 +132,7 @@ def test_the_global_generator_is_left_alone() -> None:
 
 @pytest.mark.parametrize("source", ["images", "tokens"])
 def test_episodes_of_a_data_set_come_in_batches(demos: Dataset, source: str) -> None:
-    episodes = demos if source == "images" else open_tokens(demos)
+    episodes = demos if source == "images" else open_object_cache(demos)
     loader = BatchLoader(episodes, BatchOrder(8, batch=4, seed=0), workers=1)
     seen = [(episode.task, episode.seed) for batch in loader for episode in batch]
     assert sorted(seen) == sorted((demo.task, demo.seed) for demo in demos)

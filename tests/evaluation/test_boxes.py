@@ -8,7 +8,7 @@ import pytest
 from openvima.errors import ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 
-FINDERS = Path(__file__).parents[1] / "plugged_finders.py"
+EXTRACTORS = Path(__file__).parents[1] / "plugged_extractors.py"
 CONFIG = EvaluationConfig(
     ("untrained",),
     ("visual_manipulation",),
@@ -33,12 +33,12 @@ def rows(tmp_path: Path):
 
 
 def test_a_detector_that_finds_what_the_segmentation_says_changes_nothing(rows):
-    plain, detected = rows(f"{FINDERS}:truth")
+    plain, detected = rows(f"{EXTRACTORS}:truth")
     assert detected == plain
 
 
 def test_a_detector_that_finds_nothing_fails_its_episodes_and_stops_nobody(rows):
-    _, detected = rows(f"{FINDERS}:Blind")
+    _, detected = rows(f"{EXTRACTORS}:Blind")
     assert [outcome.success for outcome in detected] == [False, False]
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation import save_episode_picture
 from openvima.evaluation.film import Artist, film_episode
-from openvima.evaluation.players import OraclePlayer
+from openvima.evaluation.rollout_policies import OraclePlayer
 from openvima.sim.ur5 import HOME
 
 

@@ -8,10 +8,10 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation import EvaluationConfig, Results
-from openvima.evaluation.controls import CONTROLS, IN_CONTEXT, sight
+from openvima.evaluation.ablations import CONTROLS, IN_CONTEXT, sight
 from openvima.evaluation.in_context import HELD_OUT_TASKS, held_out_tasks
-from openvima.evaluation.players import PolicyPlayer
 from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PolicyPlayer
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import RandomPolicy
 from openvima.policies.tokenizer import encode_text

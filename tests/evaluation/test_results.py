@@ -4,10 +4,10 @@ import json
 
 import pytest
 
+from openvima.atomic_io import atomic_write_file
 from openvima.errors import DatasetError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row, failure_kind
 from openvima.evaluation.statistics import wilson_interval
-from openvima.files import write_whole
 
 
 def test_rows_hold_what_scripts_rely_on(results):
@@ -90,9 +90,9 @@ def test_results_of_another_schema_are_refused(tmp_path):
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_temporary_one(tmp_path):
-    path = write_whole(tmp_path / "a.json", "old")
+    path = atomic_write_file(tmp_path / "a.json", "old")
     with pytest.raises(UnicodeEncodeError):
-        write_whole(path, "\ud800")
+        atomic_write_file(path, "\ud800")
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["a.json"]
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import pytest
 
 from openvima.errors import ActionError, OracleError, PolicyError
-from openvima.evaluation.players import PolicyPlayer
 from openvima.evaluation.rollout import (
     BAD_ACTION,
     NO_ORACLE_ACTION,
@@ -14,6 +13,7 @@ from openvima.evaluation.rollout import (
     WRONG_PICKED,
     play,
 )
+from openvima.evaluation.rollout_policies import PolicyPlayer
 from openvima.scene import RenderedPrompt
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from openvima.env import Setup
+from openvima.env import EnvConfig
 from openvima.errors import AssetError, ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 
@@ -111,5 +111,5 @@ def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
 
 def test_an_unknown_asset_pack_is_named_before_anything_is_written(tmp_path):
     with pytest.raises(AssetError, match="nosuch"):
-        evaluate(replace(ORACLE, out=tmp_path / "out", setup=Setup(assets="nosuch")))
+        evaluate(replace(ORACLE, out=tmp_path / "out", setup=EnvConfig(assets="nosuch")))
     assert not (tmp_path / "out").exists()

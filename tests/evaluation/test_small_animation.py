@@ -7,8 +7,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from openvima.errors import ConfigError, OpenVimaError
-from openvima.evaluation.players import OraclePlayer
 from openvima.evaluation.results import EpisodeOutcome
+from openvima.evaluation.rollout_policies import OraclePlayer
 from small_animation import SHOWN, Scenes, Wanted, compose, encoded, play_shown, tracks_of
 
 WIDTH = 200

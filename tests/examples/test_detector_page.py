@@ -9,8 +9,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.cli.detector import COMMANDS  # noqa: E402
-from openvima.detection.config import detector_config  # noqa: E402
-from openvima.detection.network import MaskRCNN  # noqa: E402
+from openvima.detector.config import detector_config  # noqa: E402
+from openvima.detector.network import MaskRCNN  # noqa: E402
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE = (DOCS / "detector.md").read_text(encoding="utf-8")

@@ -11,7 +11,7 @@ pytest.importorskip("torch")
 
 from openvima.policies import preset
 from openvima.policies.heads.candidates import FreePoints
-from openvima.policies.sizes import policy_size
+from openvima.policies.parameter_counts import policy_size
 from openvima.training.recipes import RECIPES
 
 ROOT = Path(__file__).parents[2]

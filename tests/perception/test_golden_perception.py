@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openvima.perception.objects import ObjectViews, see_objects
+from openvima.perception.objects import ObjectViews, extract_objects
 
 GOLDEN = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model" / "preprocess.npz"
 pytestmark = pytest.mark.skipif(not GOLDEN.is_file(), reason=f"no golden data at {GOLDEN}")
@@ -21,7 +21,7 @@ def golden() -> dict[str, np.ndarray]:
 def seen(golden: dict[str, np.ndarray], prefix: str, ids: np.ndarray) -> ObjectViews:
     rgb = {view: golden[f"{prefix}.rgb.{view}"] for view in ("front", "top")}
     segm = {view: golden[f"{prefix}.segm.{view}"] for view in ("front", "top")}
-    return see_objects(rgb, segm, ids)
+    return extract_objects(rgb, segm, ids)
 
 
 @pytest.mark.parametrize(("view", "name"), [(0, "front"), (1, "top")])

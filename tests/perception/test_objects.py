@@ -13,9 +13,9 @@ from openvima.perception.objects import (
     GroundTruth,
     ObjectViews,
     crop_box,
+    extract_objects,
     observe,
     observe_prompt_image,
-    see_objects,
     whole_frames,
 )
 from openvima.render.camera import CAMERAS, unproject
@@ -38,7 +38,7 @@ def empty(shape: tuple[int, int] = (128, 256)) -> dict[str, np.ndarray]:
 def seen_in_top(shown: np.ndarray, rgb: dict[str, np.ndarray] | None = None) -> ObjectViews:
     segm = empty(shown.shape)
     segm["top"][shown] = ID
-    return see_objects(rgb or noise(shape=shown.shape), segm, [ID])
+    return extract_objects(rgb or noise(shape=shown.shape), segm, [ID])
 
 
 def rectangle(rows: slice, columns: slice, shape: tuple[int, int] = (128, 256)) -> np.ndarray:
@@ -131,7 +131,7 @@ def test_objects_at_the_border_lose_nothing(rows: slice, columns: slice) -> None
 def test_an_object_hidden_from_above_is_placed_by_the_front_view() -> None:
     segm = empty()
     segm["front"][60:70, 100:111] = ID
-    objects = see_objects(noise(), segm, [ID])
+    objects = extract_objects(noise(), segm, [ID])
     assert objects.masks[:, 0].tolist() == [True, False]
     expected = unproject(np.array([105, 64]), CAMERAS["front"])
     np.testing.assert_array_equal(objects.positions()[0], expected)
@@ -145,14 +145,14 @@ def test_an_object_in_both_views_is_placed_by_the_top_view() -> None:
     segm["front"][60:70, 100:111] = ID
     segm["top"][20:30, 30:41] = ID
     expected = unproject(np.array([35, 24]), CAMERAS["top"])
-    np.testing.assert_array_equal(see_objects(noise(), segm, [ID]).positions()[0], expected)
+    np.testing.assert_array_equal(extract_objects(noise(), segm, [ID]).positions()[0], expected)
 
 
 def test_slots_are_the_same_object_in_both_views_until_compacted() -> None:
     segm = empty()
     segm["front"][10:20, 10:20] = 7
     segm["top"][10:20, 10:20] = 8
-    objects = see_objects(noise(), segm, [7, 8])
+    objects = extract_objects(noise(), segm, [7, 8])
     assert objects.masks.tolist() == [[True, False], [False, True]]
     compacted = objects.compacted()
     assert compacted.masks.tolist() == [[True, False], [True, False]]
@@ -211,7 +211,7 @@ def test_images_that_are_not_contiguous_give_the_same() -> None:
     rgb, segm = noise(), empty()
     segm["top"][shown] = ID
     turned = {view: np.moveaxis(np.moveaxis(image, 0, -1).copy(), -1, 0) for view, image in rgb.items()}
-    plain, other = see_objects(rgb, segm, [ID]), see_objects(turned, segm, [ID])
+    plain, other = extract_objects(rgb, segm, [ID]), extract_objects(turned, segm, [ID])
     np.testing.assert_array_equal(plain.crops, other.crops)
 
 
@@ -260,19 +260,19 @@ def test_frames_of_two_sizes_are_refused() -> None:
 def test_images_of_another_shape_or_dtype_are_refused() -> None:
     rgb, segm = noise(), empty()
     with pytest.raises(ShapeError, match="rgb 'front'"):
-        see_objects({**rgb, "front": rgb["front"].astype(float)}, segm, [ID])
+        extract_objects({**rgb, "front": rgb["front"].astype(float)}, segm, [ID])
     with pytest.raises(ShapeError, match="rgb 'front'"):
-        see_objects({**rgb, "front": rgb["front"].transpose(1, 2, 0)}, segm, [ID])
+        extract_objects({**rgb, "front": rgb["front"].transpose(1, 2, 0)}, segm, [ID])
     with pytest.raises(ShapeError, match="segm 'top'"):
-        see_objects(rgb, {**segm, "top": segm["top"][:-1]}, [ID])
+        extract_objects(rgb, {**segm, "top": segm["top"][:-1]}, [ID])
 
 
 def test_a_missing_view_is_named() -> None:
     rgb, segm = noise(), empty()
     with pytest.raises(PolicyError, match="rgb lacks the view top; it must hold an image of front and top"):
-        see_objects({"front": rgb["front"]}, segm, [ID])
+        extract_objects({"front": rgb["front"]}, segm, [ID])
     with pytest.raises(PolicyError, match="segm lacks the view front"):
-        see_objects(rgb, {"top": segm["top"]}, [ID])
+        extract_objects(rgb, {"top": segm["top"]}, [ID])
     with pytest.raises(PolicyError, match="rgb lacks the view front and top"):
         whole_frames(rgb["front"])
 
@@ -280,7 +280,7 @@ def test_a_missing_view_is_named() -> None:
 @pytest.mark.parametrize("number", [-1, 256])
 def test_ids_that_no_segmentation_holds_are_refused(number: int) -> None:
     with pytest.raises(PolicyError, match="0 … 255"):
-        see_objects(noise(), empty(), [5, number])
+        extract_objects(noise(), empty(), [5, number])
 
 
 @pytest.mark.parametrize("part", ["rgb", "segm", "ee"])

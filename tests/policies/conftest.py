@@ -51,7 +51,7 @@ def small_sizes():
     """A nano network that is narrower and shallower."""
     pytest.importorskip("torch")
     from openvima.policies import preset
-    from openvima.policies.layers.conv_encoder import ConvConfig
+    from openvima.policies.nn.conv_encoder import ConvConfig
 
     sizes = preset("nano")
     return replace(

@@ -27,9 +27,9 @@ from tests.policies.golden import (
 
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, to_unit_range
 from openvima.policies.inputs import WORD, HistoryBatch, Reader, StepInput
-from openvima.policies.layers.places import Places
-from openvima.policies.layers.trunk import Decoder, PrefixTrunk
 from openvima.policies.network import Memory, PolicyNetwork
+from openvima.policies.nn.places import Places
+from openvima.policies.nn.trunk import Decoder, PrefixTrunk
 from openvima.render.camera import VIEWS
 
 
@@ -44,7 +44,7 @@ def stages(network: PolicyNetwork, recorded: Arrays) -> Arrays:
 
     history, features = read_histories(network, inputs.histories)
     with watched(network) as seen:
-        slots_BTQD, mask_BTQ, _ = network.observe(history, features[history.crops_BTVN])
+        slots_BTQD, mask_BTQ, _ = network.observe(history, features[history.crop_index_BTVN])
         unit_BTC = network.head.as_history(to_unit_range(inputs.actions_BTC[:, :-1])).float()
         actions_BTD = network.actions(unit_BTC)
     result |= _step_image_stages(network, recorded, seen)
@@ -76,7 +76,7 @@ def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
     for t, end_effector in enumerate(recorded["in.ee"][:, 0]):
         steps.append(step_of(recorded, f"roll.step{t}", (), int(end_effector)))
         history, features = read_histories(network, [steps[-1:]])
-        slots_BTQD, _, _ = network.observe(history, features[history.crops_BTVN])
+        slots_BTQD, _, _ = network.observe(history, features[history.crop_index_BTVN])
 
         filled, counts = _filled(steps)
         with _zero_vectors_beyond(network, counts[-1:]):

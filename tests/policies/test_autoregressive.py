@@ -10,7 +10,6 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError, PolicyError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.families.midas import with_autoregression, with_visual_residual  # noqa: E402
 from openvima.policies.heads.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
@@ -21,6 +20,7 @@ from openvima.policies.heads.base import (  # noqa: E402
     to_unit_range,
 )
 from openvima.policies.heads.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
@@ -234,10 +234,10 @@ def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonst
     prompts = batch.prompts
     memory, plain = (network.encode_prompts(prompts, features) for network in (on, off))
     added_BLD = memory.tokens_BLD - plain.tokens_BLD
-    is_image_BL = prompts.images_BL >= 0
+    is_image_BL = prompts.object_index_BL >= 0
     assert not added_BLD[~is_image_BL].any()
-    tokens_IE = on.images(features[prompts.crops_VS], prompts.boxes_VS4, prompts.masks_VS)
-    expected = on.prompt.images(tokens_IE)[prompts.images_BL[is_image_BL]]
+    tokens_IE = on.images(features[prompts.crop_index_VS], prompts.boxes_VS4, prompts.masks_VS)
+    expected = on.prompt.images(tokens_IE)[prompts.object_index_BL[is_image_BL]]
     torch.testing.assert_close(added_BLD[is_image_BL], expected)  # widths are equal: no layer behind
     assert expected.abs().max() > 1e-3
 

@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.layers.comparison import (  # noqa: E402
+from openvima.policies.nn.comparison import (  # noqa: E402
     Comparison,
     ComparisonConfig,
     Sights,
@@ -16,8 +16,8 @@ from openvima.policies.layers.comparison import (  # noqa: E402
     earlier,
     others,
 )
-from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 
 B, N, M, V, F, A, D = 2, 3, 4, 2, 6, 5, 8
 IMAGES = ObjectEncoderConfig(

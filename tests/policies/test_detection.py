@@ -102,11 +102,11 @@ def test_prompt_images_are_seen_alike_but_for_the_order_of_their_records(task: s
 
 def test_a_segmentation_is_never_looked_at(starts) -> None:
     _, seen = starts[0]
-    finder = DetectedObjects(perfect(seen["segm"], 5))
-    expected = finder.in_observation(seen)
+    extractor = DetectedObjects(perfect(seen["segm"], 5))
+    expected = extractor.in_observation(seen)
     for segm in ({}, None, dict.fromkeys(VIEWS, "garbage")):
-        assert_same(finder.in_observation({**seen, "segm": segm}), expected)
-    assert_same(finder.in_observation({key: seen[key] for key in ("rgb", "ee")}), expected)
+        assert_same(extractor.in_observation({**seen, "segm": segm}), expected)
+    assert_same(extractor.in_observation({key: seen[key] for key in ("rgb", "ee")}), expected)
 
 
 def test_the_detector_is_shown_both_views_as_they_are() -> None:
@@ -179,23 +179,23 @@ def test_detections_of_low_score_are_left_out() -> None:
 def test_an_image_of_one_object_shows_the_likeliest_one_however_unsure() -> None:
     rows = boxes((10, 10, 20, 20), (150, 10, 160, 20))
     front, top = (Detections(rows, scores=np.array(scores)) for scores in ([0.1, 0.2], [0.9, 0.8]))
-    finder = DetectedObjects(Fixed(front, top))
-    found = finder.in_prompt_image(prompt_image("object"))
+    extractor = DetectedObjects(Fixed(front, top))
+    found = extractor.in_prompt_image(prompt_image("object"))
     assert found.boxes[:, :, 0].tolist() == [[155], [15]]
-    assert len(finder.in_prompt_image(prompt_image("scene"))) == 2
+    assert len(extractor.in_prompt_image(prompt_image("scene"))) == 2
 
 
 def test_an_image_in_which_nothing_is_found_shows_nothing() -> None:
-    finder = DetectedObjects(Fixed(plain(), plain()))
+    extractor = DetectedObjects(Fixed(plain(), plain()))
     for kind in ("object", "scene"):
-        assert len(finder.in_prompt_image(prompt_image(kind))) == 0
+        assert len(extractor.in_prompt_image(prompt_image(kind))) == 0
 
 
-def test_prompt_images_can_be_left_to_another_finder(starts) -> None:
+def test_prompt_images_can_be_left_to_another_extractor(starts) -> None:
     env, _ = starts[0]
-    finder = DetectedObjects(Fixed(plain(), plain()), prompt_finder=GROUND_TRUTH)
+    extractor = DetectedObjects(Fixed(plain(), plain()), prompt_extractor=GROUND_TRUTH)
     for image in env.prompt.images.values():
-        assert_same(finder.in_prompt_image(image), observe_prompt_image(image))
+        assert_same(extractor.in_prompt_image(image), observe_prompt_image(image))
 
 
 def test_boxes_in_real_numbers_take_in_every_pixel_they_touch() -> None:
@@ -252,12 +252,12 @@ def test_detections_that_do_not_fit_the_image_are_refused(found, error: type, me
 
 
 def test_images_that_no_detector_was_made_for_are_refused() -> None:
-    finder = DetectedObjects(Fixed(plain(), plain()))
+    extractor = DetectedObjects(Fixed(plain(), plain()))
     with pytest.raises(PolicyError, match="no 'rgb'"):
-        finder.in_observation({"ee": 0})
+        extractor.in_observation({"ee": 0})
     with pytest.raises(PolicyError, match="rgb lacks the view top"):
-        finder.in_observation({"rgb": {"front": noise()["front"]}, "ee": 0})
+        extractor.in_observation({"rgb": {"front": noise()["front"]}, "ee": 0})
     with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
-        finder.in_observation(observation({view: image[:, :64] for view, image in noise().items()}))
+        extractor.in_observation(observation({view: image[:, :64] for view, image in noise().items()}))
     with pytest.raises(PolicyError, match="prompt image 'thing' lacks the view front"):
-        finder.in_prompt_image(prompt_image("object", {"top": noise()["top"]}))
+        extractor.in_prompt_image(prompt_image("object", {"top": noise()["top"]}))

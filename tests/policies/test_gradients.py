@@ -18,9 +18,9 @@ from openvima.policies.families.midas import midas  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
-from openvima.policies.layers.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
-from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
+from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
@@ -153,10 +153,10 @@ def prompt_encoder(trained_layers: int | None) -> PromptEncoder:
 
 
 def encoded(encoder: PromptEncoder, images_IE):
-    words_BL = torch.arange(20).view(2, 10)
-    images_BL = torch.full_like(words_BL, -1)
-    images_BL[:, 3 : 3 + len(images_IE) // 2] = torch.arange(len(images_IE)).view(2, -1)
-    return encoder(words_BL, images_BL, torch.ones_like(words_BL, dtype=torch.bool), images_IE)
+    word_ids_BL = torch.arange(20).view(2, 10)
+    object_index_BL = torch.full_like(word_ids_BL, -1)
+    object_index_BL[:, 3 : 3 + len(images_IE) // 2] = torch.arange(len(images_IE)).view(2, -1)
+    return encoder(word_ids_BL, object_index_BL, torch.ones_like(word_ids_BL, dtype=torch.bool), images_IE)
 
 
 def test_gradients_reach_images_through_a_frozen_text_encoder() -> None:

@@ -10,8 +10,8 @@ torch = pytest.importorskip("torch")
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
@@ -52,8 +52,8 @@ LEFT, RIGHT = [20, 60, 40, 80], [200, 60, 220, 80]
 
 
 def test_slots_of_a_missed_object_are_kept_black_at_the_end_of_each_view() -> None:
-    finder = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], [], [LEFT, RIGHT]))
-    episode = Reader("views", finder=finder).begin_episode()
+    extractor = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], [], [LEFT, RIGHT]))
+    episode = Reader("views", extractor=extractor).begin_episode()
     steps = [episode.read_step(seen()).objects for _ in range(4)]
     assert [len(step) for step in steps] == [len(steps[0])] * 4
     both, missed, none, again = steps
@@ -70,8 +70,8 @@ def test_slots_of_a_missed_object_are_kept_black_at_the_end_of_each_view() -> No
 
 
 def test_fused_slots_follow_what_is_found() -> None:
-    finder = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], []))
-    episode = Reader("objects", finder=finder).begin_episode()
+    extractor = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], []))
+    episode = Reader("objects", extractor=extractor).begin_episode()
     counts = [episode.read_step(seen()).objects.visible().sum() for _ in range(2)]
     assert counts[1] < counts[0]
     with pytest.raises(PolicyError, match=r"shows no object.*min_score"):
@@ -87,8 +87,8 @@ def test_a_first_observation_without_objects_is_refused(layout: str) -> None:
 def test_detected_objects_act(small_sizes, demonstrations) -> None:
     """A policy that acts on detections neither needs nor reads a segmentation."""
     demo = demonstrations[0]
-    finder = DetectedObjects(Scripted([LEFT, RIGHT]), prompt_finder=GROUND_TRUTH)
-    policy = NetworkPolicy(build_network(small_sizes, seed=0), finder=finder)
+    extractor = DetectedObjects(Scripted([LEFT, RIGHT]), prompt_extractor=GROUND_TRUTH)
+    policy = NetworkPolicy(build_network(small_sizes, seed=0), extractor=extractor)
     policy.reset([demo.prompt])
     first = demo.observation(0)
     (action,) = policy.act([{key: first[key] for key in ("rgb", "ee")}])

@@ -10,9 +10,9 @@ torch = pytest.importorskip("torch")
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import UnknownPolicyError  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.base import Policy  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402

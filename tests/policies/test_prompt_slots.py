@@ -27,7 +27,7 @@ class Scripted:
 def read(*names: str):
     images = {name: PromptImage(name, "scene", {}, {}, ()) for name in names}
     prompt = RenderedPrompt("put " + " ".join(f"{{{name}}}" for name in names), images)
-    return Reader("views", finder=Scripted()).read_prompt(prompt)
+    return Reader("views", extractor=Scripted()).read_prompt(prompt)
 
 
 def test_every_image_takes_as_many_slots_as_the_fullest_one_of_each_view():

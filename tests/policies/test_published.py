@@ -18,10 +18,10 @@ from openvima.policies.families.flamingo import flamingo  # noqa: E402
 from openvima.policies.families.gato import gato  # noqa: E402
 from openvima.policies.families.gpt import gpt  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig  # noqa: E402
-from openvima.policies.layers.text_encoder import TextEncoderConfig  # noqa: E402
-from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network, outline_network  # noqa: E402
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
+from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
 from openvima.policies.published import (  # noqa: E402
     config_from_published,

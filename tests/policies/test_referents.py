@@ -9,8 +9,8 @@ torch = pytest.importorskip("torch")
 
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies.inputs import Reader, batch_prompts  # noqa: E402
-from openvima.policies.layers.referents import referents  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.nn.referents import referents  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 WORD = -1
@@ -65,10 +65,10 @@ def _encoded(network, prompt):
 
 def test_a_noun_looks_as_the_picture_that_explained_it(network, prompt):
     memory, prompts = _encoded(network, prompt)
-    shares = referents(prompts.words_BL, prompts.images_BL, prompts.mask_BL)[0]
+    shares = referents(prompts.word_ids_BL, prompts.object_index_BL, prompts.mask_BL)[0]
     nouns = shares.any(dim=1).nonzero()[:, 0]
     assert len(nouns) == 2  # the instruction names both, and "a" stands before no picture
-    is_image = prompts.images_BL[0] >= 0
+    is_image = prompts.object_index_BL[0] >= 0
     assert torch.equal(memory.object_mask_BL[0], is_image | shares.any(dim=1))
     for noun in nouns:
         (picture,) = shares[noun].nonzero()[:, 0]

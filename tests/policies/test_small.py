@@ -8,13 +8,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
-from openvima.data.tokens.episode import tokens_of  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts, on_table  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
@@ -196,9 +196,9 @@ def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(d
         prompt = reader.read_prompt(demo.prompt)
         batch = batch_prompts([prompt], [np.zeros((2, len(prompt.objects)), np.int64)])
         counts = [len(image.objects) for image in demo.prompt.images.values()]
-        assert batch.numbers_S.tolist() == np.repeat(np.arange(len(counts)), counts).tolist()
+        assert batch.image_index_S.tolist() == np.repeat(np.arange(len(counts)), counts).tolist()
         kinds = [image.kind == "scene" for image in demo.prompt.images.values()]
-        assert batch.on_table_S.tolist() == np.repeat(kinds, counts).tolist(), task
+        assert batch.in_scene_S.tolist() == np.repeat(kinds, counts).tolist(), task
         np.testing.assert_array_equal(batch.positions_S2, prompt.objects.positions())
 
 
@@ -217,7 +217,7 @@ def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tel
             batch, features = batch_prompts([read], [numbers]), network.encode_images(images)
             scenes = network.encode_prompts(batch, features).scenes
             shown = network._shown(
-                batch, batch.images_BL >= 0, features[batch.crops_VS], scenes.appearance_BKA[0]
+                batch, batch.object_index_BL >= 0, features[batch.crop_index_VS], scenes.appearance_BKA[0]
             )
         told.append((scenes.numbers_BK, scenes.turns_BKR, shown.changes_SD[None]))
     for before, after in zip(*told, strict=True):
@@ -237,10 +237,10 @@ def test_one_object_in_the_middle_stands_alone_and_all_else_is_the_table():
 def test_motions_show_the_table(demos):
     reader = Reader("objects")
     examples, _ = examples_of(demos[:1], reader)
-    motion = as_motion(tokens_of(demos[0], "objects"))
+    motion = as_motion(preprocess(demos[0], "objects"))
     batch = Collator(reader)([replace(examples[0], tokens=motion)])
-    assert batch.prompts.on_table_S.all()
-    assert batch.prompts.numbers_S.max() == demos[0].num_steps
+    assert batch.prompts.in_scene_S.all()
+    assert batch.prompts.image_index_S.max() == demos[0].num_steps
 
 
 def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):

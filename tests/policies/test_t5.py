@@ -13,8 +13,8 @@ pytest.importorskip("transformers")
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
-from openvima.policies.layers.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for  # noqa: E402
 from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
 from openvima.scene import PromptImage, RenderedPrompt  # noqa: E402
@@ -246,10 +246,10 @@ def test_hidden_states_equal_those_of_transformers_with_masks_and_far_positions(
 ) -> None:
     prompt = loaded(small_sizes, weights_folder).prompt
     generator = torch.Generator().manual_seed(1)
-    words_BL = torch.randint(0, 128, (3, 150), generator=generator)  # distances beyond the last bucket
+    word_ids_BL = torch.randint(0, 128, (3, 150), generator=generator)  # distances beyond the last bucket
     mask_BL = torch.rand(3, 150, generator=generator) < 0.7
-    expected = reference(input_ids=words_BL, attention_mask=mask_BL.long()).last_hidden_state
-    actual = prompt.text(prompt.words(words_BL), mask_BL)
+    expected = reference(input_ids=word_ids_BL, attention_mask=mask_BL.long()).last_hidden_state
+    actual = prompt.text(prompt.words(word_ids_BL), mask_BL)
     torch.testing.assert_close(actual[mask_BL], expected[mask_BL], rtol=0, atol=1e-5)
 
 
@@ -375,12 +375,12 @@ def test_the_norm_keeps_the_precision_of_float64() -> None:
 @torch.no_grad()
 def test_bfloat16_gives_finite_states_near_those_of_float32(weights_folder, small_sizes) -> None:
     prompt = loaded(small_sizes, weights_folder).prompt
-    words_BL = torch.arange(40).view(1, -1)
-    mask_BL = torch.ones_like(words_BL, dtype=torch.bool)
+    word_ids_BL = torch.arange(40).view(1, -1)
+    mask_BL = torch.ones_like(word_ids_BL, dtype=torch.bool)
     mask_BL[:, ::5] = False
-    exact = prompt.text(prompt.words(words_BL), mask_BL)
+    exact = prompt.text(prompt.words(word_ids_BL), mask_BL)
     prompt = prompt.bfloat16()
-    halved = prompt.text(prompt.words(words_BL), mask_BL)
+    halved = prompt.text(prompt.words(word_ids_BL), mask_BL)
     assert halved.dtype == torch.bfloat16
     assert halved.isfinite().all()
     error = (halved.float() - exact)[mask_BL].square().mean().sqrt() / exact[mask_BL].square().mean().sqrt()

@@ -9,8 +9,8 @@ import pytest
 
 import openvima
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
-from openvima.data.looks import looks_of, seeds_of
-from openvima.data.unseen import beyond_training
+from openvima.data.appearance_stats import looks_of, seeds_of
+from openvima.data.leakage import beyond_training
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.seeding import stream

@@ -7,9 +7,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.policies.layers.turns import TurnEstimator  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.nn.turns import RelativeRotation  # noqa: E402
 
 BINS = 72
 FRONT, TOP = 0, 1
@@ -72,7 +72,7 @@ def test_without_a_common_view_all_turns_are_equally_probable(encoder):
 
 
 def test_moved_phases_are_a_turn():
-    estimator = TurnEstimator(features=256, bins=BINS)
+    estimator = RelativeRotation(features=256, bins=BINS)
     with torch.no_grad():
         for view in estimator.views:  # features are the waves themselves
             view.weight.copy_(torch.eye(256))

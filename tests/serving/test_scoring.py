@@ -15,10 +15,10 @@ torch = pytest.importorskip("torch")
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError, ServerError  # noqa: E402
 from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E402
-from openvima.evaluation.players import PolicyPlayer, load_player  # noqa: E402
-from openvima.evaluation.protocol import Batch, policy_sources  # noqa: E402
+from openvima.evaluation.config import Batch, policy_sources  # noqa: E402
+from openvima.evaluation.rollout_policies import PolicyPlayer, load_player  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.presets import preset  # noqa: E402
 from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402

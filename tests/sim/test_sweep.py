@@ -7,9 +7,9 @@ import pytest
 
 from openvima.scene import Action, Scene
 from openvima.sim import World
-from openvima.sim.blade import SWEEP_M_S, Blade
 from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
 from openvima.sim.settling import WATCH_TICKS
+from openvima.sim.spatula import SWEEP_M_S, Blade
 from openvima.sim.stage import Stage
 from sim_tables import ASSETS, Body, table
 

@@ -7,19 +7,19 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data.tokens.episode import tokens_of  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS  # noqa: E402
 from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import Example, stack_images, token_kind  # noqa: E402
+from openvima.training.dataset import Example, input_kind, stack_images  # noqa: E402
 from training_examples import examples_of  # noqa: E402
 
 READERS = {
     "objects": Reader("objects"),
-    "views": Reader("views", finder=PUBLISHED_ORDER),
+    "views": Reader("views", extractor=PUBLISHED_ORDER),
     "frames": Reader("frames", (64, 128), tokens_per_frame_pair=3),
 }
 
@@ -47,7 +47,7 @@ def as_when_acting(demos, reader: Reader):
 @pytest.mark.parametrize("layout", READERS)
 def test_training_and_acting_see_the_same(layout, demonstrations_of_several_steps):
     reader, demos = READERS[layout], demonstrations_of_several_steps
-    examples, images = stack_images([tokens_of(demo, token_kind(reader)) for demo in demos], reader)
+    examples, images = stack_images([preprocess(demo, input_kind(reader)) for demo in demos], reader)
     batch = Collator(reader)(examples)
     *expected, expected_images = as_when_acting(demos, reader)
     for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
@@ -73,7 +73,7 @@ def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
 
 def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
-    examples, images = stack_images([tokens_of(demo, "objects") for demo in demos], READERS["objects"])
+    examples, images = stack_images([preprocess(demo, "objects") for demo in demos], READERS["objects"])
     spurious = Collator(READERS["objects"])(examples).spurious
     for b, demo in enumerate(demos):
         for t in range(demo.num_steps):
@@ -89,15 +89,15 @@ def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps)
     collator = Collator(READERS["objects"])
     examples, _ = examples_of(demonstrations_of_several_steps, READERS["objects"])
     together, alone = collator(examples), collator(examples[2:3])
-    steps, slots = alone.history.crops_BTVN.shape[1], alone.history.crops_BTVN.shape[3]
+    steps, slots = alone.history.crop_index_BTVN.shape[1], alone.history.crop_index_BTVN.shape[3]
     assert torch.equal(together.history.boxes_BTVN4[2, :steps, :, :slots], alone.history.boxes_BTVN4[0])
     assert not together.history.masks_BTVN[2, steps:].any()
-    length = alone.prompts.words_BL.shape[1]
-    assert torch.equal(together.prompts.words_BL[2, :length], alone.prompts.words_BL[0])
+    length = alone.prompts.word_ids_BL.shape[1]
+    assert torch.equal(together.prompts.word_ids_BL[2, :length], alone.prompts.word_ids_BL[0])
 
 
 def test_an_episode_in_which_nothing_is_seen_is_named(demonstrations_of_several_steps):
-    tokens = tokens_of(demonstrations_of_several_steps[-1], "objects")
+    tokens = preprocess(demonstrations_of_several_steps[-1], "objects")
     blind = replace(tokens, objects=tokens.objects[:0], steps=np.zeros_like(tokens.steps))
     with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
         Collator(READERS["objects"])([Example(blind)])

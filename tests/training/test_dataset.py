@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.tokens.cache import open_tokens  # noqa: E402
+from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
@@ -48,12 +48,12 @@ def names_of(source: ExampleSource) -> set[tuple[str, int]]:
 
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
-    cache = open_tokens(Dataset(data))
+    cache = open_object_cache(Dataset(data))
     training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
     assert names_of(training).isdisjoint(names_of(kept))
     assert len(names_of(training) | names_of(kept)) == 24
     assert 1 <= len(kept) <= 14
-    of_one_task = open_tokens(Dataset(data, tasks=["rotate"]))
+    of_one_task = open_object_cache(Dataset(data, tasks=["rotate"]))
     _, fewer = split_examples(of_one_task, validation_share=0.3, validation_episodes=100)
     assert names_of(fewer) <= names_of(kept)
     _, least = split_examples(cache, validation_share=0.3, validation_episodes=1)
@@ -64,7 +64,7 @@ def test_the_split_follows_from_the_episode_and_keeps_everything(data):
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
-    cache = open_tokens(Dataset(data))
+    cache = open_object_cache(Dataset(data))
     _, few = split_examples(cache, validation_share=0.3, validation_episodes=3)
     orders = [order_of(few, batch=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
     assert [order.batch for order in orders] == [2, 2]
@@ -73,7 +73,7 @@ def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_pro
 
 
 def test_an_example_of_a_source_knows_its_images_among_all(data):
-    cache = open_tokens(Dataset(data))
+    cache = open_object_cache(Dataset(data))
     training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
     images = np.concatenate([episode.images for episode in cache])
     for source in (training, kept):
@@ -89,7 +89,7 @@ def test_a_word_that_nobody_knows_is_found_before_training(data):
         def texts(self):
             return {"rotate the xylophone"}
 
-    check_words(open_tokens(Dataset(data)), OBJECTS)
+    check_words(open_object_cache(Dataset(data)), OBJECTS)
     with pytest.raises(PromptError, match="xylophone"):
         check_words(Cache(), OBJECTS)
 
@@ -143,7 +143,7 @@ def test_targets_follow_their_objects_through_shuffling(examples):
                 batch.history.positions_BTN2[b, t, old], changed.history.positions_BTN2[b, t, new]
             )
             assert torch.equal(
-                batch.history.crops_BTVN[b, t, :, old], changed.history.crops_BTVN[b, t, :, new]
+                batch.history.crop_index_BTVN[b, t, :, old], changed.history.crop_index_BTVN[b, t, :, new]
             )
     added = changed.history.masks_BTVN.sum() - batch.history.masks_BTVN.sum()
     possible = 2 * int(batch.targets.steps_BT.sum())
@@ -173,7 +173,7 @@ def views(demonstrations_of_several_steps):
 def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
     """Number and box of all that one view shows, in order."""
     visible = history.masks_BTVN[b, t, v]
-    numbers, boxes = history.crops_BTVN[b, t, v, visible], history.boxes_BTVN4[b, t, v, visible]
+    numbers, boxes = history.crop_index_BTVN[b, t, v, visible], history.boxes_BTVN4[b, t, v, visible]
     return [(int(number), *box.tolist()) for number, box in zip(numbers, boxes, strict=True)]
 
 
@@ -204,12 +204,12 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
         for v in range(2):  # visible ones first, then empty ones: black, without a box
             count = int(visible_BTV[b, t, v])
             assert after.masks_BTVN[b, t, v, :count].all()
-            assert not after.crops_BTVN[b, t, v, count:].any()
+            assert not after.crop_index_BTVN[b, t, v, count:].any()
             assert not after.boxes_BTVN4[b, t, v, count:].any()
         false = visible_BTV[b, : t + 1] - batch.history.masks_BTVN.sum(dim=3)[b, : t + 1]
-        expected = (batch.history.counts_BT[b, : t + 1] + false.sum(dim=1)).max()
-        assert after.counts_BT[b, t] == expected
-    assert not after.counts_BT[~batch.history.steps_BT].any()
+        expected = (batch.history.num_slots_BT[b, : t + 1] + false.sum(dim=1)).max()
+        assert after.num_slots_BT[b, t] == expected
+    assert not after.num_slots_BT[~batch.history.steps_BT].any()
     assert not views[1][0].any()
 
 
@@ -217,8 +217,8 @@ def test_without_false_detections_views_stay_as_they_are(views):
     batch = Collator(VIEWS)(views[0])
     after = augmented(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
     count = batch.history.masks_BTVN.shape[3]
-    assert torch.equal(after.counts_BT, batch.history.counts_BT)
-    assert torch.equal(after.crops_BTVN[..., :count], batch.history.crops_BTVN)
+    assert torch.equal(after.num_slots_BT, batch.history.num_slots_BT)
+    assert torch.equal(after.crop_index_BTVN[..., :count], batch.history.crop_index_BTVN)
     assert torch.equal(after.boxes_BTVN4[..., :count, :], batch.history.boxes_BTVN4)
     assert not after.masks_BTVN[..., count:].any()
 

@@ -11,11 +11,11 @@ torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
 
-from clumsy_finder import HOOK, Clumsy  # noqa: E402
+from noisy_extractor import HOOK, Clumsy  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
-from openvima.data.tokens.cache import open_tokens  # noqa: E402
-from openvima.data.tokens.episode import tokens_of  # noqa: E402
-from openvima.detection.hooks import PluggedFinder, detected_tokens, plugged_boxes  # noqa: E402
+from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.detector.hooks import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import ObjectViews  # noqa: E402
@@ -42,7 +42,7 @@ class Guesses:
         return Detections(np.concatenate([first, last], axis=1), scores=rng.random(len(first)))
 
 
-FINDERS = {"clumsy": PluggedFinder(Clumsy()), "guesses": PluggedFinder(DetectedObjects(Guesses()))}
+EXTRACTORS = {"clumsy": PluggedExtractor(Clumsy()), "guesses": PluggedExtractor(DetectedObjects(Guesses()))}
 
 
 def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
@@ -74,17 +74,17 @@ def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
             assert torch.equal(got, asked), field.name
 
 
-@pytest.mark.parametrize("name", FINDERS)
+@pytest.mark.parametrize("name", EXTRACTORS)
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_training_shows_what_a_policy_with_that_detector_sees(
     layout, name, demonstrations_of_several_steps, data
 ) -> None:
-    finder, demos = (
-        FINDERS[name],
+    extractor, demos = (
+        EXTRACTORS[name],
         [*demonstrations_of_several_steps, *(Dataset(data)[row] for row in range(6))],
     )
-    reader = Reader(layout, finder=finder)
-    examples = [Example(tokens_of(demo, "objects", finder)) for demo in demos]
+    reader = Reader(layout, extractor=extractor)
+    examples = [Example(preprocess(demo, "objects", extractor)) for demo in demos]
     batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(examples)
     assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
@@ -98,7 +98,7 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
     assert_as_when_acting(motions, demos, reader, shown)
 
 
-def test_the_clumsy_finder_finds_nothing_now_and_then(demonstrations_of_several_steps) -> None:
+def test_the_clumsy_extractor_finds_nothing_now_and_then(demonstrations_of_several_steps) -> None:
     """So that the comparison above holds that case."""
     seen = [
         len(Clumsy().in_observation(demo.observation(t)))
@@ -111,7 +111,7 @@ def test_the_clumsy_finder_finds_nothing_now_and_then(demonstrations_of_several_
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrations_of_several_steps) -> None:
-    blind = PluggedFinder(Clumsy())
+    blind = PluggedExtractor(Clumsy())
     demo = demonstrations_of_several_steps[0]
     prompt = replace(
         demo.prompt,
@@ -121,17 +121,19 @@ def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrati
         },
     )
     demo = replace(demo, prompt=prompt)
-    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)([Example(tokens_of(demo, "objects", blind))])
-    assert batch.prompts.crops_VS.shape == (2, 0)
-    assert_as_when_acting(batch, [demo], Reader(layout, finder=blind), [prompt])
+    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(
+        [Example(preprocess(demo, "objects", blind))]
+    )
+    assert batch.prompts.crop_index_VS.shape == (2, 0)
+    assert_as_when_acting(batch, [demo], Reader(layout, extractor=blind), [prompt])
 
 
 @pytest.fixture(scope="module")
 def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
-    """Demonstrations with true boxes, and with those of the clumsy finder."""
+    """Demonstrations with true boxes, and with those of the clumsy extractor."""
     dataset = Dataset(data)
-    true, _ = split_examples(open_tokens(dataset), validation_share=0.2, validation_episodes=9)
-    return true, with_boxes_of(detected_tokens(dataset, plugged_boxes(HOOK)), true)
+    true, _ = split_examples(open_object_cache(dataset), validation_share=0.2, validation_episodes=9)
+    return true, with_boxes_of(detected_object_cache(dataset, plugged_boxes(HOOK)), true)
 
 
 def detected_rows(sources, share: float, number: int, rows: slice = slice(None)) -> tuple[list, list]:
@@ -240,12 +242,12 @@ def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None
 
 
 def test_another_detector_is_another_run(settings, tmp_path) -> None:
-    file = tmp_path / "finders.py"
-    file.write_text("from clumsy_finder import make\n")
+    file = tmp_path / "extractors.py"
+    file.write_text("from noisy_extractor import make\n")
     config = TrainingConfig(**{**settings, "pretraining_steps": 0, "steps": 2, "boxes": f"{file}:make"})
     train(config)
     train(config)
-    file.write_text("from clumsy_finder import make  # changed\n")
+    file.write_text("from noisy_extractor import make  # changed\n")
     with pytest.raises(ConfigError, match=r"demonstrations\.boxes is 'make-\w+' there"):
         train(config)
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file  # noqa: E402
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.data import Demonstration  # noqa: E402
-from openvima.data.tokens.episode import BOXES, ID, NUMBERS, tokens_of  # noqa: E402
+from openvima.data.object_cache.episode import BOXES, ID, NUMBERS, preprocess  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import observe, whole_frames  # noqa: E402
@@ -20,7 +20,7 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.inputs import Reader, batch_prompts  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
-from openvima.training.dataset import Example, token_kind  # noqa: E402
+from openvima.training.dataset import Example, input_kind  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion, motion_prompt, motion_text  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.retelling import Retelling  # noqa: E402
@@ -40,7 +40,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
     kind, demonstrations_of_several_steps
 ) -> None:
     for demo in demonstrations_of_several_steps:
-        motion = as_motion(tokens_of(demo, kind))
+        motion = as_motion(preprocess(demo, kind))
         assert motion.text == motion_text(demo.num_steps + 1)
         assert len(motion.prompt_counts) == demo.num_steps + 1
         ends = np.cumsum(motion.prompt_counts)[:-1]
@@ -58,7 +58,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
 
 
 def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
-    tokens = tokens_of(demonstrations_of_several_steps[0], "objects")
+    tokens = preprocess(demonstrations_of_several_steps[0], "objects")
     motion = as_motion(tokens)
     for name in ("images", "objects", "steps", "actions"):
         assert getattr(motion, name) is getattr(tokens, name)
@@ -69,16 +69,16 @@ def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
     name, demonstrations_of_several_steps
 ) -> None:
     reader, demos = READERS[name], demonstrations_of_several_steps
-    episodes = [tokens_of(demo, token_kind(reader)) for demo in demos]
+    episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
     collate = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=1.0))
     ours = collate([Example(episode) for episode in episodes])
     read = [reader.read_prompt(motion_prompt(whole_motion(demo), demo.objects)) for demo in demos]
     stack = ImageStack(reader.image_size)
     theirs = batch_prompts(read, [stack.add(prompt.objects.crops) for prompt in read])
-    for field in ("words_BL", "images_BL", "mask_BL", "boxes_VS4", "masks_VS"):
+    for field in ("word_ids_BL", "object_index_BL", "mask_BL", "boxes_VS4", "masks_VS"):
         assert torch.equal(getattr(ours.prompts, field), getattr(theirs, field)), field
-    seen = torch.from_numpy(stack.stacked())[theirs.crops_VS]
-    assert torch.equal(ours.images[ours.prompts.crops_VS], seen)
+    seen = torch.from_numpy(stack.stacked())[theirs.crop_index_VS]
+    assert torch.equal(ours.images[ours.prompts.crop_index_VS], seen)
 
 
 def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:
@@ -87,15 +87,15 @@ def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:
     for number, episode in enumerate(episodes):
         batch = collate([Example(episode, row=number)], None if rngs is None else rngs[number : number + 1])
         length = int(batch.prompts.mask_BL.sum())
-        crops = batch.images[batch.prompts.crops_VS].sum().item()
-        found.append((length, batch.prompts.words_BL.tolist(), batch.prompts.boxes_VS4.tolist(), crops))
+        crops = batch.images[batch.prompts.crop_index_VS].sum().item()
+        found.append((length, batch.prompts.word_ids_BL.tolist(), batch.prompts.boxes_VS4.tolist(), crops))
     return found
 
 
 def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_steps) -> None:
     """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
     reader = READERS["midas-nano"]
-    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps] * 4
+    episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps] * 4
     mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
     tasks = prompts_of(PolicyCollate(reader, 0.0, with_images=True), episodes)
     motions = prompts_of(
@@ -118,7 +118,7 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
 
 def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
     reader = READERS["nano"]
-    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
+    episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
     mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
     examples = [Example(episode) for episode in episodes]
     together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
@@ -129,7 +129,7 @@ def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
     demonstrations_of_several_steps,
 ) -> None:
     reader = READERS["nano"]
-    episodes = [tokens_of(demo, "objects") for demo in demonstrations_of_several_steps]
+    episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
     plain, half, all_of_them = (
         prompts_of(
             PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=share)), episodes

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 from openvima.cli.main import main  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.evaluation import score  # noqa: E402
-from openvima.evaluation.trial import Trial  # noqa: E402
+from openvima.evaluation.online_eval import Trial  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.learner import Learner, make_learner  # noqa: E402
 

@@ -10,12 +10,12 @@ torch = pytest.importorskip("torch")
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.acting import NetworkPolicy  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range  # noqa: E402
 from openvima.policies.heads.bins import encode_bins  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
-from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.dataset import Batch  # noqa: E402

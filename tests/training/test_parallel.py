@@ -11,7 +11,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from clumsy_finder import HOOK  # noqa: E402
+from noisy_extractor import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402

@@ -5,8 +5,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.catalog.partitions import pool  # noqa: E402
-from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.training import pretrain  # noqa: E402
 from openvima.training.schedule import step_generator  # noqa: E402
 

@@ -8,8 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.data.object_cache.episode import COUNT, ID, PICK, PLACE, image_names, preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
-from openvima.data.tokens.episode import COUNT, ID, PICK, PLACE, image_names, tokens_of  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
@@ -35,7 +35,7 @@ KEPT = ("novel_noun", "novel_adj", "rearrange", "twist", "scene_understanding", 
 @pytest.fixture(scope="module")
 def episodes():
     def tokens(task: str):
-        return tokens_of(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
+        return preprocess(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
 
     return {task: tokens(task) for task in (*NAMED, *KEPT)}
 
@@ -84,7 +84,7 @@ def test_names_are_read_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
     collate = PolicyCollate(Reader("objects"), 0.0, with_images=True, retelling=Retelling(naming_share=1.0))
     plain = PolicyCollate(Reader("objects"), 0.0, with_images=True)
-    assert torch.equal(collate(several).prompts.words_BL, plain(several).prompts.words_BL)
+    assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)
     lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
     assert (lengths[0] > lengths[1]).all()
 

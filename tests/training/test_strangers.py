@@ -7,8 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data.records import rollout_oracle  # noqa: E402
-from openvima.data.tokens.episode import (  # noqa: E402
+from openvima.data.object_cache.episode import (  # noqa: E402
     BOXES,
     COUNT,
     ID,
@@ -16,8 +15,9 @@ from openvima.data.tokens.episode import (  # noqa: E402
     PICK,
     PLACE,
     SPURIOUS_NUMBERS,
-    tokens_of,
+    preprocess,
 )
+from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.inputs import Reader  # noqa: E402
@@ -34,7 +34,7 @@ TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "sam
 @pytest.fixture(scope="module")
 def episodes():
     def tokens(task: str):
-        return tokens_of(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
+        return preprocess(rollout_oracle(TabletopEnv(task, level="train", domain="user"), 1), "objects")
 
     return [tokens(task) for task in TASKS]
 
@@ -105,7 +105,7 @@ def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes
     def counts(share: float) -> torch.Tensor:
         parts = Parts(collate, 0, 99, count=1, strangers=examples, stranger_share=share)
         ((batch, _),) = parts(examples, 4)
-        return (batch.history.counts_BT * batch.history.steps_BT).sum(dim=1)
+        return (batch.history.num_slots_BT * batch.history.steps_BT).sum(dim=1)
 
     order = np.argsort([episode.num_steps for episode in episodes], kind="stable")
     plain = torch.tensor([episodes[row].steps[:, COUNT].sum() + 2 * episodes[row].num_steps for row in order])
@@ -123,7 +123,7 @@ def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, 
     batch = collate(borrowing, rngs_of(borrowing))
     images = stack if batch.images is None else batch.images
     for b, example in enumerate(borrowing):
-        numbers = batch.history.crops_BTVN[b, 0]
+        numbers = batch.history.crop_index_BTVN[b, 0]
         shown = {images[n].numpy().tobytes() for n in numbers.flatten().tolist() if n}
         expected = with_strangers(example, example.other, rngs_of(borrowing)[b]).tokens
         rows = expected.objects[: expected.steps[0, COUNT]]

@@ -11,8 +11,8 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.partitions import pool  # noqa: E402
 from openvima.catalog.random_pack import RandomLooks, is_random  # noqa: E402
-from openvima.policies.layers.conv_encoder import ConvConfig  # noqa: E402
-from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Scene  # noqa: E402
 from openvima.training import pretrain, turning  # noqa: E402

@@ -12,12 +12,12 @@ import numpy as np
 
 from openvima.catalog import boxes
 from openvima.catalog.boxes import Box, box_mesh
+from openvima.catalog.containers import bowl_collision, bowl_mesh, pan_mesh
 from openvima.catalog.geometry import CollisionHull, Geometry, Vector3
 from openvima.catalog.hanoi import hanoi_disk, hanoi_stand
 from openvima.catalog.meshes import draped, prism, scaled_geometry, slab_hull
 from openvima.catalog.objects import ObjectSpec, object_spec
 from openvima.catalog.outlines import outline, rectangle
-from openvima.catalog.vessels import bowl_collision, bowl_mesh, pan_mesh
 from openvima.errors import AssetError
 
 

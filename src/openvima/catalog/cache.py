@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.files import whole_file
+from openvima.atomic_io import atomic_write
 
 _logger = logging.getLogger(__name__)
 
@@ -66,6 +66,6 @@ def _write(path: Path, array: np.ndarray) -> None:
     np.save(buffer, array, allow_pickle=False)
     body = buffer.getvalue()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(body)
         file.write(zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little"))

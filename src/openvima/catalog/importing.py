@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from openvima.atomic_io import atomic_write
 from openvima.catalog.cache import cache_dir
 from openvima.catalog.original import decode_file
 from openvima.catalog.pack_files import ARCHIVE_NAME, CheckoutFiles, ImportedFiles, known_hashes
 from openvima.errors import AssetError
-from openvima.files import whole_file
 
 Report = Callable[[int, int, str], None]
 
@@ -98,6 +98,6 @@ def imported_pack() -> ImportedPack | None:
 def _write_archive(archive: Path, contents: dict[str, bytes], problems: list[str]) -> None:
     archive.parent.mkdir(parents=True, exist_ok=True)
     members = {**contents, _PROBLEMS_MEMBER: json.dumps(problems, indent=1).encode()}
-    with whole_file(archive) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
+    with atomic_write(archive) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as packed:
         for name, content in members.items():
             packed.writestr(zipfile.ZipInfo(name, _DATE), content)

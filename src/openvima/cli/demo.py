@@ -50,12 +50,12 @@ def main(
         raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
     if boxes is not None and policy in ("oracle", "random"):
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} looks at no boxes; name a trained policy.")
-    from openvima.env import Setup
+    from openvima.env import EnvConfig
+    from openvima.evaluation.config import Batch
     from openvima.evaluation.film import film_episode
-    from openvima.evaluation.players import load_player
-    from openvima.evaluation.protocol import Batch
+    from openvima.evaluation.rollout_policies import load_player
 
-    setup = Setup(assets, compat, difficulty)
+    setup = EnvConfig(assets, compat, difficulty)
     batch = Batch(
         policy,
         policy,

@@ -15,8 +15,8 @@ from openvima.cli.progress import Report, progress_bar
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
-    from openvima.detection.frames import Frame, FrameSource
-    from openvima.detection.scoring import DetectorScore, Precision
+    from openvima.detector.frames import Frame, FrameSource
+    from openvima.detector.scoring import DetectorScore, Precision
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
@@ -74,9 +74,9 @@ def evaluate(
     Returns:
         Exit status.
     """
-    from openvima.detection import load_detector
-    from openvima.detection.frames import held_out_frames
-    from openvima.detection.scoring import require_pycocotools, score_detector
+    from openvima.detector import load_detector
+    from openvima.detector.frames import held_out_frames
+    from openvima.detector.scoring import require_pycocotools, score_detector
 
     require_pycocotools()  # before what takes a while
     loaded = load_detector(detector, device=device)
@@ -125,9 +125,9 @@ def show(
     Returns:
         Exit status.
     """
-    from openvima.detection import load_detector
-    from openvima.detection.frames import held_out_frames
-    from openvima.detection.pictures import draw_detections, save_sheet
+    from openvima.detector import load_detector
+    from openvima.detector.frames import held_out_frames
+    from openvima.detector.pictures import draw_detections, save_sheet
     from openvima.errors import ConfigError
 
     if out.suffix.lower() != ".png":
@@ -165,8 +165,8 @@ def convert(
     if out.exists() and not force:
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
     require_torch("reading a detector")
-    from openvima.detection.checkpoint import save_network
-    from openvima.detection.detectron2 import load_detectron2
+    from openvima.detector.checkpoint import save_network
+    from openvima.detector.detectron2 import load_detectron2
 
     save_network(load_detectron2(source), out)
     print(out)
@@ -184,7 +184,7 @@ def _frames(
 ) -> "Iterator[FrameSource]":
     """Frames of a folder, or of demonstrations that are played for the purpose and deleted afterwards."""
     from openvima.data import Dataset
-    from openvima.detection.frames import FrameSource
+    from openvima.detector.frames import FrameSource
     from openvima.errors import ConfigError
 
     problems = []

@@ -69,7 +69,7 @@ def main(
             other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
         boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
             comes with the package, detector=FOLDER for one that `openvima detector train` made, or
-            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectFinder.
+            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectExtractor.
         in_context: Play each episode also with a demonstration of it as the prompt, "Follow this motion: …";
             by default of twist, follow_motion and follow_order, for policies trained without these tasks.
         batch: Episodes that are played together; a policy decides for all of them at once.
@@ -87,9 +87,9 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.env import Setup
+    from openvima.env import EnvConfig
     from openvima.evaluation import EvaluationConfig, Results, evaluate
-    from openvima.evaluation.controls import IN_CONTEXT
+    from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.in_context import held_out_tasks
 
     if in_context:
@@ -102,7 +102,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        setup=Setup(assets, compat, difficulty),
+        setup=EnvConfig(assets, compat, difficulty),
         batch=batch,
         videos=videos,
         report=report,
@@ -187,7 +187,7 @@ def _cell(rate: float, interval: tuple[float, float]) -> str:
 
 def _with_boxes(controls: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
     """Add the control that uses the boxes, if some are given and it is not asked for yet."""
-    from openvima.evaluation.controls import DETECTED_BOXES
+    from openvima.evaluation.ablations import DETECTED_BOXES
 
     asked = boxes is None or {"all", DETECTED_BOXES} & set(controls)
     return controls if asked else (*controls, DETECTED_BOXES)

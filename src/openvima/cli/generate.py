@@ -65,7 +65,7 @@ def main(
     """
     from openvima.data import GenerateConfig, generate, plan
     from openvima.data.resuming import is_finished
-    from openvima.env import Setup
+    from openvima.env import EnvConfig
 
     config = GenerateConfig(
         out=out,
@@ -74,7 +74,7 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        setup=Setup(assets, compat, difficulty),
+        setup=EnvConfig(assets, compat, difficulty),
         compression=compression,
         images=images,
         keep_failed=keep_failed,

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from openvima.policies.bundled import PackagedPolicy
     from openvima.policies.config import PolicyConfig
-    from openvima.policies.packaged import PackagedPolicy
-    from openvima.policies.sizes import PolicySize
+    from openvima.policies.parameter_counts import PolicySize
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Precision = Literal["float32", "bfloat16", "float16", "float64"]
@@ -35,12 +35,12 @@ def list_(*, as_json: Json = False) -> int:
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.packaged import PACKAGED
+    from openvima.policies.bundled import PACKAGED
     from openvima.policies.presets import PRESETS, preset
 
     require_torch("counting parameters")
     from openvima.policies.checkpoint import read_info
-    from openvima.policies.sizes import policy_size
+    from openvima.policies.parameter_counts import policy_size
 
     sizes = {name: policy_size(preset(name)) for name in PRESETS}
     here = {name: policy for name, policy in PACKAGED.items() if policy.is_here}
@@ -74,10 +74,10 @@ def show(
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.packaged import PACKAGED
+    from openvima.policies.bundled import PACKAGED
 
     require_torch("counting parameters")
-    from openvima.policies.sizes import policy_size
+    from openvima.policies.parameter_counts import policy_size
 
     config, packaged = _config(policy), PACKAGED.get(policy)
     size = policy_size(config)
@@ -132,7 +132,7 @@ def convert(
         raise ConfigError(f"{out} exists; give another folder, or --force to replace the checkpoint in it.")
     require_torch("reading a policy")
     from openvima.policies.checkpoint import load_network, save_checkpoint
-    from openvima.policies.sizes import policy_size
+    from openvima.policies.parameter_counts import policy_size
     from openvima.policies.t5 import tokenizer_for
 
     network, stored = load_network(source)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from openvima.cli.progress import progress_bar
 from openvima.errors import ConfigError
-from openvima.policies.packaged import SMALL, packaged_folder
+from openvima.policies.bundled import SMALL, packaged_folder
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 LEVELS = ("L1", "L2", "L3")
@@ -39,7 +39,7 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.evaluation.finish import require_extra
+    from openvima.evaluation.report_assets import require_extra
     from openvima.policies.base import require_torch
 
     _check(demonstrations=demonstrations, episodes=episodes, workers=workers)

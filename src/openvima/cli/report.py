@@ -52,12 +52,12 @@ def main(
     Returns:
         Exit status.
     """
+    from openvima.atomic_io import atomic_write_file
     from openvima.evaluation.comparison import compare_pairs, default_pairs
     from openvima.evaluation.report.differences import finding
     from openvima.evaluation.report.paper import latex as as_latex
     from openvima.evaluation.report.paper import markdown as as_markdown
     from openvima.evaluation.report.paper import paper_tables
-    from openvima.files import write_whole
 
     _check(results, out)
     evaluations = _read(results)
@@ -68,7 +68,7 @@ def main(
     suffix = out.suffix.lower() if out else ""
     tables = paper_tables(found, comparisons)
     if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
-        write_whole(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
+        atomic_write_file(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
         print(f"Tables: {out}")
         return 0
     if markdown:
@@ -133,9 +133,9 @@ def _page(
     out: Path,
     records: Sequence[Path],
 ) -> Path:
-    from openvima.evaluation.finish import require_extra
     from openvima.evaluation.report import write_report
     from openvima.evaluation.report.page import default_command
+    from openvima.evaluation.report_assets import require_extra
 
     require_extra()
     return write_report(
@@ -164,7 +164,7 @@ def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]
 
 def _default_out(evaluations: dict[Path, "Results"]) -> Path:
     """Beside the results; several have no place in common, and each may have a report of its own."""
-    from openvima.evaluation.finish import REPORT_NAME
+    from openvima.evaluation.report_assets import REPORT_NAME
 
     return _folder(next(iter(evaluations))) / REPORT_NAME if len(evaluations) == 1 else Path(REPORT_NAME)
 

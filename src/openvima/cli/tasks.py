@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.tasks.measured import oracle_record
+from openvima.tasks.oracle_success import oracle_record
 
 if TYPE_CHECKING:
     from openvima.tasks import TaskSpec
@@ -96,9 +96,9 @@ def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
 
 def _write_gallery(folder: Path, assets: str) -> int:
     from openvima.cli.progress import progress_bar
-    from openvima.env import Setup
+    from openvima.env import EnvConfig
     from openvima.evaluation.task_gallery import save_task_gallery
 
     with progress_bar("tasks") as report:
-        print(save_task_gallery(folder, setup=Setup(assets), report=report))
+        print(save_task_gallery(folder, setup=EnvConfig(assets), report=report))
     return 0

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from openvima.data.generation import generate
     from openvima.data.planning import GenerateConfig, plan
+    from openvima.data.progress import GenerationProgress, TaskProgress
     from openvima.data.reader import Dataset, Shard
     from openvima.data.records import Demonstration, Step, rollout_oracle
-    from openvima.data.tally import GenerationProgress, TaskProgress
     from openvima.data.verification import VerifyConfig, repair, verify
     from openvima.data.writer import ShardWriter
 
@@ -17,11 +17,11 @@ _HOMES = {
     "Dataset": "reader",
     "Demonstration": "records",
     "GenerateConfig": "planning",
-    "GenerationProgress": "tally",
+    "GenerationProgress": "progress",
     "Shard": "reader",
     "ShardWriter": "writer",
     "Step": "records",
-    "TaskProgress": "tally",
+    "TaskProgress": "progress",
     "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",

@@ -5,7 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from openvima.data.manifest import FAILED_FOLDER, MANIFEST_NAME, finish_folder
+from openvima.data.oracle_rollouts import write_block
 from openvima.data.planning import COMMAND, Block, GenerateConfig, plan
+from openvima.data.progress import NUM_COUNTS, Report, reporter
 from openvima.data.resuming import (
     check_folder,
     clear,
@@ -14,10 +16,8 @@ from openvima.data.resuming import (
     remove_leftovers,
     storage_error,
 )
-from openvima.data.tally import NUM_COUNTS, Report, reporter
-from openvima.data.trials import write_block
 from openvima.errors import ConfigError, DatasetError
-from openvima.processes import Counts, in_watched_processes
+from openvima.multiprocess import Counts, in_watched_processes
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
@@ -94,7 +94,7 @@ def _engine(
     if config.engine == "processes":
         num_workers = config.workers or 1
         return in_watched_processes(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
-    from openvima.cluster import on_cluster
+    from openvima.ray_backend import on_cluster
 
     num_workers = config.workers or (1 if config.address is None else None)
     return on_cluster(

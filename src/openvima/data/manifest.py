@@ -13,16 +13,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from openvima.atomic_io import atomic_write_file
 from openvima.data.checksums import Span, measure
 from openvima.data.schema import SCHEMA_VERSION
 from openvima.errors import DatasetError
-from openvima.files import write_whole
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
 BROKEN_NAME = "broken.json"  # episodes that an import left out
 FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
-TOKENS_FOLDER = "tokens"  # made of the shards, safe to delete
+CACHE_FOLDER = "tokens"  # made of the shards, safe to delete
 LICENCE = "MIT"
 
 INDEX_SCHEMA = pa.schema(
@@ -136,9 +136,9 @@ def finish_folder(
     pq.write_table(index, sink, compression="zstd")
     manifest["index"] = {"bytes": sink.tell(), "sha256": hashlib.sha256(sink.getbuffer()).hexdigest()}
     manifest["checksum"] = manifest_checksum(manifest)
-    write_whole(folder / INDEX_NAME, sink.getvalue())
+    atomic_write_file(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
-    write_whole(folder / MANIFEST_NAME, text + "\n")
+    atomic_write_file(folder / MANIFEST_NAME, text + "\n")
 
 
 def summarise(

@@ -16,9 +16,9 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.env.setup import DEFAULT_SETUP, Setup
+from openvima.env.config import DEFAULT_SETUP, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
-from openvima.processes import MAX_WORKERS
+from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
@@ -72,7 +72,7 @@ class GenerateConfig:
     level: str = "train"
     start_seed: int = 0
     shard_size: int | None = None
-    setup: Setup = DEFAULT_SETUP
+    setup: EnvConfig = DEFAULT_SETUP
     compression: Compression = "lz4"
     images: bool = True
     keep_failed: bool = False
@@ -157,7 +157,7 @@ class GenerateConfig:
             settings: dict[str, Any] = {
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
-                "setup": Setup(record["assets"], record["compat"], record["difficulty"]),
+                "setup": EnvConfig(record["assets"], record["compat"], record["difficulty"]),
                 **{name: record[name] for name in ("level", "episodes", "start_seed")},
                 **{name: record[name] for name in ("compression", "images")},
             }
@@ -183,7 +183,7 @@ class Block:
     info: ShardInfo
     episodes: int
     seeds: range
-    setup: Setup
+    setup: EnvConfig
     failed_path: Path | None = None
 
 

@@ -61,7 +61,7 @@ class Shard:
             raise self._row_error(row, error) from None
         if self.info.images:
             return demo
-        from openvima.data.redrawing import redrawn  # with which the renderer comes
+        from openvima.data.rerender import redrawn  # with which the renderer comes
 
         try:
             return redrawn(demo, self.info, batch.column("content_hash")[0].as_py())

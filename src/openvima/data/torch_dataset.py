@@ -82,7 +82,7 @@ class BatchStream(IterableDataset, Generic[Episode]):
     same order whatever their number.
 
     Args:
-        source: Episodes by number: a `TokenCache`, or a `Dataset` for those with images.
+        source: Episodes by number: a `ObjectCache`, or a `Dataset` for those with images.
         order: Which of them each batch takes.
         first: Number of the first batch.
         stop: Number of the batch before which to stop; None goes on for ever.
@@ -119,7 +119,7 @@ class BatchLoader(Generic[Episode]):
     `loader.forever()` goes on without an end and without starting workers anew.
 
     Args:
-        source: Episodes by number: a `TokenCache`, or a `Dataset` for those with images.
+        source: Episodes by number: a `ObjectCache`, or a `Dataset` for those with images.
         order: Which of them each batch takes.
         transform: Turns a list of episodes into a batch; see `BatchStream`.
         workers: Processes that read ahead; 0 reads when asked.
@@ -130,7 +130,7 @@ class BatchLoader(Generic[Episode]):
         ConfigError: The order is for another number of episodes.
 
     Example:
-        >>> cache = open_tokens(Dataset("demos"))
+        >>> cache = open_object_cache(Dataset("demos"))
         >>> order = BatchOrder(len(cache), batch=64, seed=0, lengths=cache.lengths())
         >>> loader = BatchLoader(cache, order, workers=2)
         >>> for episodes in loader: ...

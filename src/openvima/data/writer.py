@@ -8,12 +8,12 @@ from typing import BinaryIO
 
 import pyarrow as pa
 
+from openvima.atomic_io import atomic_write
 from openvima.data.columns import Scratch
 from openvima.data.encoding import ShardInfo, Skipped, encode
 from openvima.data.manifest import BROKEN_NAME, INDEX_NAME, MANIFEST_NAME
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
-from openvima.files import whole_file
 
 COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few per cent
 BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
@@ -38,7 +38,7 @@ class ShardWriter:
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
-        sink = _Sink(self._closing.enter_context(whole_file(path)))
+        sink = _Sink(self._closing.enter_context(atomic_write(path)))
         stream = pa.BufferedOutputStream(pa.PythonFile(sink, "w"), BUFFER_BYTES)
         self._closing.callback(stream.flush)
         self._writer = self._closing.enter_context(pa.ipc.new_file(stream, self._schema, options=options))
@@ -72,7 +72,7 @@ class ShardWriter:
 class _Sink:
     """A file that raises only once: what Arrow could not write, it tries again as it ends, and complains."""
 
-    closed = False  # `whole_file` closes the file
+    closed = False  # `atomic_write` closes the file
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._has_failed = file, False
@@ -87,7 +87,7 @@ class _Sink:
             raise
 
     def flush(self) -> None:
-        """Nothing: `whole_file` does it."""
+        """Nothing: `atomic_write` does it."""
 
     def close(self) -> None:
         """Nothing, likewise."""

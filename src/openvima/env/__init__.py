@@ -3,17 +3,22 @@
 import importlib
 from typing import TYPE_CHECKING
 
+from openvima.env.config import EnvConfig
 from openvima.env.registration import make, register_environments
-from openvima.env.setup import Setup
 
 if TYPE_CHECKING:
-    from openvima.env.gate import stack_actions
+    from openvima.env.action_validation import stack_actions
     from openvima.env.tabletop import Frame, TabletopEnv
     from openvima.env.vector import make_vec
 
-__all__ = ["Frame", "Setup", "TabletopEnv", "make", "make_vec", "register_environments", "stack_actions"]
+__all__ = ["EnvConfig", "Frame", "TabletopEnv", "make", "make_vec", "register_environments", "stack_actions"]
 
-_HOMES = {"Frame": "tabletop", "TabletopEnv": "tabletop", "make_vec": "vector", "stack_actions": "gate"}
+_HOMES = {
+    "Frame": "tabletop",
+    "TabletopEnv": "tabletop",
+    "make_vec": "vector",
+    "stack_actions": "action_validation",
+}
 
 
 def __getattr__(name: str) -> object:  # importing the environment takes MuJoCo and Numba with it

@@ -67,7 +67,7 @@ def register_with_gymnasium() -> None:
     """
     if "gymnasium.envs" in sys.modules:
         register_environments()
-    elif not any(isinstance(finder, _AfterGymnasium) for finder in sys.meta_path):
+    elif not any(isinstance(extractor, _AfterGymnasium) for extractor in sys.meta_path):
         sys.meta_path.insert(0, _AfterGymnasium())
 
 

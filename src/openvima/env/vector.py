@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from openvima.env.gate import Gate
+from openvima.env.action_validation import ActionValidator
 from openvima.env.registration import make
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, unknown_name
@@ -86,7 +86,7 @@ class SyncTabletopEnvs(SyncVectorEnv):
 
     def __init__(self, recipes: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
         super().__init__(recipes, autoreset_mode=autoreset_mode)
-        self._gate = Gate(len(recipes), autoreset_mode)
+        self._gate = ActionValidator(len(recipes), autoreset_mode)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all sub-environments, or in those of `options["reset_mask"]`.

@@ -23,9 +23,9 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.async_vector_env import AsyncState
 
-from openvima.env.gate import Gate
+from openvima.env.action_validation import ActionValidator
 from openvima.errors import WorkerError
-from openvima.processes import become_worker, end_with_parent, interrupts_held, one_thread_each
+from openvima.multiprocess import become_worker, end_with_parent, interrupts_held, one_thread_each
 
 _PATIENCE_S = 5.0  # for an idle worker to end by itself, and for an error to arrive
 
@@ -42,7 +42,7 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
     """
 
     def __init__(self, recipes: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
-        self._gate = Gate(len(recipes), autoreset_mode)
+        self._gate = ActionValidator(len(recipes), autoreset_mode)
         self._starting = contextlib.ExitStack()
         try:
             with self._starting, one_thread_each():

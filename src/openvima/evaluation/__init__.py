@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison, compare
+    from openvima.evaluation.config import EvaluationConfig
     from openvima.evaluation.merging import merge
     from openvima.evaluation.picture import save_episode_picture
-    from openvima.evaluation.protocol import EvaluationConfig
     from openvima.evaluation.report import write_report
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
     from openvima.evaluation.runner import evaluate
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "Comparison": "comparison",
     "EpisodeOutcome": "results",
-    "EvaluationConfig": "protocol",
+    "EvaluationConfig": "config",
     "Results": "results",
     "Row": "results",
     "compare": "comparison",

@@ -10,8 +10,8 @@ from typing import Any
 
 from PIL import Image
 
+from openvima.atomic_io import atomic_write_file
 from openvima.errors import DatasetError
-from openvima.files import write_whole
 
 FOLDER = "videos"
 _INDEX = "clips.json"
@@ -76,7 +76,7 @@ def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
                 "poster": _text(clip.poster),
             }
         )
-    return write_whole(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
+    return atomic_write_file(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
 
 
 def load_clips(folder: Path) -> tuple[Clip, ...]:

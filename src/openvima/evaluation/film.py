@@ -7,10 +7,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
-from openvima.evaluation.players import Player
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import Player
 from openvima.evaluation.video import VideoWriter
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene

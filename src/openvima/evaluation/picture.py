@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from openvima.atomic_io import atomic_write_file
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation.clips import png
 from openvima.evaluation.film import Artist
-from openvima.evaluation.players import OraclePlayer, Player
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.files import write_whole
+from openvima.evaluation.rollout_policies import OraclePlayer, Player
 
 _GAP = 12  # pixels between the parts
 _MUTED = (91, 100, 114)
@@ -42,7 +42,7 @@ def save_episode_picture(
     scenes = _beside(_titled(start, "before"), _titled(end, ended))
     strip = draw_prompt_strip(env.prompt, width=scenes.shape[1])
     picture = np.concatenate([strip, scenes, np.full((_GAP, scenes.shape[1], 3), 255, np.uint8)])
-    write_whole(path, png(Image.fromarray(picture)))
+    atomic_write_file(path, png(Image.fromarray(picture)))
     return outcome
 
 

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import atomic_write_file
 from openvima.errors import DatasetError
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
-from openvima.files import write_whole
 
 SCHEMA = 1
 FILE_NAME = "results.json"
@@ -51,7 +51,7 @@ class Row:
         level: "train", "L1", "L2", "L3" or "L4".
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
-        control: What was taken from the policy, see `openvima.evaluation.controls`; empty for the plain
+        control: What was taken from the policy, see `openvima.evaluation.ablations`; empty for the plain
             score.
     """
 
@@ -190,7 +190,7 @@ class Results:
 
     def write(self, path: Path) -> Path:
         """Write `results.json`; an interrupted write leaves the old file or none."""
-        return write_whole(path, self.to_json())
+        return atomic_write_file(path, self.to_json())
 
     @staticmethod
     def read(path: Path) -> "Results":

@@ -5,8 +5,8 @@ from typing import Any
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError, PolicyError
-from openvima.evaluation.players import Decision, Player
 from openvima.evaluation.results import EpisodeOutcome, failure_kind
+from openvima.evaluation.rollout_policies import Decision, Player
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
 WRONG_PICKED = "only wrong objects were picked up within the step limit"

@@ -8,17 +8,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
-from openvima.detection.hooks import finder_maker
+from openvima.detector.hooks import extractor_maker
 from openvima.errors import ConfigError
 from openvima.evaluation.clips import FOLDER
-from openvima.evaluation.finish import chosen_episodes, finish, require_extra
-from openvima.evaluation.players import load_player, one_thread
-from openvima.evaluation.protocol import Batch, EvaluationConfig, plan, rows_of
+from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
+from openvima.evaluation.report_assets import chosen_episodes, finish, require_extra
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
+from openvima.evaluation.rollout_policies import load_player, one_thread
 from openvima.evaluation.versions import versions
-from openvima.files import write_whole
-from openvima.processes import in_processes
+from openvima.multiprocess import in_processes
 
 Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
@@ -48,7 +48,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         report: Called with episodes done, episodes in all and a note on what was played last.
 
     Returns:
-        `results.json` in `config.out`; the files of `openvima.evaluation.finish` are beside it.
+        `results.json` in `config.out`; the files of `openvima.evaluation.report_assets` are beside it.
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
@@ -58,7 +58,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
     if config.report:
         require_extra()
     if config.boxes is not None:
-        finder_maker(config.boxes)  # a mistake there is named before anything is played
+        extractor_maker(config.boxes)  # a mistake there is named before anything is played
     batches = plan(config)
     chosen_episodes(config)
     policies = {source.name: source.record() for source in config.sources}
@@ -113,7 +113,7 @@ def _play_all(
         report(done, total, "")
     for job, played in _played(config, [job for job in jobs if job.batch not in outcomes]):
         records = [asdict(outcome) for outcome in played]
-        write_whole(job.part(config.out), json.dumps(records, ensure_ascii=False) + "\n")
+        atomic_write_file(job.part(config.out), json.dumps(records, ensure_ascii=False) + "\n")
         outcomes[job.batch] = played
         done += job.batch.episodes
         if report is not None:
@@ -127,7 +127,7 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tu
     if config.engine == "processes":
         yield from in_processes(play_batch, jobs, config.workers or 1)
         return
-    from openvima.cluster import on_cluster
+    from openvima.ray_backend import on_cluster
 
     sent = {Job(job.batch.with_whole_paths(), job.fingerprint): job for job in jobs}
     workers = config.workers or (1 if config.address is None else None)
@@ -168,4 +168,4 @@ def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> No
         "workers": config.workers,
         "policies": {source.name: source.source for source in config.sources},
     }
-    write_whole(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")
+    atomic_write_file(config.out / LOG_NAME, json.dumps(record, indent=1) + "\n")

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-from openvima.evaluation.players import PolicyPlayer, load_player
-from openvima.evaluation.protocol import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
+from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PolicyPlayer, load_player
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
 

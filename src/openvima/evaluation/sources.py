@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError
 from openvima.policies.base import find_checkpoint, is_policy_source, unknown_policy
-from openvima.policies.packaged import PACKAGED
+from openvima.policies.bundled import PACKAGED
 from openvima.policies.presets import PRESETS
 from openvima.serving.client import describe
 from openvima.serving.protocol import is_remote

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from openvima.env import Setup, TabletopEnv
-from openvima.env.setup import DEFAULT_SETUP
+from openvima.atomic_io import atomic_write_file
+from openvima.env import EnvConfig, TabletopEnv
+from openvima.env.config import DEFAULT_SETUP
 from openvima.evaluation.film import Artist
 from openvima.evaluation.picture import save_episode_picture
-from openvima.evaluation.players import OraclePlayer
 from openvima.evaluation.prompt_strip import INK, draw_prompt_strip, font
 from openvima.evaluation.rollout import play
-from openvima.files import write_whole
+from openvima.evaluation.rollout_policies import OraclePlayer
 from openvima.tasks import TaskSpec, list_tasks, task_spec
 
 SHEET_NAME = "contact_sheet.png"
@@ -38,7 +38,7 @@ def save_task_gallery(
     folder: Path,
     *,
     tasks: Sequence[str] = (),
-    setup: Setup = DEFAULT_SETUP,
+    setup: EnvConfig = DEFAULT_SETUP,
     seed: int = 0,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
@@ -64,9 +64,9 @@ def save_task_gallery(
         panels.append(_panel(env, spec.name, solved))
         if report is not None:
             report(number + 1, len(specs), spec.name)
-    write_whole(folder / SHEET_NAME, _small_png(_sheet(panels)))
+    atomic_write_file(folder / SHEET_NAME, _small_png(_sheet(panels)))
     sections = "\n".join(_section(spec) for spec in specs)
-    return write_whole(folder / PAGE_NAME, _PAGE.format(count=len(specs), sections=sections))
+    return atomic_write_file(folder / PAGE_NAME, _PAGE.format(count=len(specs), sections=sections))
 
 
 def _first_solved(env: TabletopEnv, seed: int) -> int:

@@ -132,7 +132,7 @@ class ObjectViews:
         return np.where(self.masks[TOP][:, None], top, front)
 
 
-class ObjectFinder(Protocol):
+class ObjectExtractor(Protocol):
     """Finds the objects in images: by their segmentation, or by a detector that knows pixels only."""
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
@@ -211,7 +211,7 @@ def whole_frames(rgb: Mapping[str, np.ndarray]) -> ObjectViews:
     )
 
 
-def see_objects(
+def extract_objects(
     rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray], object_ids: Sequence[int] | np.ndarray
 ) -> ObjectViews:
     """Cut the given objects out of the images of both views.
@@ -268,7 +268,7 @@ def observe_prompt_image(image: PromptImage) -> ObjectViews:
         ShapeError: An image has another shape or dtype.
     """
     frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
-    objects = see_objects(frames, image.segm, [record.object_id for record in image.objects])
+    objects = extract_objects(frames, image.segm, [record.object_id for record in image.objects])
     return objects.select(objects.visible())
 
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from openvima.atomic_io import restore_folder
 from openvima.errors import (
     CheckpointError,
     MissingExtraError,
@@ -15,7 +16,7 @@ from openvima.errors import (
     UnknownPolicyError,
     unknown_name,
 )
-from openvima.files import restore_folder
+from openvima.policies.bundled import PACKAGED, packaged_folder
 from openvima.policies.file_names import (
     BEST_FILE,
     CHECKPOINTS_FOLDER,
@@ -24,7 +25,6 @@ from openvima.policies.file_names import (
     WEIGHTS_FILE,
 )
 from openvima.policies.hub import fetch_from_hub, is_hub_id
-from openvima.policies.packaged import PACKAGED, packaged_folder
 from openvima.policies.presets import PRESETS
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
@@ -128,7 +128,7 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
                 "for the folder, or work elsewhere for the preset."
             )
         require_torch(f"policy {name_or_run!r}")
-        from openvima.policies.acting import NetworkPolicy
+        from openvima.policies.inference import NetworkPolicy
         from openvima.policies.network import build_network
         from openvima.policies.presets import preset
 

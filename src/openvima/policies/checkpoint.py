@@ -16,9 +16,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from openvima import __version__
+from openvima.atomic_io import atomic_folder, restore_folder
 from openvima.errors import CheckpointError, ConfigError
-from openvima.files import restore_folder, whole_folder
-from openvima.policies.acting import NetworkPolicy
 from openvima.policies.base import (
     CONFIG_FILE,
     TOKENIZER_FOLDER,
@@ -27,6 +26,7 @@ from openvima.policies.base import (
 )
 from openvima.policies.config import PolicyConfig
 from openvima.policies.differences import described, listed
+from openvima.policies.inference import NetworkPolicy
 from openvima.policies.network import PolicyNetwork, outline_network
 from openvima.policies.published import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
@@ -79,7 +79,7 @@ def save_checkpoint(
     """
     folder = Path(folder)
     _refuse_to_delete(folder)
-    with whole_folder(folder) as partial:
+    with atomic_folder(folder) as partial:
         write_checkpoint(network, partial, tokenizer, dtype=dtype)
 
 

@@ -10,11 +10,11 @@ from openvima.policies.heads.autoregressive import AutoregressiveConfig
 from openvima.policies.heads.bins import BinsConfig
 from openvima.policies.heads.copying import CopyingConfig
 from openvima.policies.heads.pointing import PointingConfig
-from openvima.policies.layers.comparison import ComparisonConfig
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig
+from openvima.policies.nn.comparison import ComparisonConfig
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig
 
 
 @dataclass(frozen=True, slots=True)

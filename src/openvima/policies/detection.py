@@ -11,7 +11,7 @@ from openvima.perception.objects import (
     FRONT,
     MIN_PIXELS,
     TOP,
-    ObjectFinder,
+    ObjectExtractor,
     ObjectViews,
     camera_frames,
     crop_box,
@@ -149,7 +149,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedObjects:
-    """Finds objects by a detector; an `ObjectFinder` that never looks at a segmentation.
+    """Finds objects by a detector; an `ObjectExtractor` that never looks at a segmentation.
 
     Each view is looked at alone. Then boxes of the two views are paired that stand on the same place of the
     table and have the same colour; what stays without a partner is an object hidden in the other view. All
@@ -158,13 +158,13 @@ class DetectedObjects:
     Args:
         detector: Finds the objects of one image.
         min_score: Detections below it are left out. Those without scores all count.
-        prompt_finder: Finds the objects of prompt images instead, which look unlike the table of most
+        prompt_extractor: Finds the objects of prompt images instead, which look unlike the table of most
             detectors' training images; `GROUND_TRUTH`, for example.
     """
 
     detector: Detector
     min_score: float = field(default=0.5, kw_only=True)
-    prompt_finder: ObjectFinder | None = field(default=None, kw_only=True)
+    prompt_extractor: ObjectExtractor | None = field(default=None, kw_only=True)
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
         """Find the objects of an observation, from left to right.
@@ -189,8 +189,8 @@ class DetectedObjects:
             ShapeError: An image or a detection has another shape or dtype.
             DetectionError: A detection lies outside the image.
         """
-        if self.prompt_finder is not None:
-            return self.prompt_finder.in_prompt_image(image)
+        if self.prompt_extractor is not None:
+            return self.prompt_extractor.in_prompt_image(image)
         single = image.kind == "object"
         frames = camera_frames(image.rgb, f"the rgb of prompt image {image.name!r}")
         front, top = (self._look(frames[view], view, single=single) for view in VIEWS)

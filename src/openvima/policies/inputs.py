@@ -20,15 +20,15 @@ from openvima.perception.objects import (
     GROUND_TRUTH,
     PUBLISHED_ORDER,
     TOP,
-    ObjectFinder,
+    ObjectExtractor,
     ObjectViews,
     end_effector_of,
     part_of,
     whole_frames,
 )
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.trunk import MAX_PLACES
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.trunk import MAX_PLACES
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
@@ -77,27 +77,27 @@ class PromptBatch(_Tensors):
     """Prompts of a batch; image tokens are numbered through the batch.
 
     Args:
-        words_BL: Word ids.
-        images_BL: Image token that stands at a place, numbered through the first tokens of all objects, then
-            all second ones, and so on; `WORD` where a word stands.
+        word_ids_BL: Word ids.
+        object_index_BL: Image token that stands at a place, numbered through the first tokens of all
+            objects, then all second ones, and so on; `WORD` where a word stands.
         mask_BL: Which places exist.
-        crops_VS: Number of each object's image in the stack of images.
+        crop_index_VS: Number of each object's image in the stack of images.
         boxes_VS4: Boxes in pixels.
         masks_VS: Whether the object is visible in the view.
         positions_S2: Table points under the boxes, metres.
-        numbers_S: Which image of its prompt shows the object, counted from 0 in reading order.
-        on_table_S: Whether that is a picture of the table, where the object has a place, see `on_table`.
+        image_index_S: Which image of its prompt shows the object, counted from 0 in reading order.
+        in_scene_S: Whether that is a picture of the table, where the object has a place, see `on_table`.
     """
 
-    words_BL: torch.Tensor
-    images_BL: torch.Tensor
+    word_ids_BL: torch.Tensor
+    object_index_BL: torch.Tensor
     mask_BL: torch.Tensor
-    crops_VS: torch.Tensor
+    crop_index_VS: torch.Tensor
     boxes_VS4: torch.Tensor
     masks_VS: torch.Tensor
     positions_S2: torch.Tensor
-    numbers_S: torch.Tensor
-    on_table_S: torch.Tensor
+    image_index_S: torch.Tensor
+    in_scene_S: torch.Tensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,20 +122,20 @@ class HistoryBatch(_Tensors):
     """Observations of a batch of episodes, padded to equal numbers of steps and objects.
 
     Args:
-        crops_BTVN: Number of each object's image in the stack of images.
+        crop_index_BTVN: Number of each object's image in the stack of images.
         boxes_BTVN4: Boxes in pixels.
         masks_BTVN: Whether the object is visible in the view.
-        counts_BT: Number of objects of the step, padding of the batch not counted.
+        num_slots_BT: Number of objects of the step, padding of the batch not counted.
         positions_BTN2: Table points under the boxes, metres.
         grasps_BTN2: Table points under the most interior pixels, metres.
         end_effector_BT: 0 suction cup, 1 spatula.
         steps_BT: Which steps exist.
     """
 
-    crops_BTVN: torch.Tensor
+    crop_index_BTVN: torch.Tensor
     boxes_BTVN4: torch.Tensor
     masks_BTVN: torch.Tensor
-    counts_BT: torch.Tensor
+    num_slots_BT: torch.Tensor
     positions_BTN2: torch.Tensor
     grasps_BTN2: torch.Tensor
     end_effector_BT: torch.Tensor
@@ -151,33 +151,33 @@ class Reader:
         image_size: Height and width of a crop or frame.
         tokens_per_frame_pair: With frames, how many tokens a pair of them becomes.
         tokenizer: Splits text into word ids.
-        finder: Finds the objects in images.
+        extractor: Finds the objects in images.
     """
 
     layout: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_frame_pair: int = 0
     tokenizer: Tokenizer = CLOSED_TOKENIZER
-    finder: ObjectFinder = GROUND_TRUTH
+    extractor: ObjectExtractor = GROUND_TRUTH
 
     @staticmethod
     def of(
         images: ObjectEncoderConfig | FrameEncoderConfig,
         tokenizer: Tokenizer | None = None,
-        finder: ObjectFinder | None = None,
+        extractor: ObjectExtractor | None = None,
     ) -> "Reader":
         """Make the reader for a network whose images are encoded in this way.
 
-        Objects are found by segmentation unless a finder is given: in the order of their ids for a token in
-        each view, as the published policies know them, and from left to right otherwise.
+        Objects are found by segmentation unless an extractor is given: in the order of their ids for a token
+        in each view, as the published policies know them, and from left to right otherwise.
         """
         tokenizer = tokenizer or CLOSED_TOKENIZER
         if isinstance(images, FrameEncoderConfig):
             size = (images.frame.image_height, images.frame.image_width)
             return Reader("frames", size, images.num_tokens, tokenizer)
         if images.fuse_views:
-            return Reader("objects", tokenizer=tokenizer, finder=finder or GROUND_TRUTH)
-        return Reader("views", tokenizer=tokenizer, finder=finder or PUBLISHED_ORDER)
+            return Reader("objects", tokenizer=tokenizer, extractor=extractor or GROUND_TRUTH)
+        return Reader("views", tokenizer=tokenizer, extractor=extractor or PUBLISHED_ORDER)
 
     def read_prompt(self, prompt: RenderedPrompt) -> PromptInput:
         """Turn a prompt into words and images.
@@ -233,7 +233,7 @@ class Reader:
     def _see_prompt_image(self, image: PromptImage) -> ObjectViews:
         if self.layout == "frames":
             return self.see_frames(image.rgb)
-        objects = self.finder.in_prompt_image(image)
+        objects = self.extractor.in_prompt_image(image)
         return objects if self.layout == "objects" else objects.compacted()
 
     def _places(self, objects: ObjectViews, slots: Sequence[int]) -> list[tuple[int, int, bool]]:
@@ -277,7 +277,7 @@ class EpisodeReader:
             frames = self._reader.see_frames(part_of(observation, "rgb"))
             centre = frames.positions()
             return StepInput(frames, centre, centre, end_effector)
-        objects = self._reader.finder.in_observation(observation)
+        objects = self._reader.extractor.in_observation(observation)
         if not len(objects) and not self._num_slots:
             raise PolicyError(
                 "the observation shows no object; there is nothing to act on. Look at its segmentation, "
@@ -294,7 +294,7 @@ class EpisodeReader:
         limit = MAX_PLACES // (len(VIEWS) if self._reader.layout == "views" else 1) - 1
         if count > limit:
             raise PolicyError(
-                f"the observation shows {count} objects; this policy takes {limit}. Make the finder choosier."
+                f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."
             )
 
 

@@ -34,14 +34,14 @@ from openvima.policies.heads.bins import BinsConfig, BinsHead
 from openvima.policies.heads.copying import CopyingConfig, CopyingHead
 from openvima.policies.heads.pointing import PointingHead
 from openvima.policies.inputs import HistoryBatch, PromptBatch
-from openvima.policies.layers.action_encoder import ActionEncoder
-from openvima.policies.layers.comparison import Comparison, Sights, TurnBetween, alike_shown, earlier, others
-from openvima.policies.layers.frame_encoder import FrameEncoder
-from openvima.policies.layers.object_encoder import ObjectEncoder, ObjectEncoderConfig
-from openvima.policies.layers.prompt_encoder import PromptEncoder
-from openvima.policies.layers.referents import referents
-from openvima.policies.layers.trunk import TrunkState, build_trunk
-from openvima.policies.layers.uninitialised import Uninitialised
+from openvima.policies.nn.action_encoder import ActionEncoder
+from openvima.policies.nn.comparison import Comparison, Sights, TurnBetween, alike_shown, earlier, others
+from openvima.policies.nn.frame_encoder import FrameEncoder
+from openvima.policies.nn.meta_init import MetaInit
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.nn.referents import referents
+from openvima.policies.nn.trunk import TrunkState, build_trunk
 from openvima.policies.tokenizer import PADDING_ID, texture_word_ids
 from openvima.scene import END_EFFECTORS
 
@@ -196,9 +196,9 @@ class PolicyNetwork(nn.Module):
             prompts: The prompts.
             features_KF: Encoded images, by number.
         """
-        features_VSF = features_KF[prompts.crops_VS]
-        is_image_BL = (prompts.images_BL >= 0) & prompts.mask_BL
-        describes_BL = self._describes(prompts.words_BL)
+        features_VSF = features_KF[prompts.crop_index_VS]
+        is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
+        describes_BL = self._describes(prompts.word_ids_BL)
         width = _appearance_width(self.config)
         looks_SA = features_VSF.new_zeros(prompts.masks_VS.shape[1], width)
         if width and len(looks_SA):
@@ -210,18 +210,18 @@ class PolicyNetwork(nn.Module):
         changes_SD = None if shown is None else shown.changes_SD
         refers_BLL = None
         if self.config.prompt.referents:
-            refers_BLL = referents(prompts.words_BL, prompts.images_BL, prompts.mask_BL)
+            refers_BLL = referents(prompts.word_ids_BL, prompts.object_index_BL, prompts.mask_BL)
             refers_BLL = refers_BLL.to(features_VSF.dtype)
         encoded_BLD = self._read(prompts, features_VSF, changes_SD, refers_BLL)
         roles_BLD = encoded_BLD
         appearance_BLA = encoded_BLD.new_zeros(*is_image_BL.shape, width)
         if width:
             # Else a role could be told by which textures had it in training.
-            words_BL = torch.where(describes_BL, PADDING_ID, prompts.words_BL)
-            blind = replace(prompts, words_BL=words_BL)
+            word_ids_BL = torch.where(describes_BL, PADDING_ID, prompts.word_ids_BL)
+            blind = replace(prompts, word_ids_BL=word_ids_BL)
             roles_BLD = self._read(blind, torch.zeros_like(features_VSF), changes_SD, refers_BLL)
             if len(looks_SA):
-                appearance_BLA = looks_SA[prompts.images_BL.clamp(min=0)] * is_image_BL[..., None]
+                appearance_BLA = looks_SA[prompts.object_index_BL.clamp(min=0)] * is_image_BL[..., None]
         shows_BL = is_image_BL
         if refers_BLL is not None:
             appearance_BLA = appearance_BLA + refers_BLL @ appearance_BLA
@@ -234,7 +234,7 @@ class PolicyNetwork(nn.Module):
         scenes = replace(scenes, numbers_BK=_scene_numbers(shown.sights))
         word_looks_BLA = None
         if self.word_looks is not None:
-            word_looks_BLA = self.word_looks(self.prompt.words(prompts.words_BL)) * describes_BL[..., None]
+            word_looks_BLA = self.word_looks(self.prompt.words(prompts.word_ids_BL)) * describes_BL[..., None]
         return replace(memory, sights=shown.sights, scenes=scenes, word_looks_BLA=word_looks_BLA)
 
     def begin(self, memory: Memory) -> HistoryState:
@@ -329,7 +329,7 @@ class PolicyNetwork(nn.Module):
         after: _Places | None = None,
     ) -> tuple[HeadInputs, HistoryState]:
         """Read the slots of steps, and the places of actions before or after those of each step."""
-        features = features_KF[history.crops_BTVN]
+        features = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self._appearance(features, history.masks_BTVN)
         sights = _sights_in_view(history, features, appearance_BTNA, memory.sights)
         slots_BTQD, mask_BTQ, read_BT = self.observe(history, features, self._relations(memory, sights))
@@ -400,20 +400,20 @@ class PolicyNetwork(nn.Module):
             query_BT1D = self.query.expand(*slots_BTQD.shape[:2], 1, -1)
             slots_BTQD = torch.cat([slots_BTQD, query_BT1D], dim=2)
             mask_BTQ = torch.cat([mask_BTQ, history.steps_BT[..., None]], dim=2)
-        read_BT = torch.full_like(history.counts_BT, slots_BTQD.shape[2] - 1)
+        read_BT = torch.full_like(history.num_slots_BT, slots_BTQD.shape[2] - 1)
         if self.query is None and isinstance(images, ObjectEncoderConfig):
             # The last slot of the episode itself, be it padding or not; beyond it lies padding of the batch.
-            read_BT = read_BT - history.masks_BTVN.shape[-1] + history.counts_BT.clamp(min=1)
+            read_BT = read_BT - history.masks_BTVN.shape[-1] + history.num_slots_BT.clamp(min=1)
         return slots_BTQD, mask_BTQ, read_BT
 
-    def _describes(self, words_BL: torch.Tensor) -> torch.Tensor:
+    def _describes(self, word_ids_BL: torch.Tensor) -> torch.Tensor:
         """Which words say how something looks, (B, L): in our own vocabulary names of textures.
 
         Other words may not have looks: they would be those of what the training told of in such words.
         """
         if self.word_looks is None or self.config.prompt.tokenizer != "closed":
-            return torch.zeros_like(words_BL, dtype=torch.bool)
-        return torch.isin(words_BL, torch.tensor(sorted(texture_word_ids()), device=words_BL.device))
+            return torch.zeros_like(word_ids_BL, dtype=torch.bool)
+        return torch.isin(word_ids_BL, torch.tensor(sorted(texture_word_ids()), device=word_ids_BL.device))
 
     def _read(
         self,
@@ -425,7 +425,9 @@ class PolicyNetwork(nn.Module):
         tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
         if changes_SD is not None:
             tokens_IE = tokens_IE + changes_SD
-        return self.prompt(prompts.words_BL, prompts.images_BL, prompts.mask_BL, tokens_IE, refers_BLL)
+        return self.prompt(
+            prompts.word_ids_BL, prompts.object_index_BL, prompts.mask_BL, tokens_IE, refers_BLL
+        )
 
     def _shown(
         self,
@@ -437,7 +439,7 @@ class PolicyNetwork(nn.Module):
         """Gather what prompts show, and compare the objects of each with those of its earlier images."""
         order_BM = _objects_first(is_image_BL)
         exists_BM = is_image_BL.gather(1, order_BM)
-        row_BM = prompts.images_BL.gather(1, order_BM).clamp(min=0)
+        row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         sights = _sights_of(prompts, row_BM, exists_BM, features_VSF, looks_SA)
         if self.compare_within is None:
             return _Shown(order_BM, sights, None, None)
@@ -530,7 +532,7 @@ def outline_network(config: PolicyConfig) -> PolicyNetwork:
     It takes no time and no memory, whatever the sizes. `network.load_state_dict(weights, assign=True)` makes
     a whole network of it.
     """
-    with Uninitialised():
+    with MetaInit():
         return PolicyNetwork(config)
 
 
@@ -555,8 +557,8 @@ def _sights_of(
         masks_VN=(prompts.masks_VS[:, row_BM] & exists_BM).transpose(0, 1),
         appearance_NA=looks_SA[row_BM],
         positions_N2=prompts.positions_S2[row_BM].to(metric),
-        on_table_N=prompts.on_table_S[row_BM] & exists_BM,
-        numbers_N=prompts.numbers_S[row_BM] * exists_BM,
+        on_table_N=prompts.in_scene_S[row_BM] & exists_BM,
+        numbers_N=prompts.image_index_S[row_BM] * exists_BM,
     )
 
 

@@ -19,9 +19,9 @@ def nano() -> "PolicyConfig":
     from openvima.policies.config import PolicyConfig
     from openvima.policies.families.common import size
     from openvima.policies.heads.pointing import PointingConfig
-    from openvima.policies.layers.conv_encoder import ConvConfig
-    from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-    from openvima.policies.layers.trunk import DecoderConfig
+    from openvima.policies.nn.conv_encoder import ConvConfig
+    from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+    from openvima.policies.nn.trunk import DecoderConfig
 
     crop = ConvConfig(width=32, output_width=128)
     return PolicyConfig(
@@ -49,12 +49,12 @@ def small() -> "PolicyConfig":
     """8.5 M parameters: it copies places that it has seen, and compares objects with each other."""
     from openvima.policies.config import PolicyConfig
     from openvima.policies.heads.copying import CopyingConfig
-    from openvima.policies.layers.comparison import ComparisonConfig
-    from openvima.policies.layers.conv_encoder import ConvConfig
-    from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-    from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-    from openvima.policies.layers.text_encoder import TextEncoderConfig
-    from openvima.policies.layers.trunk import DecoderConfig
+    from openvima.policies.nn.comparison import ComparisonConfig
+    from openvima.policies.nn.conv_encoder import ConvConfig
+    from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+    from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+    from openvima.policies.nn.text_encoder import TextEncoderConfig
+    from openvima.policies.nn.trunk import DecoderConfig
     from openvima.policies.tokenizer import vocabulary_size
 
     crop = ConvConfig(width=48, output_width=192, place_channels=32)

@@ -16,8 +16,8 @@ from safetensors import safe_open
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
 from openvima.policies.hub import fetch_from_hub
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.table import T5, to_theirs
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, END_ID, PADDING_ID, Tokenizer
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from openvima.atomic_io import atomic_write_file
 from openvima.catalog import (
     LEVELS,
     NEUTRAL_TEXTURE,
@@ -24,10 +25,9 @@ from openvima.catalog import (
     texture_spec,
 )
 from openvima.errors import AssetError
-from openvima.files import write_whole
 from openvima.render.camera import VIEWS, View
-from openvima.render.portraits import Detail, draw_portrait
 from openvima.render.rasteriser import Rasteriser
+from openvima.render.thumbnails import Detail, draw_portrait
 
 Report = Callable[[int, int, str], None]
 
@@ -83,7 +83,9 @@ def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) ->
         swatches.append(_texture_card(artist, spec))
         if report:
             report(len(objects) + len(swatches), total, spec.name)
-    page = write_whole(out / "index.html", _page(assets.name, objects, _by_category(textures, swatches)))
+    page = atomic_write_file(
+        out / "index.html", _page(assets.name, objects, _by_category(textures, swatches))
+    )
     return page, tuple(dict.fromkeys(artist.problems))
 
 
@@ -117,7 +119,7 @@ class _Artist:
             return f'<span class="missing">{html.escape(title)} is missing</span>'
         stream = io.BytesIO()
         Image.fromarray(pixels).save(stream, "PNG")
-        write_whole(self.out / PICTURES / f"{name}.png", stream.getvalue())
+        atomic_write_file(self.out / PICTURES / f"{name}.png", stream.getvalue())
         height, width = pixels.shape[:2]
         return (
             f'<img src="{PICTURES}/{name}.png" width="{width}" height="{height}" '

@@ -14,11 +14,11 @@ from openvima.scene import Action, Pose
 from openvima.sim import end_effectors as tools
 from openvima.sim import ur5
 from openvima.sim.arm_path import reachable_joints
-from openvima.sim.blade import Blade
 from openvima.sim.bodies import Bodies
+from openvima.sim.contacts import body_gap, gap, way_to_touch
 from openvima.sim.model import FLOOR_Z_M
+from openvima.sim.spatula import Blade
 from openvima.sim.stage import RESTING_GAP_M, Stage, is_level
-from openvima.sim.touch import body_gap, gap, way_to_touch
 
 _DOWN = (0.0, 0.0, -1.0)
 _ABOVE_ALL_M = 1.0  # height from which tools and held bodies are lowered, above every stack

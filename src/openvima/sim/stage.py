@@ -7,8 +7,8 @@ from openvima.scene import Placement, Pose, Scene
 from openvima.sim import settling
 from openvima.sim.arm_path import ArmPath
 from openvima.sim.bodies import Bodies
+from openvima.sim.contacts import body_gap
 from openvima.sim.model import FLOOR_Z_M
-from openvima.sim.touch import body_gap
 
 RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
 LEVEL_RAD = 0.03  # the pan rests tilted by 0.01

@@ -48,7 +48,7 @@ def augmented(
     if layout == "views":
         return _with_spurious_in_views(batch, shows_BTV, drawn[..., NUM_VIEWS : 2 * NUM_VIEWS])
     history = batch.history
-    is_slot = torch.arange(history.positions_BTN2.shape[2]) < history.counts_BT[..., None]
+    is_slot = torch.arange(history.positions_BTN2.shape[2]) < history.num_slots_BT[..., None]
     keys_BTN = torch.cat(  # padding of the batch stays at the end
         [torch.where(is_slot, drawn[..., 2 * NUM_VIEWS :], _LAST), drawn[..., NUM_VIEWS : 2 * NUM_VIEWS]], -1
     )
@@ -68,16 +68,16 @@ def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatc
     """Append a slot for each view; slot N + v shows the false detection of view v, or nothing."""
     history, spurious = batch.history, batch.spurious
     visible_BTVN = torch.diag_embed(shows_BTV)  # view v, slot v
-    crops_BTVN = torch.diag_embed(torch.from_numpy(spurious.crops)) * visible_BTVN
+    crop_index_BTVN = torch.diag_embed(torch.from_numpy(spurious.crops)) * visible_BTVN
     boxes_BTV4 = torch.from_numpy(spurious.boxes)
     boxes_BTVN4 = boxes_BTV4[:, :, :, None] * visible_BTVN[..., None]
     points_BTN2 = torch.from_numpy(spurious.points)
     return replace(
         history,
-        crops_BTVN=torch.cat([history.crops_BTVN, crops_BTVN], dim=3),
+        crop_index_BTVN=torch.cat([history.crop_index_BTVN, crop_index_BTVN], dim=3),
         boxes_BTVN4=torch.cat([history.boxes_BTVN4, boxes_BTVN4], dim=3),
         masks_BTVN=torch.cat([history.masks_BTVN, visible_BTVN], dim=3),
-        counts_BT=history.counts_BT + NUM_VIEWS,
+        num_slots_BT=history.num_slots_BT + NUM_VIEWS,
         positions_BTN2=torch.cat([history.positions_BTN2, points_BTN2], dim=2),
         grasps_BTN2=torch.cat([history.grasps_BTN2, points_BTN2], dim=2),
     )
@@ -98,10 +98,10 @@ def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: to
     rank_BTVN[..., -NUM_VIEWS:] = torch.where(
         torch.diag_embed(shows_BTV), place_BTV[..., None], rank_BTVN[..., -NUM_VIEWS:]
     )
-    counts_BT = (batch.history.counts_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
-    counts_BT = torch.where(history.steps_BT, counts_BT, 0)
+    num_slots_BT = (batch.history.num_slots_BT + shows_BTV.sum(dim=2)).cummax(dim=1).values
+    num_slots_BT = torch.where(history.steps_BT, num_slots_BT, 0)
     views = _in_order(history, rank_BTVN.argsort(dim=3))
-    return replace(batch, history=replace(views, counts_BT=counts_BT))
+    return replace(batch, history=replace(views, num_slots_BT=num_slots_BT))
 
 
 def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
@@ -110,7 +110,7 @@ def _shuffled(batch: Batch, keys_BTN: torch.Tensor) -> Batch:
     order_BTN = keys_BTN.argsort(dim=-1, stable=True)
     place_BTN = order_BTN.argsort(dim=-1)  # where each old slot has gone
     order_BTN2 = order_BTN[..., None].expand_as(history.positions_BTN2)
-    views = _in_order(history, order_BTN[:, :, None].expand_as(history.crops_BTVN))
+    views = _in_order(history, order_BTN[:, :, None].expand_as(history.crop_index_BTVN))
     moved = replace(
         views,
         positions_BTN2=history.positions_BTN2.gather(2, order_BTN2),
@@ -128,7 +128,7 @@ def _in_order(history: HistoryBatch, order_BTVN: torch.Tensor) -> HistoryBatch:
     """Reorder what views show of the objects."""
     return replace(
         history,
-        crops_BTVN=history.crops_BTVN.gather(3, order_BTVN),
+        crop_index_BTVN=history.crop_index_BTVN.gather(3, order_BTVN),
         boxes_BTVN4=history.boxes_BTVN4.gather(3, order_BTVN[..., None].expand_as(history.boxes_BTVN4)),
         masks_BTVN=history.masks_BTVN.gather(3, order_BTVN),
     )

@@ -11,8 +11,8 @@ from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.midas import with_autoregression, with_visual_residual
 from openvima.policies.inputs import Reader
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
 from openvima.policies.network import PolicyNetwork, build_network
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.config import DETECTED_SHARE, MATCHING_STEPS, TrainingConfig

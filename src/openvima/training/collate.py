@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from openvima.data.tokens.episode import (
+from openvima.data.object_cache.episode import (
     BOXES,
     COUNT,
     GRASPS,
@@ -22,7 +22,7 @@ from openvima.data.tokens.episode import (
     PLACE,
     SPURIOUS_BOXES,
     SPURIOUS_NUMBERS,
-    TokenEpisode,
+    PreprocessedEpisode,
     pieces_of,
 )
 from openvima.errors import DatasetError
@@ -64,7 +64,7 @@ class Collator:
         return Batch(self._prompts(episodes, bases), history, targets, self._spurious(steps, bases))
 
     def _history(
-        self, episodes: Sequence[TokenEpisode], steps: "_Steps", bases: np.ndarray
+        self, episodes: Sequence[PreprocessedEpisode], steps: "_Steps", bases: np.ndarray
     ) -> tuple[HistoryBatch, np.ndarray]:
         """Return what was seen, and the slots of the objects to pick and to place at, shape (2, steps)."""
         rows = np.concatenate([episode.objects for episode in episodes]).astype(np.int64)
@@ -103,7 +103,9 @@ class Collator:
                 slots[row, step[asked]] = slot[asked]
         return history, slots
 
-    def _num_slots(self, episodes: Sequence[TokenEpisode], steps: "_Steps", counts: np.ndarray) -> np.ndarray:
+    def _num_slots(
+        self, episodes: Sequence[PreprocessedEpisode], steps: "_Steps", counts: np.ndarray
+    ) -> np.ndarray:
         """Slots at each step, shape (B, T), int64; with a token for each view they never become fewer."""
         num_slots = steps.padded(counts)
         if self.reader.layout == "views":
@@ -127,19 +129,19 @@ class Collator:
         numbers = np.where(numbers > 0, numbers + bases[steps.b][:, None], 0)
         return Spurious(steps.padded(numbers), steps.padded(boxes), steps.padded(points))
 
-    def _prompts(self, episodes: Sequence[TokenEpisode], bases: np.ndarray) -> PromptBatch:
+    def _prompts(self, episodes: Sequence[PreprocessedEpisode], bases: np.ndarray) -> PromptBatch:
         prompts = [self._prompt(episode) for episode in episodes]
         total = sum(len(prompt.rows) for prompt in prompts)
         length = max(len(prompt.places.words) for prompt in prompts)
-        words_BL = np.full((len(prompts), length), PADDING_ID, np.int64)
-        images_BL = np.full((len(prompts), length), WORD, np.int64)
+        word_ids_BL = np.full((len(prompts), length), PADDING_ID, np.int64)
+        object_index_BL = np.full((len(prompts), length), WORD, np.int64)
         mask_BL = np.zeros((len(prompts), length), np.bool_)
         first = 0
         for b, prompt in enumerate(prompts):
             places, size = prompt.places, len(prompt.places.words)
-            words_BL[b, :size] = places.words
+            word_ids_BL[b, :size] = places.words
             numbered = places.entries + (first + places.parts * total)
-            images_BL[b, :size] = np.where(places.is_word, WORD, numbered)
+            object_index_BL[b, :size] = np.where(places.is_word, WORD, numbered)
             mask_BL[b, :size] = True if prompt.mask is None else prompt.mask
             first += len(prompt.rows)
         rows = np.concatenate([prompt.rows for prompt in prompts]).astype(np.int64)
@@ -154,8 +156,8 @@ class Collator:
             for prompt, start, end in zip(prompts, starts[:-1], starts[1:], strict=True)
         ]
         arrays = (
-            words_BL,
-            images_BL,
+            word_ids_BL,
+            object_index_BL,
             mask_BL,
             numbers_VS,
             boxes_VS4,
@@ -166,7 +168,7 @@ class Collator:
         )
         return PromptBatch(*(torch.from_numpy(array) for array in arrays))
 
-    def _prompt(self, episode: TokenEpisode) -> "_Prompt":
+    def _prompt(self, episode: PreprocessedEpisode) -> "_Prompt":
         """Lay out one prompt: words, and one token or several for each object of an image."""
         counts = tuple(episode.prompt_counts.tolist())
         if self.reader.layout != "views":
@@ -258,7 +260,7 @@ class _Steps:
         return self.exists.shape
 
     @staticmethod
-    def of(episodes: Sequence[TokenEpisode]) -> "_Steps":
+    def of(episodes: Sequence[PreprocessedEpisode]) -> "_Steps":
         lengths = np.array([episode.num_steps for episode in episodes])
         b = np.repeat(np.arange(len(episodes)), lengths)
         t = np.arange(len(b)) - np.repeat(np.cumsum(lengths) - lengths, lengths)

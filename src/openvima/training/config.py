@@ -6,7 +6,7 @@ from typing import Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.presets import PRESETS
-from openvima.training.checks import problems_of
+from openvima.training.validation import problems_of
 
 MATCHING_STEPS = 400  # of presets with an appearance embedding
 DETECTED_SHARE = 0.5  # where there are boxes of a detector
@@ -92,7 +92,7 @@ class TrainingConfig:
             whose view up to three objects of another demonstration come.
         boxes: Detector whose boxes part of the demonstrations are shown with, images of prompts included:
             "detector" for the one that comes with the package, "detector=folder" for another trained one, or
-            "module:function" or "file.py:function", which makes an `ObjectFinder`.
+            "module:function" or "file.py:function", which makes an `ObjectExtractor`.
         detected_share: Share of demonstrations that are shown with these boxes instead of the true ones,
             drawn anew in each batch; None is half of them where `boxes` are given. The checkpoint is chosen
             by true boxes, unless it is 1.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from openvima.data.tokens.episode import IMAGE_SIZES, TokenEpisode, TokenKind
+from openvima.data.object_cache.episode import IMAGE_SIZES, InputKind, PreprocessedEpisode
 from openvima.policies.heads.base import ActionTargets
 from openvima.policies.inputs import HistoryBatch, PromptBatch, Reader
 
@@ -42,7 +42,7 @@ class Example:
         other: Another one, from which objects may be borrowed.
     """
 
-    tokens: TokenEpisode
+    tokens: PreprocessedEpisode
     base: int = 0
     row: int = 0
     other: "Example | None" = None
@@ -78,18 +78,20 @@ class Batch:
         )
 
 
-def token_kind(reader: Reader) -> TokenKind:
+def input_kind(reader: Reader) -> InputKind:
     """Return what a network's images show: objects, or whole frames."""
     return "frames" if reader.layout == "frames" else "objects"
 
 
-def stack_images(episodes: Sequence[TokenEpisode], reader: Reader) -> tuple[list[Example], torch.Tensor]:
+def stack_images(
+    episodes: Sequence[PreprocessedEpisode], reader: Reader
+) -> tuple[list[Example], torch.Tensor]:
     """Put the images of some demonstrations into one stack, behind a black one.
 
     Returns:
         The demonstrations, and the stack, shape (K, 3, height, width), uint8.
     """
-    size = IMAGE_SIZES[token_kind(reader)]
+    size = IMAGE_SIZES[input_kind(reader)]
     stack = np.concatenate([np.zeros((1, 3, *size), np.uint8), *(episode.images for episode in episodes)])
     bases = np.cumsum([0, *(len(episode.images) for episode in episodes)]).tolist()
     examples = [Example(episode, base) for episode, base in zip(episodes, bases[:-1], strict=True)]

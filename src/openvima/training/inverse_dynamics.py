@@ -14,13 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.tokens.episode import COUNT, ID, NUMBERS, PROMPT_WIDTH, TokenEpisode
+from openvima.data.object_cache.episode import COUNT, ID, NUMBERS, PROMPT_WIDTH, PreprocessedEpisode
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 
 MOTION_TEXT = "Follow this motion: {frames}."
 
 
-def as_motion(episode: TokenEpisode) -> TokenEpisode:
+def as_motion(episode: PreprocessedEpisode) -> PreprocessedEpisode:
     """Return the same demonstration with its own frames as the prompt.
 
     Nothing is copied but rows of numbers: the prompt names the images of the history. Nothing is left of the

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from openvima.data.tokens.episode import TokenKind
+from openvima.data.object_cache.episode import InputKind
 from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.checkpoint import load_weights, write_checkpoint
@@ -19,7 +19,7 @@ from openvima.policies.inputs import Reader
 from openvima.policies.network import PolicyNetwork
 from openvima.training.augment import augmented
 from openvima.training.collate import Collator
-from openvima.training.dataset import Batch, Example, stack_images, token_kind
+from openvima.training.dataset import Batch, Example, input_kind, stack_images
 from openvima.training.retelling import AS_TOLD, Retelling
 
 # From examples and, while training, one generator for each of them, to a batch.
@@ -30,11 +30,11 @@ class Learner(nn.Module):
     """Base of all that can be trained; a policy of your own needs two methods.
 
     Attributes:
-        token_kind: What its images show: "objects" or "frames".
+        input_kind: What its images show: "objects" or "frames".
         score: The metric that chooses the best checkpoint, the larger the better, a share of 1.
     """
 
-    token_kind: TokenKind = "objects"
+    input_kind: InputKind = "objects"
     score = "accuracy"
 
     def collator(self) -> Collate:
@@ -98,7 +98,7 @@ class PolicyLearner(Learner):
         super().__init__()
         self.network = network
         self.reader = reader
-        self.token_kind = token_kind(reader)
+        self.input_kind = input_kind(reader)
         self.score = network.head.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
         self._spurious_probability, self._retelling = spurious_probability, retelling
@@ -228,12 +228,14 @@ def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example]
 def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:
     """Keep the images that the batch shows, each once, and number them anew."""
     prompts, history = batch.prompts, batch.history
-    numbers = torch.cat([prompts.crops_VS.flatten(), history.crops_BTVN.flatten()])
+    numbers = torch.cat([prompts.crop_index_VS.flatten(), history.crop_index_BTVN.flatten()])
     used, places = numbers.unique(return_inverse=True)
-    prompt_places, history_places = places.split([prompts.crops_VS.numel(), history.crops_BTVN.numel()])
+    prompt_places, history_places = places.split(
+        [prompts.crop_index_VS.numel(), history.crop_index_BTVN.numel()]
+    )
     return replace(
         batch,
-        prompts=replace(prompts, crops_VS=prompt_places.view_as(prompts.crops_VS)),
-        history=replace(history, crops_BTVN=history_places.view_as(history.crops_BTVN)),
+        prompts=replace(prompts, crop_index_VS=prompt_places.view_as(prompts.crop_index_VS)),
+        history=replace(history, crop_index_BTVN=history_places.view_as(history.crop_index_BTVN)),
         images=stack[used],
     )

@@ -12,17 +12,15 @@ import torch
 from torch import nn
 
 from openvima.catalog.packs import load_assets
+from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.reader import Dataset
-from openvima.data.tokens.cache import Boxes, TokenCache, open_tokens
-from openvima.detection.hooks import detected_tokens, plugged_boxes
+from openvima.detector.hooks import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
-from openvima.training.board import Board
 from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
 from openvima.training.inverse_dynamics import MOTION_TEXT
 from openvima.training.learner import Learner, PolicyLearner
-from openvima.training.lengths import check_lengths
 from openvima.training.optimizer_state import load_named_state, named_state
 from openvima.training.parallel import (
     Parallel,
@@ -41,8 +39,10 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
+from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
 from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops, has_turns, keeps_crops
+from openvima.training.tensorboard import Board
 
 Report = Callable[[int, int, str], None]
 # A trial in the simulator: checkpoint folder to metrics. It is handed in, since training needs no simulation.
@@ -98,7 +98,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     boxes = plugged_boxes(config.boxes) if config.boxes is not None else None
     with torch_threads(config.threads), joined(config.device, config.sharding) as parallel:
         learner = build_learner(config)
-        if boxes and learner.token_kind == "frames":
+        if boxes and learner.input_kind == "frames":
             raise ConfigError(
                 f"boxes is {config.boxes!r}, but preset {config.preset!r} sees whole frames; leave boxes "
                 "out, or take a preset that sees objects."
@@ -271,7 +271,7 @@ class _Trainer:
             load_named_state(self.learner, optimizer, state)
 
     @cached_property
-    def _tokens(self) -> list[TokenCache]:
+    def _tokens(self) -> list[ObjectCache]:
         """The token caches: of true boxes, of those of a detector, or first the one and then the other.
 
         The first process makes them if need be.
@@ -281,11 +281,11 @@ class _Trainer:
         if not self.parallel.is_first:
             self.parallel.wait()
         if share < 1:
-            kind = self.learner.token_kind
-            caches.append(open_tokens(self.dataset, kind, folder=folder, report=self._say))
+            kind = self.learner.input_kind
+            caches.append(open_object_cache(self.dataset, kind, folder=folder, report=self._say))
         if share > 0:
             assert self.boxes is not None  # `resolved` has seen to it
-            caches.append(detected_tokens(self.dataset, self.boxes, folder=folder, report=self._say))
+            caches.append(detected_object_cache(self.dataset, self.boxes, folder=folder, report=self._say))
         if self.parallel.is_first:
             self.parallel.wait()
         return caches

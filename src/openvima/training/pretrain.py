@@ -19,8 +19,8 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
 from openvima.catalog.random_pack import RandomLooks, shows_heading
 from openvima.catalog.textures import NEUTRAL_TEXTURE
-from openvima.perception.objects import ObjectViews, observe_prompt_image, see_objects
-from openvima.policies.layers.object_encoder import ObjectEncoder
+from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
+from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode
@@ -357,7 +357,7 @@ def _seen(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
     views = rasteriser.scene(scene)
     rgb = {name: image.rgb for name, image in views.items()}
     segm = {name: image.segm for name, image in views.items()}
-    return see_objects(rgb, segm, [placement.id for placement in scene.placements])
+    return extract_objects(rgb, segm, [placement.id for placement in scene.placements])
 
 
 def _prompt_image(placement: Placement, magnification: float, rasteriser: Rasteriser):

@@ -9,7 +9,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.tokens.episode import BOXES, COUNT, ID, NUMBERS, PICK, PLACE, TokenEpisode, image_names
+from openvima.data.object_cache.episode import (
+    BOXES,
+    COUNT,
+    ID,
+    NUMBERS,
+    PICK,
+    PLACE,
+    PreprocessedEpisode,
+    image_names,
+)
 from openvima.policies.inputs import on_table
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 
@@ -21,7 +30,7 @@ _INVENTED = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
 _DETERMINED = ("the", "same", "any", "all")  # words after which a noun needs no article
 
 
-def as_named(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
+def as_named(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Return the same demonstration with invented nouns for one or two objects that its prompt shows alone.
 
     Half of these prompts also name things that do not matter, as they are seen in the scene, so that nouns
@@ -51,7 +60,7 @@ def as_named(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
     return _with_text(episode, text, parts)
 
 
-def in_any_order(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisode:
+def in_any_order(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
     """Return the same demonstration with the sentences that explain invented words in any order.
 
     Definitions and comparisons ("{a} is kobar than {b}.") may then come after the instruction, and of several
@@ -76,13 +85,15 @@ def in_any_order(episode: TokenEpisode, rng: np.random.Generator) -> TokenEpisod
     return _with_text(episode, text, _parts(episode))
 
 
-def _parts(episode: TokenEpisode) -> dict[str, np.ndarray]:
+def _parts(episode: PreprocessedEpisode) -> dict[str, np.ndarray]:
     """Rows of the objects of each prompt image, by its name."""
     rows = np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1])
     return dict(zip(image_names(episode.text), rows, strict=True))
 
 
-def _with_text(episode: TokenEpisode, text: str, parts: Mapping[str, np.ndarray]) -> TokenEpisode:
+def _with_text(
+    episode: PreprocessedEpisode, text: str, parts: Mapping[str, np.ndarray]
+) -> PreprocessedEpisode:
     """The demonstration with another prompt, which shows some of these images."""
     in_order = [parts[name] for name in image_names(text)]
     return replace(
@@ -93,7 +104,9 @@ def _with_text(episode: TokenEpisode, text: str, parts: Mapping[str, np.ndarray]
     )
 
 
-def _others_in_view(episode: TokenEpisode, alone: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+def _others_in_view(
+    episode: PreprocessedEpisode, alone: np.ndarray, rng: np.random.Generator
+) -> list[np.ndarray]:
     """Rows for pictures of objects that the first step does nothing with, in any order.
 
     They show the crops of the scene, in the middle of the picture as single objects stand there.
@@ -112,7 +125,9 @@ def _others_in_view(episode: TokenEpisode, alone: np.ndarray, rng: np.random.Gen
     return [rows[[int(number)]] for number in rng.permutation(len(rows))]
 
 
-def without_bystanders(motion: TokenEpisode, share: float, rng: np.random.Generator) -> TokenEpisode:
+def without_bystanders(
+    motion: PreprocessedEpisode, share: float, rng: np.random.Generator
+) -> PreprocessedEpisode:
     """Take objects that nothing is done with out of view, and others out of the pictures that show a motion.
 
     Args:
@@ -142,7 +157,7 @@ def _counted(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
     return np.bincount(group[kept], minlength=len(counts))
 
 
-def _alone(episode: TokenEpisode) -> np.ndarray:
+def _alone(episode: PreprocessedEpisode) -> np.ndarray:
     """Which images of the prompt show one object alone, shape (I,), bool."""
     image = np.repeat(np.arange(len(episode.prompt_counts)), episode.prompt_counts)
     boxes = episode.prompt[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1)

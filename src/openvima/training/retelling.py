@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from openvima.data.tokens.episode import TokenEpisode
+from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.training.dataset import Example
 from openvima.training.inverse_dynamics import as_motion
 from openvima.training.rereading import as_named, in_any_order, without_bystanders
@@ -52,5 +52,7 @@ class Retelling:
 AS_TOLD = Retelling()
 
 
-def _reread(example: Example, change: Callable[..., TokenEpisode], *given: Any) -> Example:  # Any: its own
+def _reread(
+    example: Example, change: Callable[..., PreprocessedEpisode], *given: Any
+) -> Example:  # Any: its own
     return replace(example, tokens=change(example.tokens, *given))

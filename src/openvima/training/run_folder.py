@@ -22,11 +22,11 @@ import torch
 import yaml
 from safetensors.torch import save_file
 
+from openvima.atomic_io import atomic_write_file
 from openvima.errors import CheckpointError, ConfigError
-from openvima.files import write_whole
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
-from openvima.training.board import BOARD_FOLDER
 from openvima.training.learner import Learner, read_tensors
+from openvima.training.tensorboard import BOARD_FOLDER
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -105,7 +105,7 @@ class RunFolder:
         self.checkpoints.mkdir(parents=True, exist_ok=True)
         for leftover in self.checkpoints.glob(f"*{_PARTIAL}"):
             shutil.rmtree(leftover)
-        write_whole(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
+        atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def latest(self) -> Path | None:
         """Return the last whole checkpoint, or None if there is none."""
@@ -197,11 +197,11 @@ class RunFolder:
                 continue
             if (values["stage"], values["step"]) <= (progress.stage, progress.step):
                 kept.append(line + "\n")
-        write_whole(file, "".join(kept))
+        atomic_write_file(file, "".join(kept))
 
     def _note_best(self, progress: Progress) -> None:
         if progress.best_checkpoint:
-            write_whole(self.checkpoints / BEST_FILE, progress.best_checkpoint)
+            atomic_write_file(self.checkpoints / BEST_FILE, progress.best_checkpoint)
 
     def _differences(self, settings: dict[str, Any]) -> list[str]:
         file = self.path / CONFIG_FILE

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 
 from openvima.data.batching import BatchOrder
-from openvima.data.tokens.cache import TokenCache
-from openvima.data.tokens.episode import pieces_of
+from openvima.data.object_cache.cache import ObjectCache
+from openvima.data.object_cache.episode import pieces_of
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.inputs import Reader
 from openvima.training.dataset import Example
+from openvima.training.hash_split import lots_of
 from openvima.training.learner import Collate
-from openvima.training.lots import lots_of
 from openvima.training.strangers import receives_strangers
 
 
@@ -28,7 +28,7 @@ class ExampleSource(Sequence[Example]):
         lengths: Steps of each one and objects in view in all of them, shape (N, 2), int64.
     """
 
-    cache: TokenCache
+    cache: ObjectCache
     rows: np.ndarray
     bases: np.ndarray
     lengths: np.ndarray
@@ -104,7 +104,7 @@ class Parts:
 
 
 def split_examples(
-    cache: TokenCache, *, validation_share: float, validation_episodes: int
+    cache: ObjectCache, *, validation_share: float, validation_episodes: int
 ) -> tuple[ExampleSource, ExampleSource]:
     """Divide demonstrations into those to learn from and those for validation.
 
@@ -132,7 +132,7 @@ def split_examples(
     return first, second
 
 
-def with_boxes_of(detected: TokenCache, source: ExampleSource) -> ExampleSource:
+def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource:
     """Return the demonstrations of a source with the boxes of a detector.
 
     Args:
@@ -145,7 +145,7 @@ def with_boxes_of(detected: TokenCache, source: ExampleSource) -> ExampleSource:
     return ExampleSource(detected, source.rows, bases, detected.lengths()[source.rows])
 
 
-def check_words(cache: TokenCache, reader: Reader) -> None:
+def check_words(cache: ObjectCache, reader: Reader) -> None:
     """Look at every text before training rather than in the middle of it.
 
     Raises:

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import nn
 
-from openvima.data.tokens.cache import TokenCache
+from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.torch_dataset import BatchStream, batches_of
 from openvima.errors import ConfigError
-from openvima.policies.layers.object_encoder import ObjectEncoder
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.training.config import TrainingConfig
-from openvima.training.gaps import with_gaps
 from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.occlusion import with_gaps
 from openvima.training.parallel import Parallel
 from openvima.training.pretrain import Pairs, matching_loss, pairs_again, scene_accuracy
 from openvima.training.schedule import step_generator
@@ -233,7 +233,7 @@ def has_turns(network: PolicyNetwork) -> bool:
     return isinstance(network.images, ObjectEncoder) and network.images.config.turn_bins > 0
 
 
-def freeze_crops(learner: PolicyLearner, caches: Sequence[TokenCache]) -> None:
+def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
     """Leave the crop encoder as it is; where there are not too many images, encode each once and for all.
 
     Args:

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.tokens.episode import (
+from openvima.data.object_cache.episode import (
     BOXES,
     COUNT,
     ID,
     NUMBERS,
     SPURIOUS_NUMBERS,
-    TokenEpisode,
+    PreprocessedEpisode,
 )
-from openvima.perception.overlap import box_overlaps
+from openvima.perception.iou import box_overlaps
 from openvima.training.dataset import Example
 
 MOST_STRANGERS = 3
@@ -21,7 +21,7 @@ MOST_STRANGERS = 3
 RECEIVING = ("visual_manipulation", "rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore")
 
 
-def receives_strangers(episode: TokenEpisode) -> bool:
+def receives_strangers(episode: PreprocessedEpisode) -> bool:
     """Whether what an episode demonstrates stays right with other objects in view."""
     return episode.task in RECEIVING
 
@@ -60,7 +60,7 @@ def _places(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1), rows[:, NUMBERS].T > 0
 
 
-def _absolute(example: Example) -> TokenEpisode:
+def _absolute(example: Example) -> PreprocessedEpisode:
     """The demonstration with its images numbered as in the stack, in 64 bits."""
     episode = example.tokens
     prompt, objects, final = (

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch.nn import functional as F
 
-from openvima.policies.layers.object_encoder import ObjectEncoder
+from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.training.pretrain import Again, Pairs, alike_in_prompts, colour_mixing, contrast
 
 TURN_TOLERANCE_RAD = math.radians(15)  # as in `rotate` and `twist`

@@ -15,7 +15,7 @@ from openvima.data.published.names import part_of
 from openvima.data.published.picks import picked_ids
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
-from openvima.env import Setup
+from openvima.env import EnvConfig
 from openvima.errors import ConfigError, DatasetError, MemberError, UnknownTaskError
 from openvima.scene import ObjectRecord
 from published_data import PUBLISHED, TODAY, Generation, MadeEpisode, jpeg, pickled, write_folder, write_zip
@@ -311,7 +311,7 @@ def test_unknown_textures_are_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "sweep_without_exceeding", "rearrange"])
 def test_picks_are_found_again_in_the_images(task: str) -> None:
-    demo: Demonstration = rollout_oracle(Setup(compat=True).make(task, "train", domain="user"), 0)
+    demo: Demonstration = rollout_oracle(EnvConfig(compat=True).make(task, "train", domain="user"), 0)
     ids = [record.object_id for record in demo.objects]
     assert picked_ids(demo.segm["top"], demo.actions, ids) == demo.pick_ids
     nothing = np.zeros_like(demo.segm["top"])

@@ -3,8 +3,8 @@
 from openvima.cli.data.importing import import_published
 from openvima.cli.data.info import info
 from openvima.cli.data.lerobot import export_lerobot
+from openvima.cli.data.preprocess import tokens
 from openvima.cli.data.subsets import merge, sample, split
-from openvima.cli.data.tokens import tokens
 from openvima.cli.data.verify import verify
 
 # Subcommand → what runs it, in the order in which they are listed.

@@ -12,7 +12,7 @@ import tyro
 from openvima.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from openvima.data.overview import Histogram, Overview, Unfinished
+    from openvima.data.summary import Histogram, Overview, Unfinished
 
 _BAR_WIDTH = 40
 _MOST_BARS = 12  # histograms with more are cut to their ends
@@ -44,7 +44,7 @@ def info(
     Returns:
         Exit status.
     """
-    from openvima.data.overview import Unfinished, look_at
+    from openvima.data.summary import Unfinished, look_at
     from openvima.errors import ConfigError, DatasetError
 
     if html is not None and html.suffix.lower() not in (".html", ".htm"):
@@ -71,14 +71,14 @@ def info(
 
 def _write_looks(folder: Path, file: Path) -> None:
     """Write which looks there are, and say on standard error whether training may show them."""
-    from openvima.data.looks import looks_record, looks_text
+    from openvima.atomic_io import atomic_write_file
+    from openvima.data.appearance_stats import looks_record, looks_text
+    from openvima.data.leakage import beyond_training
     from openvima.data.reader import Dataset
-    from openvima.data.unseen import beyond_training
-    from openvima.files import write_whole
 
     with progress_bar("files") as report:
         record = looks_record(Dataset(folder), report)
-    write_whole(file, looks_text(record))
+    atomic_write_file(file, looks_text(record))
     problems = beyond_training(record)
     for problem in problems[:_NUM_AT_END]:
         print(f"beyond the training partition: {problem}", file=sys.stderr)

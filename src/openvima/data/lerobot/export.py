@@ -9,13 +9,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima import __version__
+from openvima.atomic_io import atomic_folder
 from openvima.data.lerobot import layout
 from openvima.data.lerobot.features import FrameLayout
 from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
-from openvima.files import whole_folder
 from openvima.films import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
@@ -90,7 +90,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     if not len(dataset):
         raise DatasetError(f"{config.data} has no episodes to export.")
     _check_out(config)
-    with whole_folder(config.out) as folder:
+    with atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
             survey(dataset),

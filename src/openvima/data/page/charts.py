@@ -2,7 +2,7 @@
 
 import html
 
-from openvima.data.overview import Histogram
+from openvima.data.summary import Histogram
 
 _MOST_BARS = 18
 _NUM_FIRST, _NUM_LAST = 10, 6  # of histograms with more bars

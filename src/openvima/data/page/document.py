@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.data.overview import Overview, TaskOverview
+from openvima.atomic_io import atomic_write_file
 from openvima.data.page.charts import bar_chart
 from openvima.data.page.episodes import episode_card
 from openvima.data.reader import Dataset
+from openvima.data.summary import Overview, TaskOverview
 from openvima.errors import AssetError, ConfigError, ShardError
-from openvima.files import write_whole
 
 MAX_SAMPLES = 50  # of each task; a page with more is too large for a browser
 
@@ -45,7 +45,7 @@ def write_page(overview: Overview, out: Path, *, num_samples: int = 3, report: R
         _episodes(overview, num_samples, report or (lambda done, total, note: None)),
         _provenance(overview),
     )
-    return write_whole(out, _document(overview, "\n".join(section for section in sections if section)))
+    return atomic_write_file(out, _document(overview, "\n".join(section for section in sections if section)))
 
 
 def _document(overview: Overview, body: str) -> str:

@@ -7,6 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import atomic_write_file
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
@@ -22,8 +23,7 @@ from openvima.data.reader import Shard
 from openvima.data.resuming import FULL_DISK, clear, is_finished, storage_error
 from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.errors import ConfigError, DatasetError
-from openvima.files import write_whole
-from openvima.processes import MAX_WORKERS, Counts, in_watched_processes
+from openvima.multiprocess import MAX_WORKERS, Counts, in_watched_processes
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
@@ -271,7 +271,7 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
     if broken or data.broken_folders:
         entries = [{"member": b.member, "reason": b.reason} for b in (*data.broken_folders, *broken)]
         text = json.dumps(entries, indent=1, ensure_ascii=False)
-        write_whole(config.out / BROKEN_NAME, text + "\n")
+        atomic_write_file(config.out / BROKEN_NAME, text + "\n")
     finish_folder(
         config.out,
         [block.path for block in blocks],

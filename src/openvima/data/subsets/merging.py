@@ -9,13 +9,13 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 
+from openvima.atomic_io import atomic_folder
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset
 from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, provenance
 from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shards
 from openvima.errors import DatasetError, unknown_name
-from openvima.files import whole_folder
 
 Duplicates = Literal["refuse", "skip"]
 Report = Callable[[int, int, str], None]
@@ -92,7 +92,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         "compression": config.compression,
     }
     manifests = [dataset.manifest for dataset in datasets]
-    with whole_folder(config.out) as folder:
+    with atomic_folder(config.out) as folder:
         shards = _plan(parts, folder, config.compression)
         write_shards(shards, config.workers, report)
         finish_folder(

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from openvima.atomic_io import atomic_folder
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset, of_tasks
 from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
 from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
-from openvima.files import whole_folder
 
 Report = Callable[[int, int, str], None]
 
@@ -76,7 +76,7 @@ def sample(config: SubsetConfig, share: float, *, report: Report | None = None) 
         dataset.index, config.tasks, dataset.path
     )
     settings = {**config.settings(dataset), "share": share}
-    with whole_folder(config.out) as folder:
+    with atomic_folder(config.out) as folder:
         _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
     return config.out
 
@@ -110,7 +110,7 @@ def split(config: SubsetConfig, parts: Parts, *, report: Report | None = None) -
             "Give it a larger share, or another --seed."
         )
     settings = {**config.settings(dataset), "parts": dict(parts.shares)}
-    with whole_folder(config.out) as folder:
+    with atomic_folder(config.out) as folder:
         subsets = [
             _Subset(folder / name, mask, "openvima data split", {**settings, "part": name})
             for name, mask in chosen.items()

@@ -12,7 +12,7 @@ from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset
 from openvima.data.writer import ShardWriter
 from openvima.errors import DatasetError, ShardError
-from openvima.processes import in_processes
+from openvima.multiprocess import in_processes
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
 from openvima.data.verification.token_files import check_tokens
-from openvima.processes import in_processes
+from openvima.multiprocess import in_processes
 
 DEFAULT = VerifyConfig()
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError
-from openvima.processes import check_workers
+from openvima.multiprocess import check_workers
 
 Report = Callable[[int, int, str], None]
 

@@ -10,16 +10,16 @@ from typing import Any
 
 from openvima.data.generation import finish
 from openvima.data.manifest import FAILED_FOLDER, fingerprint
+from openvima.data.oracle_rollouts import write_block
 from openvima.data.planning import Block, GenerateConfig, plan
+from openvima.data.progress import NUM_COUNTS
 from openvima.data.reader import Shard
 from openvima.data.records import package_versions
 from openvima.data.resuming import is_done
-from openvima.data.tally import NUM_COUNTS
-from openvima.data.trials import write_block
 from openvima.data.verification.findings import Report, VerifyConfig
-from openvima.env.setup import Setup
+from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OpenVimaError
-from openvima.processes import Counts, in_watched_processes
+from openvima.multiprocess import Counts, in_watched_processes
 
 _STAGING = ".repair.tmp"
 
@@ -61,7 +61,7 @@ def settings_in_shards(folder: Path, whole: Sequence[Shard], config: VerifyConfi
         level=info.level,
         start_seed=info.first_seed,
         shard_size=info.shard_size or None,
-        setup=Setup(config.assets or info.assets, info.compat, info.difficulty),
+        setup=EnvConfig(config.assets or info.assets, info.compat, info.difficulty),
         compression="zstd" if info.compression == "zstd" else "lz4",
         images=info.images,
         keep_failed=_has_failed(folder),

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from openvima.data.checksums import spans_of
-from openvima.data.manifest import FAILED_FOLDER, TOKENS_FOLDER, finish_folder
+from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, finish_folder
 from openvima.data.planning import COMMAND, GenerateConfig
 from openvima.data.reader import Shard
 from openvima.data.verification.checks import DEFAULT, verify
@@ -86,7 +86,7 @@ def repair(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
 
 
 def _delete_tokens(found: Verification) -> tuple[str, ...]:
-    names = sorted({p.file for p in found.problems if p.file.startswith(f"{TOKENS_FOLDER}/")})
+    names = sorted({p.file for p in found.problems if p.file.startswith(f"{CACHE_FOLDER}/")})
     for name in names:
         (found.folder / name).unlink(missing_ok=True)
     return tuple(names)

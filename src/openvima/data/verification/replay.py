@@ -16,9 +16,9 @@ from openvima.data.verification.episodes import PUBLISHED
 from openvima.data.verification.findings import Problem, Report, VerifyConfig, by_cause
 from openvima.data.verification.inventory import Inventory
 from openvima.data.verification.shards import ShardFindings
-from openvima.env.setup import Setup
+from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, OpenVimaError
-from openvima.processes import in_processes
+from openvima.multiprocess import in_processes
 from openvima.scene import RenderedPrompt
 
 if TYPE_CHECKING:  # comes with the simulator
@@ -230,10 +230,10 @@ def _when(step: int) -> str:
     return "at the start" if step == 0 else f"after step {step - 1}"
 
 
-def _setup(task: ReplayTask) -> Setup:
-    return Setup(task.assets, task.info.compat, task.info.difficulty)
+def _setup(task: ReplayTask) -> EnvConfig:
+    return EnvConfig(task.assets, task.info.compat, task.info.difficulty)
 
 
 @lru_cache(maxsize=4)
-def _env(task: str, level: str, domain: str, setup: Setup) -> "TabletopEnv":
+def _env(task: str, level: str, domain: str, setup: EnvConfig) -> "TabletopEnv":
     return setup.make(task, level, domain=domain)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from openvima.data.manifest import TOKENS_FOLDER
+from openvima.data.manifest import CACHE_FOLDER
+from openvima.data.object_cache.cache_file import CacheFile
+from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.reader import Shard
-from openvima.data.tokens.episode import TokenEpisode, tokens_of
-from openvima.data.tokens.token_file import TokenFile
 from openvima.data.verification.findings import Problem, Report, by_cause
 from openvima.errors import OpenVimaError, ShardError
-from openvima.processes import in_processes
+from openvima.multiprocess import in_processes
 
 # What tokens hold whatever found the objects.
 _OF_ALL = ("task", "seed", "text", "end_effector", "actions")
@@ -62,7 +62,7 @@ def check_tokens(
         num_workers: Number of processes.
         report: Called with episodes done, episodes in all, and what is being done.
     """
-    files = sorted((folder / TOKENS_FOLDER).glob("*/*.arrow"))
+    files = sorted((folder / CACHE_FOLDER).glob("*/*.arrow"))
     tasks = [
         TokenTask(path, folder / path.name, content_hashes[path.name], str(path.relative_to(folder)))
         for path in files
@@ -90,7 +90,7 @@ def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[
         What is wrong; None where the file is out of date, for then it is made anew before it is used.
     """
     try:
-        tokens = TokenFile(task.path)
+        tokens = CacheFile(task.path)
     except ShardError as error:
         return [str(error).removeprefix(f"{task.path} ").split(". ")[0]]
     if tokens.source != task.content_hash:
@@ -101,11 +101,11 @@ def check_token_file(task: TokenTask, count: Callable[[int], None]) -> Sequence[
     return by_cause(_differences(tokens, shard, count), len(shard))
 
 
-def _differences(tokens: TokenFile, shard: Shard, count: Callable[[int], None]) -> Iterator[tuple[int, str]]:
+def _differences(tokens: CacheFile, shard: Shard, count: Callable[[int], None]) -> Iterator[tuple[int, str]]:
     for row in range(len(shard)):
         try:
-            names = _OF_ALL if tokens.boxes else [field.name for field in fields(TokenEpisode)]
-            is_same = _is_same(tokens[row], tokens_of(shard[row], tokens.kind), names)
+            names = _OF_ALL if tokens.boxes else [field.name for field in fields(PreprocessedEpisode)]
+            is_same = _is_same(tokens[row], preprocess(shard[row], tokens.kind), names)
         except OpenVimaError as error:
             yield row, f"its tokens cannot be compared: {error}"
             continue
@@ -114,5 +114,5 @@ def _differences(tokens: TokenFile, shard: Shard, count: Callable[[int], None]) 
         count(row + 1)
 
 
-def _is_same(ours: TokenEpisode, theirs: TokenEpisode, names: Sequence[str]) -> bool:
+def _is_same(ours: PreprocessedEpisode, theirs: PreprocessedEpisode, names: Sequence[str]) -> bool:
     return all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in names)

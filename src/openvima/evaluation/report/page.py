@@ -6,18 +6,18 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.clips import Clip
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.report import sections
-from openvima.evaluation.report.controls import control_section
+from openvima.evaluation.report.ablations import control_section
 from openvima.evaluation.report.curves import read_run_charts
 from openvima.evaluation.report.differences import comparison_section
-from openvima.evaluation.report.elsewhere import published_section
+from openvima.evaluation.report.published_comparison import published_section
 from openvima.evaluation.report.tables import failure_table, rate_table
-from openvima.evaluation.report.wording import headline, prose
+from openvima.evaluation.report.text import headline, prose
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
-from openvima.files import write_whole
 
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
@@ -76,7 +76,7 @@ def write_report(
         sections.level_meanings(results),
         sections.reproduction(results, command or default_command(results)),
     )
-    return write_whole(out, _page(results, "\n".join(part for part in body if part), notes))
+    return atomic_write_file(out, _page(results, "\n".join(part for part in body if part), notes))
 
 
 def default_command(results: Results) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from openvima.evaluation.comparison import CONTROL_MARK, Comparison, Difference
 from openvima.evaluation.report.published import leading_models, published_tasks
-from openvima.evaluation.report.wording import control_name, counted
+from openvima.evaluation.report.text import control_name, counted
 from openvima.evaluation.results import LevelMean, Results
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, control and level

@@ -7,7 +7,7 @@ from openvima.evaluation.clips import Clip
 from openvima.evaluation.report.curves import Chart
 from openvima.evaluation.report.figures import curve_chart, level_chart
 from openvima.evaluation.report.markup import DOT, section
-from openvima.evaluation.report.wording import (
+from openvima.evaluation.report.text import (
     LEVEL_MEANINGS,
     LEVEL_NAMES,
     counted,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from openvima.evaluation.report.markup import breakable, policy_head, section
 from openvima.evaluation.report.published import BESIDE, published_tasks
-from openvima.evaluation.report.wording import (
+from openvima.evaluation.report.text import (
     LEVEL_NAMES,
     counted,
     exact,

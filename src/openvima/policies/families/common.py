@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from openvima.errors import UnknownPolicyError, unknown_name
 from openvima.policies.config import PolicyConfig
 from openvima.policies.heads.bins import BinsConfig
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-from openvima.policies.layers.text_encoder import TextEncoderConfig
-from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
+from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig
 from openvima.policies.tokenizer import vocabulary_size
 
 T5_VOCABULARY_SIZE = 32128

@@ -9,8 +9,8 @@ history  [4 latents, action, 4 latents, action, …]
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.common import Size
 from openvima.policies.families.frames import frame_transformer
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
-from openvima.policies.layers.resampler import ResamplerConfig
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.resampler import ResamplerConfig
 
 
 def flamingo(size: Size) -> PolicyConfig:

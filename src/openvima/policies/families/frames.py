@@ -1,7 +1,7 @@
 """The transformer over whole frames, which the three baselines share."""
 
 from openvima.policies.families.common import Size
-from openvima.policies.layers.vit import VitConfig
+from openvima.policies.nn.vit import VitConfig
 
 
 def frame_transformer(size: Size, *, class_token: bool) -> VitConfig:

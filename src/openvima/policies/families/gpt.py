@@ -8,7 +8,7 @@
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.common import Size
 from openvima.policies.families.frames import frame_transformer
-from openvima.policies.layers.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
 
 
 def gpt(size: Size) -> PolicyConfig:

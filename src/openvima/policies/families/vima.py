@@ -8,8 +8,8 @@ history  [front 1, front 2, top 1, top 2, action, front 1, …]
 
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.common import Size
-from openvima.policies.layers.object_encoder import ObjectEncoderConfig
-from openvima.policies.layers.vit import VitConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.vit import VitConfig
 
 
 def vima(size: Size) -> PolicyConfig:

@@ -11,7 +11,7 @@ from functools import cache
 import torch
 from torch import nn
 
-from openvima.policies.layers.action_encoder import ACTION_PARTS, ACTION_WIDTH
+from openvima.policies.nn.action_encoder import ACTION_PARTS, ACTION_WIDTH
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 __all__ = [

@@ -24,7 +24,7 @@ from openvima.policies.heads.base import (
     masked_mean,
     to_unit_range,
 )
-from openvima.policies.layers.mlp import mlp, scale_last
+from openvima.policies.nn.mlp import mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
 

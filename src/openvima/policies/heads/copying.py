@@ -55,7 +55,7 @@ from openvima.policies.heads.pointing import (
     turned,
     yaw_bin,
 )
-from openvima.policies.layers.mlp import mlp
+from openvima.policies.nn.mlp import mlp
 
 _ON_TOP_M = 0.04  # an object so near to another one lies in or on it, more or less
 _FAR = 10.0  # in units of offsets; beyond it, distances count as this

@@ -22,7 +22,7 @@ from openvima.policies.heads.base import (
     masked_mean,
     to_unit_range,
 )
-from openvima.policies.layers.mlp import mlp
+from openvima.policies.nn.mlp import mlp
 
 OFFSET_UNIT_M = 0.1  # the network speaks of offsets in decimetres, so that they are of the order of 1
 _ALIKE = 0.3  # cosine of embeddings from which on two pictures may show the same object

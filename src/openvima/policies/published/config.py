@@ -13,9 +13,9 @@ from openvima.policies.families.flamingo import flamingo
 from openvima.policies.families.gato import gato
 from openvima.policies.families.gpt import gpt
 from openvima.policies.families.vima import vima
-from openvima.policies.layers.prompt_encoder import PromptEncoderConfig
-from openvima.policies.layers.text_encoder import TextEncoderConfig
-from openvima.policies.layers.trunk import DecoderConfig, PrefixConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
+from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig
 from openvima.policies.published.names import family_of, without_prefix
 from openvima.policies.published.table import T5, Family
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 import torch
 
 from openvima.errors import CheckpointError
-from openvima.policies.layers.object_encoder import ObjectEncoder
-from openvima.policies.layers.trunk import MAX_PLACES, MAX_PROMPT_PLACES
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.nn.trunk import MAX_PLACES, MAX_PROMPT_PLACES
 from openvima.policies.published.table import PERCEIVER, T5, Family, to_ours, to_theirs
 
 PREFIX = "policy."  # before every name in a file

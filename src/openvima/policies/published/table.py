@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-from openvima.policies.layers.action_encoder import ACTION_PARTS
+from openvima.policies.nn.action_encoder import ACTION_PARTS
 
 Family = Literal["vima", "gato", "flamingo", "gpt"]
 

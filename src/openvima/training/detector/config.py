@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from openvima.detection.config import DETECTORS
+from openvima.detector.config import DETECTORS
 from openvima.errors import ConfigError, unknown_name
-from openvima.training.checks import problems_of
+from openvima.training.validation import problems_of
 
 # Smallest and largest allowed value of each number; None means no bound on that side.
 _BOUNDS: dict[str, tuple[float, float | None]] = {

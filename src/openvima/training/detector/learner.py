@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from openvima.detection.checkpoint import load_weights, write_network
-from openvima.detection.frames import Frame
-from openvima.detection.network import MaskRCNN, Objects
+from openvima.detector.checkpoint import load_weights, write_network
+from openvima.detector.frames import Frame
+from openvima.detector.network import MaskRCNN, Objects
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.training.learner import Learner
 

@@ -13,12 +13,12 @@ from torch import nn
 
 from openvima.data.batching import BatchOrder
 from openvima.data.reader import Dataset
-from openvima.detection.augment import augmented
-from openvima.detection.checkpoint import load_network
-from openvima.detection.config import detector_config
-from openvima.detection.detectron2 import load_detectron2
-from openvima.detection.frames import Frame, FrameSource, held_out_frames
-from openvima.detection.network import MaskRCNN
+from openvima.detector.augment import augmented
+from openvima.detector.checkpoint import load_network
+from openvima.detector.config import detector_config
+from openvima.detector.detectron2 import load_detectron2
+from openvima.detector.frames import Frame, FrameSource, held_out_frames
+from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.devices import torch_threads, usable_device
 from openvima.training.detector.config import DetectorTrainingConfig

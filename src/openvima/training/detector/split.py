@@ -3,7 +3,7 @@
 import numpy as np
 
 from openvima.data.reader import Dataset
-from openvima.training.lots import lots_of
+from openvima.training.hash_split import lots_of
 
 
 def split_episodes(dataset: Dataset, share: float) -> tuple[np.ndarray, np.ndarray]:

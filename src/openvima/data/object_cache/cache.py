@@ -1,0 +1,252 @@
+"""The token cache of a data set: a derived folder, made when it is first needed and safe to delete."""
+
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.atomic_io import remove_abandoned
+from openvima.data.checksums import Frame, spans_of
+from openvima.data.manifest import CACHE_FOLDER, joint_hash
+from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, write_cache_file
+from openvima.data.object_cache.episode import KINDS, InputKind, PreprocessedEpisode, preprocess
+from openvima.data.reader import Dataset, Shard
+from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.multiprocess import in_processes
+from openvima.perception.objects import ObjectExtractor
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes:
+    """Where boxes come from, if not from the segmentation.
+
+    Args:
+        name: Stands for all that decides what is found; it becomes part of the name of a folder. Whatever
+            bears the same name is taken to find the same.
+        make: Makes what finds the objects. It is sent to other processes, where it is called once.
+    """
+
+    name: str
+    make: Callable[[], ObjectExtractor] = field(compare=False)
+
+
+class ObjectCache(Sequence[PreprocessedEpisode]):
+    """The episodes of a data set as tokens, each read when it is asked for.
+
+    The order is that of the data set. Objects can be sent to other processes: they open files anew.
+
+    Args:
+        dataset: The demonstrations, perhaps of some tasks only.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
+        folder: Where the files are; None means `tokens/` in the folder of the demonstrations.
+        boxes: Name of what found the objects, as in `Boxes`; empty for the segmentation.
+
+    Raises:
+        DatasetError: There is no such kind, or files are missing or older than the demonstrations;
+            `open_object_cache` makes them.
+
+    Example:
+        >>> cache = open_object_cache(Dataset("demos"))
+        >>> cache[0].images.shape
+        (14, 3, 32, 32)
+    """
+
+    def __init__(
+        self, dataset: Dataset, kind: InputKind = "objects", folder: Path | None = None, boxes: str = ""
+    ) -> None:
+        self.dataset, self.kind, self.boxes, self._root = dataset, kind, boxes, folder
+        self.folder = _cache_folder(dataset, kind, folder, boxes)
+        found = {source.name: _made(self.folder, source, kind, boxes) for source in sources(dataset)}
+        missing = [name for name, file in found.items() if file is None]
+        if missing:
+            option = "--boxes DETECTOR" if boxes else f"--kind {kind}"
+            raise DatasetError(
+                f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
+                f"`openvima data tokens {shlex.quote(str(dataset.path))} {option}` makes them."
+            )
+        self._files = {name: file for name, file in found.items() if file is not None}
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    @overload
+    def __getitem__(self, index: int) -> PreprocessedEpisode: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[PreprocessedEpisode]: ...
+    def __getitem__(self, index: int | slice) -> PreprocessedEpisode | list[PreprocessedEpisode]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        name, row = self.dataset.locate(index)
+        return self._files[name][row]
+
+    def __iter__(self) -> Iterator[PreprocessedEpisode]:
+        return (self[index] for index in range(len(self)))
+
+    def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
+        return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
+
+    def lengths(self) -> np.ndarray:
+        """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
+        return self._gathered(CacheFile.lengths, 2)
+
+    def widths(self) -> np.ndarray:
+        """Return how many objects the fullest prompt image and the fullest view show, shape (N, 2)."""
+        return self._gathered(CacheFile.widths, 2)
+
+    def image_counts(self) -> np.ndarray:
+        """Return the number of images of each episode, shape (N,), int64."""
+        return self._gathered(CacheFile.image_counts, 1)[:, 0]
+
+    def texts(self) -> set[str]:
+        """Return the different prompts, with their placeholders."""
+        return {text for file in self._files.values() for text in file.texts()}
+
+    def _gathered(self, column: Callable[[CacheFile], np.ndarray], width: int) -> np.ndarray:
+        """Read a column of numbers of all files, and put it into the order of the episodes."""
+        of_file = {name: column(file) for name, file in self._files.items()}
+        places = [self.dataset.locate(index) for index in range(len(self))]
+        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, width)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Source:
+    """One shard of demonstrations.
+
+    Args:
+        name: Of the shard, and of its file of tokens.
+        content_hash: Of its episodes together.
+        index: Its part of the index.
+    """
+
+    name: str
+    content_hash: str
+    index: pa.Table
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Work:
+    shard: Path
+    frame: Frame
+    source: Source
+    path: Path
+    kind: InputKind
+    boxes: Boxes | None
+
+
+def open_object_cache(
+    dataset: Dataset,
+    kind: InputKind = "objects",
+    *,
+    folder: Path | None = None,
+    boxes: Boxes | None = None,
+    workers: int = 1,
+    report: Report | None = None,
+) -> ObjectCache:
+    """Open the token cache of a data set; make what is missing, or older than the demonstrations.
+
+    Args:
+        dataset: The demonstrations, perhaps of some tasks only.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
+        folder: Where to keep them; None means `tokens/` in the folder of the demonstrations.
+        boxes: What finds the objects; None takes the segmentation. Each detector has a folder of its own.
+        workers: Number of processes.
+        report: Called with episodes done, episodes in all, and a note.
+
+    Raises:
+        DatasetError: There is no such kind, it has no use for boxes, or the folder cannot be written to.
+        ShardError: A shard is damaged.
+    """
+    name = boxes.name if boxes else ""
+    target = _cache_folder(dataset, kind, folder, name)
+    work = [
+        _Work(
+            dataset.path / source.name,
+            Frame.from_entry(dataset.manifest["shards"][source.name]),
+            source,
+            target / source.name,
+            kind,
+            boxes,
+        )
+        for source in sources(dataset)
+        if _made(target, source, kind, name) is None
+    ]
+    if work:
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatasetError(
+                f"cannot keep tokens in {target}: {error.strerror}. Name another folder."
+            ) from None
+        remove_abandoned(target)
+        total = sum(item.source.index.num_rows for item in work)
+        work.sort(key=lambda item: -item.source.index.num_rows)
+
+        def say(done: int) -> None:
+            if report is not None:
+                report(done, total, "")
+
+        try:
+            for _ in in_processes(_write, work, workers, report=say):
+                pass  # the result of a job is its file
+        finally:
+            _extractor.cache_clear()  # where it was made here
+    return ObjectCache(dataset, kind, folder, name)
+
+
+def sources(dataset: Dataset) -> list[Source]:
+    """List the shards that hold episodes of a data set, each with all that it holds."""
+    whole = dataset if dataset.tasks is None else Dataset(dataset.path)
+    shards = whole.index.column("shard").combine_chunks().dictionary_encode()
+    # Episodes of a shard follow each other.
+    starts = np.flatnonzero(np.diff(shards.indices.to_numpy(), prepend=-1)).tolist()
+    wanted, found = set(dataset.shard_names()), []
+    for start, end in zip(starts, [*starts[1:], whole.index.num_rows], strict=True):
+        name = shards[start].as_py()
+        if name in wanted:
+            part = whole.index.slice(start, end - start)
+            found.append(Source(name, joint_hash(part.column("content_hash")), part))
+    return found
+
+
+def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, boxes: str) -> Path:
+    if kind not in KINDS:
+        raise DatasetError(unknown_name("kind of tokens", kind, KINDS))
+    if boxes and kind == "frames":
+        raise DatasetError(f"boxes are those of {boxes}, but whole frames have none; leave them out.")
+    parts = (kind, f"v{CACHE_VERSION}", *((boxes,) if boxes else ()))
+    return (folder or dataset.path / CACHE_FOLDER) / "-".join(parts)
+
+
+def _made(folder: Path, source: Source, kind: InputKind, boxes: str) -> CacheFile | None:
+    """Open the tokens of a shard; None if they are missing, damaged, or of another version or content."""
+    try:
+        file = CacheFile(folder / source.name)
+    except ShardError:
+        return None
+    asked = (source.content_hash, kind, boxes)
+    return file if (file.source, file.kind, file.boxes) == asked else None
+
+
+def _write(work: _Work, count: Callable[[int], None]) -> None:
+    shard, episodes = Shard(work.shard, work.frame), []
+    extractor = _extractor(work.boxes) if work.boxes else None
+    for row, span in enumerate(spans_of(work.source.index)):
+        shard.check(row, span)
+        episodes.append(preprocess(shard[row], work.kind, extractor))
+        count(row + 1)
+    write_cache_file(
+        work.path, episodes, work.kind, work.source.content_hash, work.boxes.name if work.boxes else ""
+    )
+
+
+@lru_cache(maxsize=1)
+def _extractor(boxes: Boxes) -> ObjectExtractor:
+    """Make an extractor once in this process, for all shards."""
+    return boxes.make()

@@ -1,0 +1,132 @@
+"""Checkpoints of detectors: a folder with `model.safetensors` and `config.yaml`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from openvima import __version__
+from openvima.atomic_io import atomic_folder, restore_folder
+from openvima.detector.config import DetectorConfig
+from openvima.detector.network import MaskRCNN
+from openvima.errors import CheckpointError, ConfigError
+from openvima.policies.base import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
+from openvima.policies.differences import described, listed
+
+_KIND = "detector"
+_SHOWN = 5  # names of each kind of problem that a message lists
+_COUNTER = "num_batches_tracked"  # of batch normalisation; nothing depends on it
+
+
+def save_network(network: MaskRCNN, folder: str | Path) -> None:
+    """Write a checkpoint folder, whole or not at all; a checkpoint that is there is replaced.
+
+    Raises:
+        CheckpointError: The folder holds other files.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        found = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
+        if others := sorted(found - {WEIGHTS_FILE, CONFIG_FILE}):
+            raise CheckpointError(
+                f"{folder} holds other files than a checkpoint ({', '.join(others[:_SHOWN])}), which "
+                "would be lost; give another folder."
+            )
+    with atomic_folder(folder) as partial:
+        write_network(network, partial)
+
+
+def write_network(network: MaskRCNN, folder: Path, weights: Mapping[str, torch.Tensor] | None = None) -> None:
+    """Write the files of a checkpoint into a folder that is still being filled.
+
+    Args:
+        network: The network.
+        folder: The folder.
+        weights: Instead of those of the network.
+    """
+    weights = network.state_dict() if weights is None else weights
+    tensors = {
+        name: tensor.detach().cpu().contiguous()
+        for name, tensor in weights.items()
+        if not name.endswith(_COUNTER)
+    }
+    save_file(tensors, folder / WEIGHTS_FILE)
+    values = {"policy": _KIND, "openvima": __version__, "config": network.config.to_dict()}
+    (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+
+
+def load_network(path: str | Path) -> MaskRCNN:
+    """Read a network, in evaluation mode.
+
+    Args:
+        path: A checkpoint folder, or a run folder, of which the best checkpoint is taken.
+
+    Raises:
+        CheckpointError: There is none, it is damaged, or weights and sizes do not fit.
+    """
+    path = Path(path)
+    restore_folder(path)
+    folder = checkpoint_folder(path)
+    network = MaskRCNN(read_config(folder))
+    load_weights(network, folder / WEIGHTS_FILE)
+    return network.eval()
+
+
+def read_config(folder: Path) -> DetectorConfig:
+    """Read the sizes of a checkpoint.
+
+    Raises:
+        CheckpointError: There is no config, or it makes no sense.
+    """
+    file = folder / CONFIG_FILE
+    try:
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"{file} is no valid YAML: {error}") from error
+    if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
+        raise CheckpointError(f"{file} does not describe a {_KIND}; `openvima policies` is for policies.")
+    try:
+        return DetectorConfig.from_dict(values["config"])
+    except ConfigError as error:
+        raise CheckpointError(f"{file}: {error}") from error
+
+
+def load_weights(network: MaskRCNN, file: Path) -> None:
+    """Copy the weights of a file into a network.
+
+    Raises:
+        CheckpointError: The file is missing or damaged, or names or shapes differ.
+    """
+    try:
+        tensors = load_file(file)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{file} cannot be read ({error}).") from error
+    copy_weights(network, tensors, source=str(file))
+
+
+def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
+    """Copy weights into a network.
+
+    Raises:
+        CheckpointError: Names or shapes differ; one message tells all of them.
+    """
+    expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
+    wrong = [
+        f"{name} is {described(tensors[name].dtype, tensors[name].shape)} instead of "
+        f"{described(own.dtype, own.shape)}"
+        for name, own in expected.items()
+        if name in tensors and tensors[name].shape != own.shape
+    ]
+    problems = [
+        *listed("missing", [name for name in expected if name not in tensors], most=_SHOWN),
+        *listed("unexpected", [name for name in tensors if name not in expected], most=_SHOWN),
+        *listed("wrong", wrong, most=_SHOWN),
+    ]
+    if problems:
+        raise CheckpointError(f"{source} does not fit the sizes of the detector: {'; '.join(problems)}.")
+    network.load_state_dict(tensors, strict=False)

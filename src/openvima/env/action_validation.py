@@ -1,0 +1,145 @@
+"""Refusing, before anything moves, a call that a batch of environments could not take."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from openvima.errors import ActionError, ConfigError, EpisodeError
+from openvima.scene import ACTION_SHAPES, WORKSPACE_LOW, Action
+from openvima.tasks.seeding import checked_seed
+
+RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset, shape (N,), bool
+
+
+class ActionValidator:
+    """Checks resets and actions of all sub-environments at once.
+
+    Gymnasium checks nothing here: its synchronous kind moves the environments before the first bad action
+    and leaves those after it, and in its asynchronous kind a bad action or seed ends a worker.
+
+    Args:
+        num_envs: Number of sub-environments.
+        autoreset_mode: If it is "Disabled", a sub-environment whose episode is over waits for a `reset`.
+    """
+
+    def __init__(self, num_envs: int, autoreset_mode: AutoresetMode) -> None:
+        self.num_envs = num_envs
+        self._waits_for_reset = autoreset_mode is AutoresetMode.DISABLED
+        self._needs_reset = np.ones(num_envs, dtype=bool)
+        self._resetting = np.zeros(num_envs, dtype=bool)
+
+    def check_reset(self, seed: object, options: Mapping[str, Any] | None) -> list[int | None]:
+        """Refuse seeds and options that a reset does not take.
+
+        Args:
+            seed: None, a number k (then sub-environment i gets k + i), or one number or None for each.
+            options: None, or a mapping with "reset_mask" or nothing.
+
+        Returns:
+            The seed of each sub-environment, or None.
+
+        Raises:
+            ConfigError: A seed or an option is not allowed, or there are not as many seeds as environments.
+        """
+        if seed is None:
+            seeds: list[int | None] = [None] * self.num_envs
+        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+            seeds = [None if entry is None else checked_seed(entry) for entry in seed]
+        else:
+            seeds = [checked_seed(seed) + index for index in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"got {len(seeds)} seeds for {self.num_envs} sub-environments; give one each.")
+        unknown = set(options or ()) - {RESET_MASK}
+        if unknown:
+            shown = ", ".join(map(str, sorted(unknown, key=str)))
+            raise ConfigError(f"reset has no option {shown} here; it takes '{RESET_MASK}'.")
+        mask = (options or {}).get(RESET_MASK)
+        self._resetting = np.ones(self.num_envs, dtype=bool) if mask is None else _checked_mask(mask, seeds)
+        return seeds
+
+    def note_reset(self) -> None:
+        """Remember that the reset that was checked last has happened."""
+        self._needs_reset &= ~self._resetting
+
+    def check_step(self, actions: object) -> None:
+        """Refuse actions of which one does not fit, and a step while a sub-environment awaits its reset.
+
+        Raises:
+            EpisodeError: A sub-environment has no episode that is running.
+            ActionError: An action does not fit; all problems are in one message. Nothing was moved.
+        """
+        if self._needs_reset.any():
+            waiting = ", ".join(map(str, np.flatnonzero(self._needs_reset)))
+            how = "reset()" if self._needs_reset.all() else f"reset(options={{'{RESET_MASK}': mask}})"
+            raise EpisodeError(f"sub-environments {waiting} have no running episode; call {how} first.")
+        places: dict[str, list[int]] = {}
+        for index, action in enumerate(_rows(actions, self.num_envs)):
+            try:
+                Action.from_arrays(action)
+            except ActionError as error:
+                places.setdefault(str(error).removesuffix(" Nothing was moved."), []).append(index)
+        if places:
+            problems = [f"sub-environment {', '.join(map(str, at))}: {text}" for text, at in places.items()]
+            raise ActionError(" ".join(problems) + " Nothing was moved.")
+
+    def note_step(self, is_over: np.ndarray) -> None:
+        """Remember which episodes ended in a step, shape (num_envs,), bool."""
+        if self._waits_for_reset:
+            self._needs_reset = np.array(is_over)
+
+
+def stack_actions(actions: Sequence[Mapping[str, Any] | Action | None]) -> dict[str, np.ndarray]:
+    """Join one action for each sub-environment into the batch that `step` of a vector environment takes.
+
+    Args:
+        actions: What a policy's `act` returns. None becomes an action that reaches into a corner of the
+            table, for sub-environments whose action does not matter.
+
+    Returns:
+        The four keys, each array with one row an action, float32.
+
+    Raises:
+        ActionError: An action has not the four keys, or an array the wrong length.
+    """
+    corner = Action(WORKSPACE_LOW, WORKSPACE_LOW)
+    rows = [corner if action is None else action for action in actions]
+    checked = [row if isinstance(row, Action) else Action.from_arrays(row) for row in rows]
+    arrays = [action.to_arrays() for action in checked]
+    return {key: np.stack([array[key] for array in arrays]) for key in ACTION_SHAPES}
+
+
+def _rows(actions: object, num_envs: int) -> list[dict[str, Any]]:
+    """Take a batch of actions apart."""
+    if not isinstance(actions, Mapping):
+        keys, given = ", ".join(ACTION_SHAPES), type(actions).__name__
+        raise ActionError(
+            f"actions are one mapping with keys {keys} and a row for each sub-environment, not {given}. "
+            "`stack_actions` makes it from a list. Nothing was moved."
+        )
+    for key, value in actions.items():
+        length = len(value) if hasattr(value, "__len__") else None
+        if key in ACTION_SHAPES and length != num_envs:
+            given = "no rows" if length is None else f"{length} rows"
+            raise ActionError(
+                f"{key} has {given}; it must have one for each of the {num_envs} sub-environments, shape "
+                f"({num_envs}, {ACTION_SHAPES[key]}). Nothing was moved."
+            )
+    known = {key: value for key, value in actions.items() if key in ACTION_SHAPES}
+    others = {key: value for key, value in actions.items() if key not in ACTION_SHAPES}
+    return [{key: value[index] for key, value in known.items()} | others for index in range(num_envs)]
+
+
+def _checked_mask(mask: object, seeds: Sequence[int | None]) -> np.ndarray:
+    if (
+        not isinstance(mask, np.ndarray)
+        or mask.dtype != bool
+        or mask.shape != (len(seeds),)
+        or not mask.any()
+    ):
+        raise ConfigError(
+            f"option '{RESET_MASK}' is {mask!r}; give an array of shape ({len(seeds)},), dtype bool, with at "
+            "least one True."
+        )
+    return mask

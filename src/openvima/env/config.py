@@ -1,0 +1,74 @@
+"""What all episodes of a run have in common, whatever the task: assets, difficulty, fidelity."""
+
+import shlex
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
+
+from openvima.tasks.options import check_difficulty
+
+if TYPE_CHECKING:
+    from openvima.env.tabletop import TabletopEnv
+
+
+@dataclass(frozen=True, slots=True)
+class EnvConfig:
+    """How the benchmark is run.
+
+    Args:
+        assets: Asset pack: "procedural", "original" or the folder of a checkout of the original benchmark.
+        compat: Follow the original benchmark also where it is odd.
+        difficulty: "easy", as for all published results, "medium" or "hard".
+
+    Raises:
+        ConfigError: There is no such difficulty.
+    """
+
+    assets: str = "procedural"
+    compat: bool = False
+    difficulty: str = "easy"
+
+    def __post_init__(self) -> None:
+        check_difficulty(self.difficulty)
+
+    def make(self, task: str, level: str, *, domain: str, realtime: bool = False) -> "TabletopEnv":
+        """Build an environment.
+
+        Args:
+            task: Name of the task.
+            level: "train" or "L1" to "L4".
+            domain: Domain of the seeds.
+            realtime: Record every frame of a step.
+
+        Raises:
+            ConfigError: The task does not know the difficulty.
+        """
+        from openvima.env.tabletop import TabletopEnv
+
+        return TabletopEnv(
+            task,
+            level=level,
+            domain=domain,
+            assets=self.assets,
+            compat=self.compat,
+            realtime=realtime,
+            **self.options(),
+        )
+
+    def options(self) -> dict[str, Any]:
+        """Return the options of the task."""
+        if self.difficulty == "easy":  # a task may have but one, and then no such option
+            return {}
+        return {"difficulty": self.difficulty}
+
+    def record(self) -> dict[str, str | bool]:
+        """Return the settings as plain values, without a path."""
+        return {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
+
+    def words(self) -> list[str]:
+        """Return the options of a command line that differ from the defaults."""
+        words = [f"--assets {shlex.quote(self.assets)}"] if self.assets != "procedural" else []
+        words += ["--compat"] if self.compat else []
+        return words + ([f"--difficulty {self.difficulty}"] if self.difficulty != "easy" else [])
+
+
+DEFAULT_SETUP = EnvConfig()

@@ -1,0 +1,169 @@
+"""Controls: what a score is made of. Each takes one thing away from a policy; the episode stays.
+
+| control | what the policy gets |
+|---|---|
+| `no_prompt` | the same prompt in all episodes of all tasks: one full stop and no image |
+| `other_prompt_images` | its own words, with the images of another episode of the task and level |
+| `scrambled_words` | its own images; each word, number and mark of the text is some word of the vocabulary |
+| `shuffled_objects` | object ids dealt out anew, in the segmentations and in the records of the prompt |
+| `detected_boxes` | boxes that a plugged-in detector finds in the pixels |
+| `in_context` | in place of the task's prompt the motion of the oracle in the same episode |
+
+What is drawn follows from the episode's task, level and seed, so neither the batch nor the number of workers
+changes it. Starts, goals and time limits are those of the plain score.
+
+A prompt goes on listing the objects of an image in the same order under `shuffled_objects`: a policy that
+does not look at ids, nor orders by them, acts exactly as without the control.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import SamplingError
+from openvima.evaluation.in_context import demonstrated
+from openvima.policies.tokenizer import word_ids
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import ObjectRecord, Prompt, PromptImage, RenderedPrompt
+from openvima.tasks.sampling import sample_episode
+from openvima.tasks.seeding import stream
+
+NO_PROMPT = "no_prompt"
+OTHER_PROMPT_IMAGES = "other_prompt_images"
+SCRAMBLED_WORDS = "scrambled_words"
+SHUFFLED_OBJECTS = "shuffled_objects"
+DETECTED_BOXES = "detected_boxes"
+IN_CONTEXT = "in_context"  # takes the task away and gives its solution; not among "all"
+CONTROLS = (NO_PROMPT, OTHER_PROMPT_IMAGES, SCRAMBLED_WORDS, SHUFFLED_OBJECTS, DETECTED_BOXES)
+
+NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
+_MAX_TRIES = 100  # for tasks whose placeholders vary; those of the benchmark's own tasks never do
+_LARGEST_SEED = 2**31  # of the episodes whose images are borrowed
+_PIECE = re.compile(r"\{\w+\}|[A-Za-z]+(?:-[A-Za-z]+)*|\d+|\S")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What a policy gets to see of one episode.
+
+    Args:
+        prompt: What it is told.
+        new_ids: For each object id the one that it is shown under, shape (256,), uint8; None: its own.
+    """
+
+    prompt: RenderedPrompt
+    new_ids: np.ndarray | None = None
+
+    def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
+        """Return an observation as the policy sees it."""
+        if self.new_ids is None:
+            return observation
+        return {**observation, "segm": _renumbered(observation["segm"], self.new_ids)}
+
+
+def sight(env: TabletopEnv, control: str) -> Sight:
+    """Return what a policy gets to see of the episode that an environment has begun.
+
+    Args:
+        env: The environment; it is left as it is.
+        control: One of `CONTROLS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
+            `openvima.detector.hooks`.
+
+    Raises:
+        SamplingError: No other episode has images for the same placeholders.
+    """
+    if control == IN_CONTEXT:
+        return Sight(demonstrated(env))
+    if control == NO_PROMPT:
+        return Sight(NEUTRAL_PROMPT)
+    if control in ("", DETECTED_BOXES):
+        return Sight(env.prompt)
+    episode = env.episode
+    rng = stream(episode.domain, episode.task, episode.level, episode.seed, f"control {control}")
+    if control == OTHER_PROMPT_IMAGES:
+        return Sight(_with_images_of_another(env, rng))
+    if control == SCRAMBLED_WORDS:
+        return Sight(replace(env.prompt, text=_scrambled(env.prompt.text, rng)))
+    return _shuffled(env, rng)
+
+
+def _with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> RenderedPrompt:
+    """Draw seeds until an episode has images of the same names and kinds."""
+    episode = env.episode
+    prompt = episode.problem.prompt
+    for _ in range(_MAX_TRIES):
+        seed = int(rng.integers(_LARGEST_SEED))
+        if seed == episode.seed:
+            continue
+        try:
+            other = sample_episode(
+                episode.task,
+                level=episode.level,
+                seed=seed,
+                domain=episode.domain,
+                assets=env.assets,
+                compat=env.compat,
+                **env.task_options,
+            )
+        except SamplingError:
+            continue
+        images = other.problem.prompt.images
+        if _kinds(images) == _kinds(prompt.images):
+            return Rasteriser(env.assets).prompt(Prompt(prompt.text, images))
+    raise SamplingError(
+        f"{_MAX_TRIES} other episodes of {episode.task} at level {episode.level} have no images for "
+        f"{prompt.text!r}; evaluate this task without the control {OTHER_PROMPT_IMAGES}."
+    )
+
+
+def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
+    return {name: type(fill) for name, fill in images}
+
+
+def _scrambled(text: str, rng: np.random.Generator) -> str:
+    """Put a word of the vocabulary in the place of each word, number and mark; placeholders stay."""
+    pieces = _PIECE.findall(text)
+    drawn = rng.choice(_words(), len(pieces)).tolist()
+    return " ".join(piece if piece[0] == "{" else word for piece, word in zip(pieces, drawn, strict=True))
+
+
+@cache
+def _words() -> tuple[str, ...]:
+    return tuple(sorted(word for word in word_ids() if word[0].isalpha()))
+
+
+def _shuffled(env: TabletopEnv, rng: np.random.Generator) -> Sight:
+    """Deal the ids out anew among the objects on the table, and among those in the prompt's scenes."""
+    prompt = env.prompt
+    new_ids = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
+    scenes = [image for image in prompt.images.values() if image.kind == "scene"]
+    # One permutation for all images, as in the environment: an object keeps its id from frame to frame.
+    new_shown = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
+    images = {
+        name: _relabelled(image, new_shown) if image.kind == "scene" else image
+        for name, image in prompt.images.items()
+    }
+    return Sight(RenderedPrompt(prompt.text, images), new_ids)
+
+
+def _permutation(ids: set[int], rng: np.random.Generator) -> np.ndarray:
+    table = np.arange(256, dtype=np.uint8)
+    table[sorted(ids)] = rng.permutation(sorted(ids))
+    return table
+
+
+def _relabelled(image: PromptImage, new_ids: np.ndarray) -> PromptImage:
+    records = tuple(
+        ObjectRecord(int(new_ids[record.object_id]), record.object, record.texture)
+        for record in image.objects
+    )
+    return replace(image, segm=_renumbered(image.segm, new_ids), objects=records)
+
+
+def _renumbered(segm: Mapping[str, np.ndarray], new_ids: np.ndarray) -> dict[str, np.ndarray]:
+    return {view: new_ids[ids] for view, ids in segm.items()}

@@ -1,0 +1,311 @@
+"""The protocol of an evaluation: which policies play which tasks at which levels on which seeds.
+
+Episodes are grouped into batches before anything runs, in a way that depends on the protocol alone. Workers
+take whole batches, so their number changes neither the batches nor the results.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from openvima.catalog.packs import ASSET_PACKS
+from openvima.catalog.partitions import LEVELS
+from openvima.env.config import DEFAULT_SETUP, EnvConfig
+from openvima.errors import ConfigError, LevelError, unknown_name
+from openvima.evaluation.ablations import CONTROLS, DETECTED_BOXES, IN_CONTEXT
+from openvima.evaluation.results import EpisodeOutcome, Row
+from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
+from openvima.policies.bundled import PACKAGED
+from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.seeding import MAX_SEED
+
+POLICY_CONTROLS = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
+DEFAULT_EPISODES = 200  # as in the published tables
+PRECISIONS = ("float64", "float32", "bfloat16")
+Engine = Literal["processes", "ray"]
+DEFAULT_DEVICE = "cpu"
+DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationConfig:
+    """What to evaluate, and how.
+
+    Args:
+        policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
+            preset, a run folder, a published file, an id on the Hugging Face Hub; or the address of a policy
+            server such as "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by
+            default it has its own.
+        tasks: Names of tasks, or ("all",) for every task that the level holds.
+        levels: From "train", "L1", "L2", "L3", "L4".
+        episodes: Episodes for each policy, task and level.
+        seed: First seed, of domain "eval"; the others follow without gaps.
+        workers: Processes; the results do not depend on their number. None means one, or as many as the Ray
+            cluster at `address` has processors.
+        out: Folder to write to.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        batch: Episodes that are played together, so that a policy decides for all of them at once.
+        videos: Filmed episodes of each policy and task, for the report.
+        report: Whether to film and to write `report.html`; needs the extra `report`.
+        force: Overwrite results of another evaluation in `out`.
+        device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
+            float64, does the division into batches not change what they decide.
+        precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a processor, float32
+            elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
+        controls: What to play besides, to show what a score is made of: names of
+            `openvima.evaluation.ablations.CONTROLS`, of which each policy that reads prompts plays all;
+            "random" and "oracle", which then are played too; or ("all",). "in_context", which prompts with a
+            demonstration of the episode, is asked for by its name.
+        boxes: For the control "detected_boxes": "detector" for the one that comes with the package,
+            "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
+            the `ObjectExtractor` to plug in. "all" takes this control in only where boxes are given.
+        film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
+            levels that holds the task, or "task/level/seed".
+        engine: "processes" of this machine, or "ray".
+        address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
+
+    Raises:
+        ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
+    """
+
+    policies: tuple[str, ...]
+    tasks: tuple[str, ...] = ("all",)
+    levels: tuple[str, ...] = ("L1", "L2", "L3", "L4")
+    episodes: int = DEFAULT_EPISODES
+    seed: int = 0
+    workers: int | None = None
+    out: Path = Path("evaluation")
+    setup: EnvConfig = DEFAULT_SETUP
+    batch: int = DEFAULT_BATCH
+    videos: int = 1
+    report: bool = True
+    force: bool = False
+    device: str = DEFAULT_DEVICE
+    precision: str | None = None
+    controls: tuple[str, ...] = ()
+    boxes: str | None = None
+    film: tuple[str, ...] = ()
+    engine: Engine = "processes"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{name} is {value}; it must be at least {least}."
+            for name, value, least in (
+                ("episodes", self.episodes, 1),
+                ("seed", self.seed, 0),
+                ("workers", self.workers, 1),
+                ("batch", self.batch, 1),
+                ("videos", self.videos, 0),
+            )
+            if value is not None and value < least
+        ]
+        if self.seed + self.episodes - 1 > MAX_SEED:
+            problems.append(f"seed is {self.seed}; seeds of all episodes must lie within 0 to 2**63 - 1.")
+        problems += [
+            f"{name} is empty; give at least one."
+            for name, values in (("policy", self.policies), ("tasks", self.tasks), ("levels", self.levels))
+            if not values
+        ]
+        if problems := [*problems, *self._unknown_names(), *self._contradictions()]:
+            raise ConfigError(" ".join(problems))
+
+    def _unknown_names(self) -> Iterator[str]:
+        allowed = ("all", *CONTROLS, IN_CONTEXT, *POLICY_CONTROLS)
+        yield from (unknown_name("control", name, allowed) for name in self.controls if name not in allowed)
+        if self.precision is not None and self.precision not in PRECISIONS:
+            yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
+        if self.engine not in ("processes", "ray"):
+            yield f"engine is {self.engine!r}; allowed are processes and ray."
+
+    def _contradictions(self) -> Iterator[str]:
+        if self.address is not None and self.engine == "processes":
+            yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
+        if DETECTED_BOXES in self.controls and self.boxes is None:
+            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
+        if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.controls):
+            yield f"boxes is {self.boxes!r}, which only the control {DETECTED_BOXES} plugs in; ask for it."
+        if self.film and not self.report:
+            yield "film names episodes, but no report is asked for; films are part of it."
+
+    @property
+    def sources(self) -> tuple[PolicySource, ...]:
+        """The policies that are played, those that the controls add last.
+
+        Raises:
+            ConfigError: As for `policy_sources`.
+        """
+        given = policy_sources(self.policies)
+        asked = POLICY_CONTROLS if "all" in self.controls else self.controls
+        there = {source.source for source in given}
+        added = [name for name in POLICY_CONTROLS if name in asked and name not in there]
+        return policy_sources((*self.policies, *added)) if added else given
+
+    def controls_of(self, source: PolicySource) -> tuple[str, ...]:
+        """Return the controls under which a policy is played, besides the plain score.
+
+        Oracle and random policy read no prompts, and a policy server finds its objects by itself.
+        """
+        if source.kind in (ORACLE, RANDOM):
+            return ()
+        asked = {*self.controls, *(CONTROLS if "all" in self.controls else ())}
+        usable = self.boxes is not None and source.kind != "remote"
+        names = (name for name in (*CONTROLS, IN_CONTEXT) if name in asked)
+        return tuple(name for name in names if name != DETECTED_BOXES or usable)
+
+    def record(self) -> dict[str, object]:
+        """Settings that the results depend on, as plain JSON values; not who plays, nor where to."""
+        return {
+            "policies": [source.name for source in self.sources],
+            "tasks": list(self.tasks),
+            "levels": list(self.levels),
+            "episodes": self.episodes,
+            "seed": self.seed,
+            "domain": "eval",
+            "batch": self.batch,
+            **self.setup.record(),
+            **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
+            **({"precision": self.precision} if self.precision else {}),
+            **({"controls": list(self.controls)} if self.controls else {}),
+            **({"boxes": self.boxes} if self.boxes else {}),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Episodes of one policy, task and level with consecutive seeds, played together.
+
+    Args:
+        policy: Name of the policy in the results.
+        source: Where the policy comes from, as in `PolicySource`.
+        task: Name of the task.
+        level: Level of the episodes.
+        first_seed: Seed of the first one.
+        episodes: How many.
+        setup: As in `EvaluationConfig`.
+        device: As in `EvaluationConfig`.
+        control: What is taken from the policy; empty for nothing.
+        precision: As in `EvaluationConfig`; empty for the policy's own.
+        boxes: What makes the detector; empty for boxes of the segmentation.
+    """
+
+    policy: str
+    source: str
+    task: str
+    level: str
+    first_seed: int
+    episodes: int
+    setup: EnvConfig = DEFAULT_SETUP
+    device: str = DEFAULT_DEVICE
+    control: str = ""
+    precision: str = ""
+    boxes: str = ""
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the episodes."""
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+    def key(self, fingerprint: str) -> str:
+        """Name for the batch's stored outcomes: changes with anything that they depend on.
+
+        Args:
+            fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
+        """
+        content = json.dumps([{**asdict(self), "source": ""}, fingerprint], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:24]
+
+    def with_whole_paths(self) -> "Batch":
+        """Return the batch for a process with another working directory."""
+        source, assets, boxes = self.source, self.setup.assets, self.boxes
+        is_path = PolicySource(self.policy, source).kind == "run" and source not in PACKAGED
+        if is_path and Path(source).exists():
+            source = str(Path(source).absolute())
+        if assets not in ASSET_PACKS:
+            assets = str(Path(assets).expanduser().absolute())
+        name, is_trained, folder = boxes.partition("=")
+        if is_trained:
+            boxes = f"{name}={Path(folder).absolute()}"
+        elif ".py:" in boxes:
+            boxes = str(Path(boxes).absolute())
+        return replace(self, source=source, setup=replace(self.setup, assets=assets), boxes=boxes)
+
+
+def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
+    """Pairs of task and level to play, by level and then by task.
+
+    A task is left out at levels that do not hold it, as `sweep_without_exceeding` at L3.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        LevelError: There is no such level, or none of the levels holds a task that was named.
+        ConfigError: No level holds any of the tasks.
+    """
+    for level in config.levels:
+        if level not in LEVELS:
+            raise LevelError(unknown_name("level", level, LEVELS))
+    tasks = dict.fromkeys(list_tasks() if "all" in config.tasks else config.tasks)
+    pairs = [
+        (task, level)
+        for level in dict.fromkeys(config.levels)
+        for task in tasks
+        if level in task_spec(task).levels
+    ]
+    asked = ", ".join(config.levels)
+    stranded = [task for task in tasks if task not in {task for task, _ in pairs}]
+    if stranded and "all" not in config.tasks:
+        where = "; ".join(f"{task} exists at {', '.join(task_spec(task).levels)}" for task in stranded)
+        raise LevelError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
+    if not pairs:
+        raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
+    return pairs
+
+
+def plan(config: EvaluationConfig) -> list[Batch]:
+    """Divide an evaluation into batches: by policy, control, level and task, then by `config.batch` seeds.
+
+    Raises:
+        ConfigError: A control fits none of the policies.
+    """
+    played = [(source, control) for source in config.sources for control in ("", *config.controls_of(source))]
+    asked = [name for name in config.controls if name in (*CONTROLS, IN_CONTEXT)]
+    if useless := [name for name in asked if name not in {control for _, control in played}]:
+        raise ConfigError(
+            f"control {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "
+            "that reads prompts, or leave the control out."
+        )
+    return [
+        Batch(
+            policy=source.name,
+            source=source.source,
+            task=task,
+            level=level,
+            first_seed=config.seed + offset,
+            episodes=min(config.batch, config.episodes - offset),
+            setup=config.setup,
+            device=config.device,
+            control=control,
+            precision=config.precision or "",
+            boxes=(config.boxes or "") if control == DETECTED_BOXES else "",
+        )
+        for source, control in played
+        for task, level in cells(config)
+        for offset in range(0, config.episodes, config.batch)
+    ]
+
+
+def rows_of(
+    batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]
+) -> tuple[Row, ...]:
+    """Join the batches of each policy, control, task and level."""
+    joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
+    for batch in batches:
+        cell = (batch.policy, batch.control, batch.task, batch.level)
+        joined.setdefault(cell, []).extend(outcomes[batch])
+    return tuple(
+        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
+        for (policy, control, task, level), played in joined.items()
+    )

@@ -1,0 +1,41 @@
+"""Trials in the simulator while a policy is being trained."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from openvima.env.config import DEFAULT_SETUP, EnvConfig
+from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.policies.base import load_policy
+
+TRIAL_LEVEL = "L1"
+_DOMAIN = "user"  # evaluation episodes stay unseen until the policy is finished
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Plays the same few episodes of some tasks with every checkpoint that it is given.
+
+    Args:
+        tasks: Names of the tasks.
+        episodes: Episodes of each task, at level L1; none of them occurs in training or evaluation.
+        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        device: Where the policy computes.
+    """
+
+    tasks: tuple[str, ...]
+    episodes: int
+    setup: EnvConfig = DEFAULT_SETUP
+    device: str = "cpu"
+
+    def __call__(self, checkpoint: Path) -> dict[str, float]:
+        """Return the success rate of each task, and their mean as "success"."""
+        policy = load_policy(str(checkpoint), device=self.device)
+        rates = {task: self._rate(task, policy) for task in self.tasks}
+        return {"success": sum(rates.values()) / len(rates), **rates}
+
+    def _rate(self, task: str, policy: object) -> float:
+        seeds = range(self.episodes)
+        envs = [self.setup.make(task, TRIAL_LEVEL, domain=_DOMAIN) for _ in seeds]
+        outcomes = play(envs, seeds, PolicyPlayer(policy))
+        return sum(outcome.success for outcome in outcomes) / len(outcomes)

@@ -1,0 +1,116 @@
+"""Section of the report on what a score is made of: the same policy with something taken from it."""
+
+from collections.abc import Mapping
+
+from openvima.evaluation.comparison import CONTROL_MARK, Comparison, can_be_compared, compare_pairs
+from openvima.evaluation.report.markup import folded, policy_head, section
+from openvima.evaluation.report.tables import mean_cell, rate_cell
+from openvima.evaluation.report.text import (
+    LEVEL_NAMES,
+    control_meaning,
+    control_name,
+    points,
+    points_span,
+    prose,
+    series_colours,
+)
+from openvima.evaluation.results import LevelMean, Results
+
+_BOUNDS = ("oracle", "random")  # kinds of policies between which a score lies
+
+
+def control_section(results: Results) -> str:
+    """Scores under controls beside the plain ones; nothing where no controls were played."""
+    policies = [policy for policy in results.policy_names() if _controls(results, policy)]
+    if not policies:
+        return ""
+    controls = dict.fromkeys(control for policy in policies for control in _controls(results, policy))
+    meanings = "".join(
+        f"<dt>{prose(control_name(control))}</dt><dd>{prose(control_meaning(control))}</dd>"
+        for control in controls
+    )
+    means = results.means()
+    return section(
+        "controls",
+        "What the score is made of",
+        "The same policy on the same episodes with something taken from it. What it still solves does not "
+        "need that. Below each score stand its interval and the change in points; ≈ marks what is inside the "
+        "noise.",
+        "".join(_policy(results, means, policy) for policy in policies)
+        + f'<div class="card"><dl class="levels">{meanings}</dl></div>',
+    )
+
+
+def _controls(results: Results, policy: str) -> list[str]:
+    return list(dict.fromkeys(row.control for row in results.rows if row.policy == policy and row.control))
+
+
+def _policy(results: Results, means: Mapping[tuple[str, str, str], LevelMean], policy: str) -> str:
+    controls = _controls(results, policy)
+    comparisons = _against_plain(results, policy, controls)
+    bounds = [
+        name
+        for name in results.policy_names()
+        if name != policy and results.policies.get(name, {}).get("kind") in _BOUNDS
+    ]
+    colours = series_colours(results)
+    columns = [(policy, ""), *((policy, control) for control in controls), *((name, "") for name in bounds)]
+    head = "".join(
+        f'<th scope="col">{prose(control_name(control))}</th>'
+        if control
+        else policy_head(name, colours[name])
+        for name, control in columns
+    )
+    head = f'<thead><tr><th scope="col">level</th>{head}</tr></thead>'
+    rows, details = "", ""
+    for level in results.levels():
+        cells = "".join(
+            _with_drop(
+                mean_cell(means.get((name, control, level)), len(results.tasks(level))),
+                comparisons.get(control),
+                level,
+            )
+            for name, control in columns
+        )
+        rows += (
+            f'<tr><th scope="row">{prose(level)}<small>{prose(LEVEL_NAMES.get(level, ""))}</small></th>'
+            f"{cells}</tr>"
+        )
+        details += _task_rows(results, level, columns)
+    return (
+        f'<h3 class="of">{prose(policy)}</h3>'
+        f'<div class="card scroll"><table class="rates narrow">{head}<tbody>{rows}'
+        "</tbody></table></div>"
+        + folded(
+            f"{policy}, task by task",
+            f'<div class="scroll"><table class="rates narrow">{head}<tbody>{details}</tbody></table></div>',
+        )
+    )
+
+
+def _against_plain(results: Results, policy: str, controls: list[str]) -> dict[str, Comparison]:
+    """Each control against the plain score, where both were played on some of the same episodes."""
+    names = {control: f"{policy}{CONTROL_MARK}{control}" for control in controls}
+    pairs = {c: (name, policy) for c, name in names.items() if can_be_compared(results, name, policy)}
+    return dict(zip(pairs, compare_pairs(results, list(pairs.values())), strict=True))
+
+
+def _with_drop(cell: str, comparison: Comparison | None, level: str) -> str:
+    """Add to a cell by how much the control changes the score."""
+    if comparison is None:
+        return cell
+    for difference in comparison.levels:
+        if difference.level == level:
+            noise = " ≈" if difference.verdict == "noise" else ""
+            text = f"{points(difference.difference, 0)} ({points_span(difference.interval, 0)}){noise}"
+            return cell.replace("</td>", f'<small class="drop">{text}</small></td>')
+    return cell
+
+
+def _task_rows(results: Results, level: str, columns: list[tuple[str, str]]) -> str:
+    return "".join(
+        f'<tr><th scope="row">{prose(task)}<small>{prose(level)}</small></th>'
+        + "".join(rate_cell(results.row(name, task, level, control)) for name, control in columns)
+        + "</tr>"
+        for task in results.tasks(level)
+    )

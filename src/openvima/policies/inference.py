@@ -1,0 +1,314 @@
+"""A network as a policy: keeps what it has read of a batch of episodes and decides each step."""
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from openvima.errors import PolicyError
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.objects import ObjectExtractor
+from openvima.policies.base import Policy, prompt_number
+from openvima.policies.devices import usable_device
+from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
+from openvima.policies.inputs import (
+    EpisodeReader,
+    Reader,
+    batch_histories,
+    batch_prompts,
+)
+from openvima.policies.network import HistoryState, Memory, PolicyNetwork
+from openvima.policies.t5 import tokenizer_for
+from openvima.policies.tokenizer import Tokenizer
+from openvima.scene import RenderedPrompt
+
+NEAR_TIE = 1e-4  # scores of two classes this near may change places by rounding in float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Episodes:
+    """The episodes of a batch that still run; all have made equally many steps.
+
+    Args:
+        places: Where in the batch each one stands.
+        readers: Readers of their observations.
+        generators: Generators of their draws.
+        memory: Their prompts.
+        state: What has been read of them.
+        actions_BC: Their last actions, metres and quaternions, float32; None before the first.
+        margins_B: How far the best class of their last action lay above the next, in its tightest choice;
+            None before the first.
+        features: Features of the images that were encoded for the last step, by the bytes of the images.
+    """
+
+    places: tuple[int, ...]
+    readers: tuple[EpisodeReader, ...]
+    generators: tuple[torch.Generator, ...]
+    memory: Memory
+    state: HistoryState
+    actions_BC: torch.Tensor | None
+    margins_B: torch.Tensor | None
+    features: Mapping[bytes, torch.Tensor]
+
+    def at(self, places: Sequence[int]) -> "_Episodes":
+        """Return those that stand at some places of the batch."""
+        rows = [self.places.index(place) for place in places]
+        if len(rows) == len(self.places):
+            return self
+        return _Episodes(
+            tuple(places),
+            tuple(self.readers[row] for row in rows),
+            tuple(self.generators[row] for row in rows),
+            self.memory.select(rows),
+            self.state.select(rows),
+            None if self.actions_BC is None else self.actions_BC[rows],
+            None if self.margins_B is None else self.margins_B[rows],
+            self.features,
+        )
+
+
+class NetworkPolicy(Policy):
+    """Plays several episodes at once; what the others do does not change an episode's actions.
+
+    The prompt is encoded once, and keys and values of all that was read are kept, so that a step costs what
+    its own tokens cost. On a processor it computes in float64 unless told otherwise: the rounding of sums,
+    which varies with the shape of a batch, then stays far below the float32 in which actions are sent, and
+    the same episode gets the same actions in any batch. In float32 and bfloat16 that holds but for near ties.
+    Large networks are several times faster in float32 and bfloat16.
+
+    An error in `reset` or `act` leaves the policy as it was before the call.
+
+    Args:
+        network: The network; it is moved to the device and precision, and set to evaluation.
+        tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
+        extractor: Finds the objects in images; by default by the simulator's segmentation, see `Reader.of`.
+        device: Where to compute, such as "cpu" or "cuda".
+        dtype: Precision; by default float64 on a processor and float32 elsewhere.
+        temperature: 0 takes the likeliest action. Above 0 actions are drawn, with scores divided by it.
+        generator: Needed to draw. Its seed and the prompt decide an episode's draws, so that they do not
+            depend on the other episodes; the generator itself is left as it is.
+
+    Raises:
+        PolicyError: The temperature is negative, or above 0 without a generator; no tokenizer is given to a
+            network that reads prompts with that of T5; or there is no such device.
+    """
+
+    def __init__(
+        self,
+        network: PolicyNetwork,
+        *,
+        tokenizer: Tokenizer | None = None,
+        extractor: ObjectExtractor | None = None,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype | None = None,
+        temperature: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if temperature < 0 or (temperature > 0 and generator is None):
+            raise PolicyError(
+                f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to draw with."
+            )
+        tokenizer = tokenizer or tokenizer_for(network.config.prompt)
+        self.reader = Reader.of(network.config.images, tokenizer, extractor)
+        self.device = usable_device(device)
+        self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
+        self.network = network.to(self.device, self.dtype).eval()
+        if self.device.type == "cpu":
+            # Crops are convolved with their channels together; kernels in another order would be copied at
+            # every call, a third of what a few crops cost.
+            self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._temperature = temperature
+        self._seed = generator.initial_seed() if generator else 0
+        self._num_prompts = 0
+        self._episodes: _Episodes | None = None
+
+    @torch.inference_mode()
+    def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
+        """Begin a batch of episodes.
+
+        Raises:
+            PolicyError: There is no prompt, or one is too long.
+            PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
+            ShapeError: An image has another shape or dtype.
+        """
+        if not prompts:
+            raise PolicyError("reset got no prompts; give one for each episode.")
+        inputs = [self.reader.read_prompt(prompt) for prompt in prompts]
+        stack = ImageStack(self.reader.image_size)
+        numbers = [stack.add(prompt.objects.crops) for prompt in inputs]
+        features, _ = self._encode(stack.stacked(), {})
+        memory = self.network.encode_prompts(batch_prompts(inputs, numbers).to(self.device), features)
+        seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
+        self._episodes = _Episodes(
+            places=tuple(range(len(prompts))),
+            readers=tuple(self.reader.begin_episode() for _ in prompts),
+            generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
+            memory=memory,
+            state=self.network.begin(memory),
+            actions_BC=None,
+            margins_B=None,
+            features={},
+        )
+        self._num_prompts = len(prompts)
+
+    @torch.inference_mode()
+    def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
+        """Decide the next action of every episode.
+
+        Args:
+            observations: One for each prompt; None for an episode that has ended, from then on.
+
+        Returns:
+            An action for each observation, float32 arrays within the bounds; None for None.
+
+        Raises:
+            PolicyError: `reset` was not called, or with another number of prompts; an episode goes on after
+                its end; no object is in view; or a history is too long.
+            ShapeError: An image has another shape or dtype.
+        """
+        if self._episodes is None:
+            raise PolicyError("there are no prompts yet; call reset with one for each episode first.")
+        if len(observations) != self._num_prompts:
+            raise PolicyError(
+                f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "
+                "and None for episodes that have ended."
+            )
+        seen = {
+            place: observation for place, observation in enumerate(observations) if observation is not None
+        }
+        ended = sorted(seen.keys() - self._episodes.places)
+        if ended:
+            raise PolicyError(
+                f"episode {', '.join(map(str, ended))} ended with a None before; call reset to begin anew."
+            )
+        episodes = self._episodes.at(list(seen))
+        actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
+        if seen:
+            episodes = self._decide(episodes, list(seen.values()))
+            assert episodes.actions_BC is not None
+            arrays_BC = episodes.actions_BC.cpu().numpy()
+            for place, array_C in zip(seen, arrays_BC, strict=True):
+                actions[place] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
+        self._episodes = episodes
+        return actions
+
+    def new_session(self) -> "NetworkPolicy":
+        """Return a policy that shares the network with this one and has episodes of its own."""
+        other = copy(self)
+        other._num_prompts, other._episodes = 0, None  # never changed in place, so nothing else is shared
+        return other
+
+    @property
+    def near_ties(self) -> list[bool]:
+        """For each episode whether rounding may have chosen its last action; False where it has ended.
+
+        It may where two classes scored within `NEAR_TIE` of each other.
+        """
+        near = [False] * self._num_prompts
+        if self._episodes is not None and self._episodes.margins_B is not None:
+            margins = self._episodes.margins_B.tolist()
+            for place, margin in zip(self._episodes.places, margins, strict=True):
+                near[place] = margin < NEAR_TIE
+        return near
+
+    @staticmethod
+    def from_pretrained(
+        path_or_hub_id: str | Path,
+        **options: Any,  # Any: of several kinds
+    ) -> "NetworkPolicy":
+        """Load a policy from a folder or from the Hugging Face Hub; see `load_pretrained`."""
+        from openvima.policies.checkpoint import load_pretrained
+
+        return load_pretrained(path_or_hub_id, **options)
+
+    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
+        """Write the policy into a folder; see `openvima.policies.checkpoint.save_checkpoint`.
+
+        Args:
+            folder: Where to; a checkpoint that is there is replaced.
+            dtype: Precision of the stored weights, whatever the policy computes in.
+        """
+        from openvima.policies.checkpoint import save_pretrained
+
+        save_pretrained(self, folder, dtype=dtype)
+
+    def _decide(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
+        """Make one step of all episodes."""
+        readers = tuple(copy(reader) for reader in episodes.readers)
+        steps = [reader.read_step(seen) for reader, seen in zip(readers, observations, strict=True)]
+        stack = ImageStack(self.reader.image_size)
+        numbers = [[stack.add(step.objects.crops)] for step in steps]
+        features_KF, features = self._encode(stack.stacked(), episodes.features)
+        history = batch_histories([[step] for step in steps], numbers).to(self.device)
+        has_previous_B1 = torch.full_like(history.steps_BT, episodes.actions_BC is not None)
+        previous_BC = episodes.actions_BC
+        if previous_BC is None:
+            previous_BC = torch.zeros(len(steps), ACTION_WIDTH, device=self.device)
+        inputs, state = self.network.extend(
+            episodes.memory, episodes.state, history, features_KF, previous_BC[:, None], has_previous_B1
+        )
+        choose = drawing(episodes.generators, self._temperature) if self._temperature else likeliest
+        margins: list[torch.Tensor] = []
+        # The history holds actions as they are sent.
+        actions_BC = self.network.decide(inputs, state, _noting(choose, margins))[:, 0].to(torch.float32)
+        return replace(
+            episodes,
+            readers=readers,
+            state=state,
+            actions_BC=actions_BC,
+            margins_B=torch.stack(margins).amin(0) if margins else None,
+            features=features,
+        )
+
+    def _encode(
+        self, images: np.ndarray, known: Mapping[bytes, torch.Tensor]
+    ) -> tuple[torch.Tensor, dict[bytes, torch.Tensor]]:
+        """Encode images that are not known by their bytes; most objects look as they did a step ago.
+
+        Returns:
+            Features of all images, and by their bytes.
+        """
+        keys = [image.tobytes() for image in images]
+        new = [number for number, key in enumerate(keys) if key not in known]
+        encoded = self.network.encode_images(torch.from_numpy(images[new]).to(self.device))
+        if len(new) == len(keys):
+            return encoded, dict(zip(keys, encoded, strict=True))
+        by_key = {**known, **dict(zip((keys[number] for number in new), encoded, strict=True))}
+        features = torch.stack([by_key[key] for key in keys])
+        return features, dict(zip(keys, features, strict=True))
+
+
+def _noting(choose: Choose, margins: list[torch.Tensor]) -> Choose:
+    """Make the same choice, and note how far the best class of each row lies above the next, shape (B,)."""
+
+    def noted(scores: torch.Tensor) -> torch.Tensor:
+        if scores.shape[-1] > 1:
+            best, second = scores.topk(2).values.unbind(-1)
+            margins.append((best - second).flatten(1).amin(1))
+        return choose(scores)
+
+    return noted
+
+
+def drawing(generators: Sequence[torch.Generator], temperature: float) -> Choose:
+    """Make the choice that draws classes instead of taking the likeliest.
+
+    Args:
+        generators: One for each row of the scores. A draw takes one number of it, however many classes there
+            are, so that padding changes nothing.
+        temperature: Scores are divided by it.
+    """
+
+    def draw(scores: torch.Tensor) -> torch.Tensor:
+        chances = torch.softmax(scores.to("cpu", torch.float64) / temperature, dim=-1)
+        sums = chances.cumsum(dim=-1)
+        shape = (*scores.shape[1:-1], 1)
+        drawn = [torch.rand(shape, dtype=torch.float64, generator=generator) for generator in generators]
+        chosen = torch.searchsorted(sums, torch.stack(drawn) * sums[..., -1:], right=True)
+        return chosen.squeeze(-1).clamp(max=scores.shape[-1] - 1).to(scores.device)
+
+    return draw

@@ -1,0 +1,170 @@
+"""Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
+
+Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token, R bins of
+turns; `...` any axes.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+from openvima.policies.nn.conv_encoder import ConvConfig, ConvEncoder
+from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.turns import RelativeRotation
+from openvima.policies.nn.vit import VisionTransformer, VitConfig
+
+NUM_VIEWS = 2
+_BOX_UNITS = (
+    256.0,
+    128.0,
+    128.0,
+    256.0,
+)  # box = centre x, centre y, height, width in pixels of a 128 × 256 image
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectEncoderConfig:
+    """Sizes of the object encoder.
+
+    Args:
+        crop: The crop encoder: a vision transformer, as published, or convolutions.
+        box_width: Width of the box features.
+        width: Width of an object token.
+        fuse_views: One token for both views of an object, instead of one for each.
+        appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
+        crop_dropout: Share of objects whose crop features are left out of their token in training. What is
+            then left, box and appearance embedding, serves for unknown objects as well: the policy does not
+            learn the training objects by heart.
+        turn_bins: Number of turns between which two images of an object are compared, 72 for steps of 5
+            degrees; 0 for no such comparison.
+    """
+
+    crop: VitConfig | ConvConfig
+    box_width: int
+    width: int
+    fuse_views: bool = False
+    appearance_width: int = 0
+    crop_dropout: float = 0.0
+    turn_bins: int = 0
+
+    @property
+    def token_width(self) -> int:
+        """Width of what `forward` gives."""
+        return self.width
+
+    def __post_init__(self) -> None:
+        if self.appearance_width and not self.fuse_views:
+            raise ConfigError(
+                "object encoder: an appearance embedding needs fuse_views, one token per object."
+            )
+        if not 0 <= self.crop_dropout < 1:
+            raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
+        if self.turn_bins < 0 or self.turn_bins == 1:
+            raise ConfigError(
+                f"object encoder: turn_bins is {self.turn_bins}; it must be 0, or at least 2, such as 72."
+            )
+        if self.turn_bins and not self.appearance_width:
+            raise ConfigError(
+                "object encoder: turn_bins needs an appearance width above 0; turns are learnt with looks."
+            )
+
+
+class ObjectEncoder(nn.Module):
+    """Crops -> features (`encode_images`), then features and boxes -> tokens (`forward`).
+
+    Three objects, views apart: [front 1, front 2, front 3, top 1, top 2, top 3]; fused: [1, 2, 3].
+    The two parts are apart so that the features of crops that never change can be computed once.
+    """
+
+    box_units: torch.Tensor
+
+    def __init__(self, config: ObjectEncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        features = config.crop.output_width
+        # A constant has a device of its own, so that a network without weights has it, too.
+        self.register_buffer("box_units", torch.tensor(_BOX_UNITS, device="cpu"), persistent=False)
+        self.crop_encoder = _crop_encoder(config.crop)
+        box_widths = (4, config.box_width, config.box_width, config.box_width)
+        self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))
+        per_view = features + config.box_width
+        fusion_widths = [NUM_VIEWS * (per_view + 1)] if config.fuse_views else [per_view] * NUM_VIEWS
+        self.fusion = nn.ModuleList(nn.Linear(width, config.width) for width in fusion_widths)
+        if config.appearance_width:
+            self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
+        if config.turn_bins:
+            self.turns = RelativeRotation(features, config.turn_bins)
+
+    def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
+        """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
+        return self.crop_encoder(crops.flatten(0, -4)).unflatten(0, crops.shape[:-3])
+
+    def forward(
+        self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
+    ) -> torch.Tensor:
+        """Make tokens.
+
+        Args:
+            features_VNF: Crop features, shape (..., 2, N, F).
+            boxes_VN4: Boxes in pixels, shape (..., 2, N, 4), integers.
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N). Only fusing looks at it.
+
+        Returns:
+            Shape (..., N, D) with fused views, else (..., 2 · N, D), all front slots first.
+        """
+        if self.training and self.config.crop_dropout:
+            shape = (*masks_VN.shape[:-2], 1, masks_VN.shape[-1])
+            kept = torch.rand(shape, device=features_VNF.device) >= self.config.crop_dropout
+            features_VNF = features_VNF * kept[..., None]
+        boxes_VN4 = boxes_VN4.to(features_VNF.dtype) / self.box_units
+        views = [
+            torch.cat([features_VNF[..., v, :, :], encoder(boxes_VN4[..., v, :, :])], dim=-1)
+            for v, encoder in enumerate(self.box_encoders)
+        ]
+        if not self.config.fuse_views:
+            return torch.cat([self.fusion[v](view) for v, view in enumerate(views)], dim=-2)
+        visible = [masks_VN[..., v, :, None].to(features_VNF.dtype) for v in range(NUM_VIEWS)]
+        seen = [view * mask for view, mask in zip(views, visible, strict=True)]
+        return self.fusion[0](torch.cat([*seen, *visible], dim=-1))
+
+    def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
+        """Embed what objects look like, wherever they lie.
+
+        Args:
+            features_VNF: Crop features, shape (..., 2, N, F).
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N).
+
+        Returns:
+            Vectors of length 1, shape (..., N, appearance width); their products are similarities.
+        """
+        seen_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
+        both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
+        return F.normalize(self.appearance(both), dim=-1)
+
+    def turn_between(
+        self,
+        features_a: torch.Tensor,
+        features_b: torch.Tensor,
+        masks_a: torch.Tensor,
+        masks_b: torch.Tensor,
+    ) -> torch.Tensor:
+        """Tell how far each object has turned from one image of it to another.
+
+        Args:
+            features_a: Crop features in the first image, shape (..., 2, N, F).
+            features_b: Those in the second image, of the same shape or one that broadcasts with it.
+            masks_a: Whether the object is visible in the view, bool, shape (..., 2, N).
+            masks_b: The same for the second image.
+
+        Returns:
+            Probabilities of turns, shape (..., N, R); bin k is k / R of a circle, counter-clockwise seen from
+            above. Shapes that look the same at several angles have several peaks.
+        """
+        return self.turns(features_a, features_b, masks_a, masks_b).exp()
+
+
+def _crop_encoder(config: VitConfig | ConvConfig) -> VisionTransformer | ConvEncoder:
+    return VisionTransformer(config) if isinstance(config, VitConfig) else ConvEncoder(config)

@@ -1,0 +1,210 @@
+"""Running jobs on a Ray cluster, each on one thread; the counterpart of `openvima.multiprocess`.
+
+Only here is Ray imported, and only when it was asked for: `pip install openvima[scale]`.
+"""
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
+from typing import Any
+
+from openvima.errors import ConfigError, MissingExtraError, WorkerError
+from openvima.multiprocess import THREAD_VARIABLES, Counts, Job
+
+POLL_S = 0.5
+COUNT_INTERVAL_S = 1.0  # a message a job and second, whatever the number of jobs
+CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C; they notice between two steps of Python
+CONNECT_S = 10.0
+OBJECT_STORE_BYTES = 100 * 2**20  # by default Ray takes 30 % of the memory; results are files here
+AUTO = "auto"  # the cluster that this machine belongs to
+
+
+def on_cluster(
+    job: Job,
+    items: Sequence[Any],
+    num_workers: int | None,
+    *,
+    address: str | None = None,
+    num_counts: int = 1,
+    watch: Callable[[Counts], None] | None = None,
+) -> Iterator[tuple[Any, Any]]:
+    """Apply a job to every item on a Ray cluster.
+
+    Args:
+        job: A function of a module that all machines have.
+        items: Its arguments, taken in order; they and the results are pickled.
+        num_workers: Jobs that run at the same time; None means as many as the cluster has processors.
+        address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses Ray as it runs in
+            this process, or starts it on this machine and stops it in the end.
+        num_counts: Numbers that a job tells.
+        watch: Called now and then with the numbers of all jobs, in the order of the items.
+
+    Yields:
+        An item and its result, as they finish.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: No cluster answers at the address, it has another version of Ray or Python, or it lacks
+            the job's module.
+        WorkerError: A worker died.
+        Exception: Whatever a job raised; the other jobs are stopped.
+    """
+    ray = _import_ray()
+    with _connected(ray, address, num_workers):
+        yield from _run_all(ray, job, items, num_workers or len(items), num_counts, watch or (lambda _: None))
+
+
+def _import_ray() -> ModuleType:
+    # Read when Ray is imported. It would report its use to its makers, and warn of its own future.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError:
+        raise MissingExtraError(
+            "running on a Ray cluster needs ray: pip install openvima[scale]. "
+            "Without it, --engine processes uses the processors of this machine."
+        ) from None
+    return ray
+
+
+@contextlib.contextmanager
+def _connected(ray: ModuleType, address: str | None, num_workers: int | None) -> Iterator[None]:
+    """Connect to a cluster, or start one on this machine; leave Ray as it was found."""
+    if address is None and ray.is_initialized():
+        yield
+        return
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}  # Any: options of `ray.init`
+    if address is None:
+        options |= {
+            "address": "local",
+            "num_cpus": num_workers or os.cpu_count() or 1,
+            "include_dashboard": False,
+            "object_store_memory": OBJECT_STORE_BYTES,
+        }
+    else:
+        _check_answers(address)
+        options["address"] = address
+    try:
+        ray.init(**options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        hint = " If it asks for a token, RAY_AUTH_TOKEN must hold it here too." if address else ""
+        raise ConfigError(
+            f"cannot use Ray at {address or 'this machine'}: {_first_line(error)}.{hint}"
+        ) from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    """Knock at a HOST:PORT: Ray itself would wait for minutes, then end the process without an exception."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if address == AUTO:
+        return
+    if not host or not port.isdigit():
+        raise ConfigError(f"address is {address!r}; allowed are HOST:PORT, ray://HOST:PORT and {AUTO!r}.")
+    try:
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"no Ray cluster answers at {address} ({error}); `ray status` on its head shows the address."
+        ) from None
+
+
+def _run_all(
+    ray: ModuleType,
+    job: Job,
+    items: Sequence[Any],
+    num_workers: int,
+    num_counts: int,
+    watch: Callable[[Counts], None],
+) -> Iterator[tuple[Any, Any]]:
+    counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
+    board = ray.remote(num_cpus=0)(_Board).remote()
+    # A job that died is not tried again: the same command continues, and says why it has to.
+    remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": _environment()})(_run_one)
+    waiting, running = iter(enumerate(items)), {}
+    try:
+        while True:
+            while len(running) < num_workers and (entry := next(waiting, None)) is not None:
+                running[remote.remote(job, entry[1], entry[0], board)] = entry[0]
+            if not running:
+                return
+            done, _ = ray.wait(list(running), timeout=POLL_S)
+            for reference in done:
+                result, numbers = ray.get(reference)
+                slot = running.pop(reference)
+                counts[slot] = numbers or counts[slot]
+                yield items[slot], result
+            for slot, numbers in ray.get(board.read.remote()).items():
+                if slot in running.values():
+                    counts[slot] = numbers
+            watch(counts)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, ray.exceptions.RayError):  # of reading the job, before it could begin
+            raise ConfigError(
+                f"a machine of the Ray cluster cannot do the work ({_first_line(error.cause)}). "
+                "All of them need this version of openvima, with what its extras and your tasks import."
+            ) from None
+        raise error.cause from None  # what the job raised
+    except ray.exceptions.RayError as error:
+        raise WorkerError(
+            f"a worker of the Ray cluster died ({_first_line(error)}); often for lack of memory. "
+            "Whole files were kept, and the same command continues."
+        ) from None
+    finally:
+        _stop(ray, list(running))
+
+
+def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's references
+    """Interrupt jobs and wait until they have tidied up behind them."""
+    if not references:
+        return
+    with contextlib.suppress(ray.exceptions.RayError):
+        for reference in references:
+            ray.cancel(reference)
+        ray.wait(references, num_returns=len(references), timeout=CANCEL_S)
+
+
+def _environment() -> dict[str, str]:
+    """Variables of the workers: one thread each, and those that this package reads."""
+    own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
+    return {**own, **dict.fromkeys(THREAD_VARIABLES, "1")}
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[0].strip().rstrip(".")
+
+
+class _Board:
+    """What running jobs have last counted; an actor."""
+
+    def __init__(self) -> None:
+        self._counts: dict[int, tuple[int, ...]] = {}
+
+    def write(self, slot: int, numbers: tuple[int, ...]) -> None:
+        self._counts[slot] = numbers
+
+    def read(self) -> dict[int, tuple[int, ...]]:
+        return self._counts
+
+
+def _run_one(job: Job, item: Any, slot: int, board: Any) -> tuple[Any, tuple[int, ...]]:  # Any: see `Job`
+    """Do a job in a worker; return its result and its last counts."""
+    last: tuple[int, ...] = ()
+    next_s = 0.0
+
+    def count(*numbers: int) -> None:
+        nonlocal last, next_s
+        last = numbers
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + COUNT_INTERVAL_S
+            board.write.remote(slot, numbers)
+
+    return job(item, count), last

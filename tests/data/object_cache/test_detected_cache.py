@@ -1,0 +1,154 @@
+"""Tokens of objects that a detector finds: what they say, where they lie, and that they are made once."""
+
+import pickle
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from noisy_extractor import HOOK, Clumsy
+from openvima.cli.main import main
+from openvima.data import Dataset
+from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
+from openvima.data.object_cache.cache_file import write_cache_file
+from openvima.data.object_cache.episode import COUNT, ID, PICK, PLACE, preprocess
+from openvima.data.verification import verify
+from openvima.errors import DatasetError, WorkerError
+from openvima.perception.iou import overlaps
+from openvima.perception.objects import GROUND_TRUTH, observe
+
+CLUMSY = Boxes("clumsy-1", Clumsy)
+
+
+def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -> None:
+    num_lost = 0
+    for demo in Dataset(demos):
+        tokens = preprocess(demo, "objects", Clumsy())
+        assert tokens.text == demo.prompt.text
+        ends = np.cumsum(tokens.steps[:, COUNT])
+        for t, rows in enumerate(np.split(tokens.objects, ends)[:-1]):
+            found, true = Clumsy().in_observation(demo.observation(t)), observe(demo.observation(t))
+            assert rows[:, ID].tolist() == list(range(len(found)))
+            shares = overlaps(found, true)
+            for column, asked in ((PICK, demo.pick_ids[t]), (PLACE, demo.place_ids[t])):
+                slot, there = (
+                    tokens.steps[t, column],
+                    true.ids.tolist().index(asked) if asked in true.ids else -1,
+                )
+                if slot >= 0:
+                    assert shares[slot, there] >= 0.5
+                    assert shares[slot].argmax() == there
+                elif there >= 0:
+                    num_lost += 1
+                    assert not (shares[:, there] >= 0.5).any()
+    assert num_lost  # some are not found
+
+
+def test_a_extractor_that_is_always_right_names_the_same_objects(demos: Path) -> None:
+    for demo in Dataset(demos):
+        detected, true = (preprocess(demo, "objects", extractor) for extractor in (GROUND_TRUTH, None))
+        for name in ("images", "prompt_counts", "actions"):
+            np.testing.assert_array_equal(getattr(detected, name), getattr(true, name))
+        np.testing.assert_array_equal(detected.objects[:, ID + 1 :], true.objects[:, ID + 1 :])
+        starts = np.cumsum(true.steps[:, COUNT]) - true.steps[:, COUNT]
+        for column in (PICK, PLACE):
+            slots, ids = detected.steps[:, column], true.steps[:, column]
+            assert ((slots >= 0) == (ids >= 0)).all()
+            named = true.objects[(starts + slots)[slots >= 0], ID]
+            np.testing.assert_array_equal(named, ids[slots >= 0])
+
+
+def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -> None:
+    dataset, made = Dataset(copy), []
+
+    def make(pixels: int) -> Clumsy:
+        made.append(pixels)
+        return Clumsy(pixels)
+
+    one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
+    caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
+    assert [cache.folder.name for cache in caches] == [
+        "objects-v2",
+        "objects-v2-clumsy-1",
+        "objects-v2-clumsy-2",
+    ]
+    assert made == [1, 2]  # once, for all shards
+    assert open_object_cache(dataset, boxes=two)[0].objects.tolist() == caches[2][0].objects.tolist()
+    assert made == [1, 2]
+    assert caches[1][0].objects.tolist() != caches[2][0].objects.tolist()
+    again = pickle.loads(pickle.dumps(caches[2]))
+    assert again[3].objects.tolist() == caches[2][3].objects.tolist()
+    with pytest.raises(DatasetError, match=r"lacks tokens of 6 shards.*--boxes DETECTOR"):
+        ObjectCache(dataset, boxes="clumsy-3")
+
+
+def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:
+    folders = [
+        open_object_cache(Dataset(copy), folder=tmp_path / str(workers), boxes=CLUMSY, workers=workers).folder
+        for workers in (1, 2)
+    ]
+    one, two = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in folders)
+    assert one == two
+    assert len(one) == 6
+
+
+def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
+    dataset, seen = Dataset(copy), []
+
+    class Tiring(Clumsy):
+        def in_observation(self, observation):
+            if len(seen) == 12:
+                raise WorkerError("enough")
+            seen.append(observation)
+            return super().in_observation(observation)
+
+    with pytest.raises(WorkerError, match="enough"):
+        open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
+    folder = copy / "tokens" / "objects-v2-clumsy-1"
+    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
+    assert 1 <= len(before) <= 5
+    cache = open_object_cache(dataset, boxes=CLUMSY)
+    assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
+    for demo, tokens in zip(dataset, cache, strict=True):
+        assert tokens.objects.tolist() == preprocess(demo, "objects", Clumsy()).objects.tolist()
+
+
+def test_tokens_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
+    dataset = Dataset(copy, tasks=["rotate"])
+    cache = open_object_cache(dataset, boxes=CLUMSY)
+    path = cache.folder / "rotate-train-00000.arrow"
+    whole = path.read_bytes()
+    write_cache_file(path, cache[:2], "objects", cache._files[path.name].source, "clumsy-2")
+    with pytest.raises(DatasetError, match="lacks tokens of 1 shards"):
+        ObjectCache(dataset, boxes="clumsy-1")
+    open_object_cache(dataset, boxes=CLUMSY)
+    assert path.read_bytes() == whole
+
+
+def test_whole_frames_have_no_boxes(demos: Path) -> None:
+    with pytest.raises(DatasetError, match="whole frames have none"):
+        open_object_cache(Dataset(demos), "frames", boxes=CLUMSY)
+
+
+def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> None:
+    cache = open_object_cache(Dataset(copy), boxes=CLUMSY)
+    assert not verify(copy).problems
+    path = cache.folder / "rotate-train-00000.arrow"
+    rows = [row for row, tokens in enumerate(cache) if tokens.task == "rotate"][:2]
+    changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
+    write_cache_file(path, changed, "objects", cache._files[path.name].source, "clumsy-1")
+    (problem,) = verify(copy).problems
+    assert "not those of the demonstration" in problem.cause
+    assert problem.file.endswith("objects-v2-clumsy-1/rotate-train-00000.arrow")
+
+
+def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["data", "tokens", str(copy), "--boxes", HOOK]
+    assert main(words) == 0
+    (folder,) = (copy / "tokens").iterdir()
+    assert capsys.readouterr().out.strip() == str(folder)
+    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v2-"))) == 10
+    assert main([*words, "--kind", "frames"]) == 2
+    assert "whole frames have none" in capsys.readouterr().err

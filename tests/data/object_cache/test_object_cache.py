@@ -1,0 +1,157 @@
+"""The token cache: the same tokens as cutting anew, made once, and never trusted when damaged or old."""
+
+import os
+import pickle
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.object_cache.cache import ObjectCache, open_object_cache
+from openvima.data.object_cache.cache_file import CacheFile
+from openvima.data.object_cache.episode import PreprocessedEpisode, image_names, pieces_of, preprocess
+from openvima.errors import DatasetError, ShardError
+
+TASKS = ("rotate", "rearrange_then_restore")
+
+
+def assert_equal(a: PreprocessedEpisode, b: PreprocessedEpisode) -> None:
+    for field in fields(PreprocessedEpisode):
+        ours, theirs = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(ours, np.ndarray):
+            assert ours.dtype == theirs.dtype, field.name
+            assert np.array_equal(ours, theirs), field.name
+        else:
+            assert ours == theirs, field.name
+
+
+@pytest.mark.parametrize("kind", ["objects", "frames"])
+def test_the_cache_holds_what_cutting_anew_would_give(copy: Path, kind) -> None:
+    dataset = Dataset(copy)
+    cache = open_object_cache(dataset, kind)
+    assert len(cache) == len(dataset) == 10
+    for demo, tokens in zip(dataset, cache, strict=True):
+        assert_equal(tokens, preprocess(demo, kind))
+        assert tokens.num_steps == demo.num_steps
+    assert np.array_equal(cache.lengths(), [[len(tokens.steps), len(tokens.objects)] for tokens in cache])
+
+
+def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:
+    one = open_object_cache(Dataset(copy), folder=tmp_path / "one").folder
+    two = open_object_cache(Dataset(copy), folder=tmp_path / "two", workers=2).folder
+    files = sorted(path.name for path in one.iterdir())
+    assert files == sorted(path.name for path in copy.glob("*.arrow"))
+    assert all((one / name).read_bytes() == (two / name).read_bytes() for name in files)
+
+
+def test_opening_again_makes_nothing_and_extending_makes_what_is_new(copy: Path) -> None:
+    cache = open_object_cache(Dataset(copy))
+    before = {path.name: path.stat().st_mtime_ns for path in cache.folder.iterdir()}
+    calls: list[int] = []
+    open_object_cache(Dataset(copy), report=lambda done, total, note: calls.append(total))
+    assert calls == []
+    generate(GenerateConfig(out=copy, tasks=TASKS, episodes=7, shard_size=2))
+    with pytest.raises(DatasetError, match=r"lacks tokens of 4 shards, first .* makes them"):
+        ObjectCache(Dataset(copy))
+    extended = open_object_cache(Dataset(copy), report=lambda done, total, note: calls.append(total))
+    assert calls[-1] == 6  # the two short shards of before, and two new ones
+    after = {path.name: path.stat().st_mtime_ns for path in cache.folder.iterdir()}
+    assert sum(before[name] == after[name] for name in before) == 4
+    assert_equal(extended[-1], preprocess(Dataset(copy)[-1], "objects"))
+
+
+def test_a_dataset_of_some_tasks_has_their_tokens_only(copy: Path) -> None:
+    dataset = Dataset(copy, tasks=["rotate"])
+    cache = open_object_cache(dataset)
+    assert {path.name.split("-")[0] for path in cache.folder.iterdir()} == {"rotate"}
+    assert [tokens.seed for tokens in cache] == [demo.seed for demo in dataset]
+    with pytest.raises(DatasetError, match="lacks tokens of 3 shards"):
+        ObjectCache(Dataset(copy))
+
+
+def test_old_tokens_are_noticed(copy: Path) -> None:
+    open_object_cache(Dataset(copy))
+    for path in copy.glob("*.arrow"):
+        path.unlink()
+    generate(GenerateConfig(out=copy, tasks=TASKS, episodes=5, shard_size=2, start_seed=50, force=True))
+    with pytest.raises(DatasetError, match="lacks tokens of 6 shards"):
+        ObjectCache(Dataset(copy))
+    assert open_object_cache(Dataset(copy))[0].seed == Dataset(copy)[0].seed
+
+
+@pytest.mark.parametrize("size", [0, 7, 1000, -1])
+def test_a_truncated_file_is_made_anew(copy: Path, size: int) -> None:
+    cache = open_object_cache(Dataset(copy))
+    path = next(iter(sorted(cache.folder.iterdir())))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:size])
+    with pytest.raises(ShardError, match="holds no tokens that can be read"):
+        CacheFile(path)
+    with pytest.raises(DatasetError, match="lacks tokens of 1 shards"):
+        ObjectCache(Dataset(copy))
+    open_object_cache(Dataset(copy))
+    assert path.read_bytes() == whole
+
+
+def test_a_shard_of_demonstrations_is_no_file_of_tokens(copy: Path) -> None:
+    with pytest.raises(ShardError, match="holds no tokens"):
+        CacheFile(next(copy.glob("*.arrow")))
+    with pytest.raises(ShardError, match="holds no tokens"):
+        CacheFile(copy / "gone.arrow")
+
+
+def test_a_folder_that_cannot_be_made_is_named(copy: Path) -> None:
+    (copy / "blocked").write_text("a file")
+    with pytest.raises(DatasetError, match=r"cannot keep tokens in .*blocked"):
+        open_object_cache(Dataset(copy), folder=copy / "blocked")
+    with pytest.raises(DatasetError, match="Did you mean 'frames'"):
+        open_object_cache(Dataset(copy), "frame")  # type: ignore[arg-type]
+
+
+def test_a_cache_can_be_sent_to_another_process(demos: Path) -> None:
+    cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
+    _ = cache[0]
+    again = pickle.loads(pickle.dumps(cache))
+    assert_equal(again[3], cache[3])
+    assert [tokens.seed for tokens in again[1:3]] == [cache[1].seed, cache[2].seed]
+
+
+def test_tokens_are_read_with_pyarrow_alone(demos: Path) -> None:
+    cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
+    table = pa.ipc.open_file(pa.memory_map(str(cache.folder / "rotate-train-00000.arrow"))).read_all()
+    row = table.slice(1, 1).to_pylist()[0]
+    pixels = pa.decompress(row["images"], row["num_images"] * 3 * 32 * 32, codec="lz4_raw", asbytes=True)
+    images = np.frombuffer(pixels, np.uint8).reshape(-1, 3, 32, 32)
+    assert np.array_equal(images, cache[1].images)
+    assert np.array_equal(np.array(row["objects"]), cache[1].objects)
+
+
+def test_a_prompt_is_split_into_texts_and_images() -> None:
+    text = "Put {a} into {b}, then {a} back."
+    assert image_names(text) == ("a", "b")
+    assert pieces_of(text) == ("Put", 0, "into", 1, ", then", 0, "back.")
+    assert pieces_of("{x}") == (0,)
+    assert pieces_of("only words") == ("only words",)
+
+
+def test_tokens_are_not_made_of_damaged_demonstrations(copy: Path) -> None:
+    shard = copy / "rotate-train-00001.arrow"
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(ShardError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
+        open_object_cache(Dataset(copy))
+    with pytest.raises(DatasetError, match="lacks tokens"):
+        ObjectCache(Dataset(copy))
+
+
+def test_makers_of_the_same_tokens_leave_each_other_alone(copy: Path) -> None:
+    folder = copy / "tokens" / "objects-v1"
+    folder.mkdir(parents=True)
+    writing = folder / f".rotate-train-00000.arrow.{os.getppid()}.tmp"
+    writing.touch()
+    open_object_cache(Dataset(copy))
+    assert writing.exists()

@@ -1,0 +1,126 @@
+"""What a data set shows, by task and role, and whether that is from the training partition."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from openvima.catalog import TEXTURE_SETS
+from openvima.cli.main import main
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.appearance_stats import ROLES, looks_of, looks_record, looks_text, seeds_of
+from openvima.data.leakage import beyond_training, training_looks
+from openvima.data.manifest import MANIFEST_NAME
+from openvima.errors import LevelError
+
+TASKS = ("rearrange", "visual_manipulation", "novel_noun", "sweep_without_exceeding")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return generate(GenerateConfig(out=tmp_path_factory.mktemp("demos"), tasks=TASKS, episodes=6))
+
+
+@pytest.fixture(scope="module")
+def record(demos: Path) -> dict[str, Any]:
+    return looks_record(Dataset(demos))
+
+
+def test_every_object_and_every_prompt_image_is_in_the_table(demos: Path, record: dict[str, Any]) -> None:
+    dataset = Dataset(demos)
+    shown = dict.fromkeys(TASKS, 0)
+    for demo in dataset:
+        roles = record["tasks"][demo.task]["roles"]
+        on_table = frozenset().union(*(looks_of(roles[role]) for role in roles if role != "prompted"))
+        assert {(part.object, part.texture) for part in demo.objects} <= on_table
+        shown[demo.task] += len(demo.objects)
+        for image in demo.prompt.images.values():
+            assert {(part.object, part.texture) for part in image.objects} <= looks_of(roles["prompted"])
+    for task, number in shown.items():
+        roles = record["tasks"][task]["roles"]
+        assert sum(roles[role]["shown"] for role in roles if role != "prompted") == number
+        assert set(roles) <= set(ROLES)
+
+
+def test_what_the_oracle_picks_is_dragged_or_a_distractor(demos: Path, record: dict[str, Any]) -> None:
+    for demo in Dataset(demos):
+        roles = record["tasks"][demo.task]["roles"]
+        look = {part.object_id: (part.object, part.texture) for part in demo.objects}
+        for pick, place in zip(demo.pick_ids, demo.place_ids, strict=True):
+            distractors = looks_of(roles["distractor"]) if demo.task == "rearrange" else set()
+            assert look[pick] in looks_of(roles["dragged"]) | distractors
+            assert place == -1 or look[place] in looks_of(roles["base"])
+
+
+def test_the_table_names_its_data_and_survives_a_file(demos: Path, record: dict[str, Any]) -> None:
+    manifest = json.loads((demos / MANIFEST_NAME).read_text())
+    assert record["manifest"]["content_hash"] == manifest["content_hash"]
+    assert record["manifest"]["index"] == manifest["index"]
+    assert json.loads(looks_text(record)) == record
+    for task, entry in record["tasks"].items():
+        rows = [row for row in Dataset(demos).index.to_pylist() if row["task"] == task]
+        assert seeds_of(entry) == sorted(row["seed"] for row in rows)
+        assert entry["steps"] == sum(row["steps"] for row in rows)
+
+
+def test_demonstrations_for_training_keep_to_their_partition(record: dict[str, Any]) -> None:
+    assert beyond_training(record) == []
+
+
+@pytest.mark.parametrize(
+    ("role", "look"),
+    [
+        ("dragged", ("letter R", "red")),  # a novel object
+        ("dragged", ("letter A", "brick")),  # a novel texture
+        ("dragged", ("letter A", "blue")),  # as L2 combines them
+        ("base", ("bowl", "red")),
+        ("base", ("pan", "blue")),
+        ("distractor", ("letter A", "brick")),
+        ("prompted", ("letter A", "gray")),
+    ],
+)
+def test_what_goes_beyond_it_is_named(record: dict[str, Any], role: str, look: tuple[str, str]) -> None:
+    changed = deepcopy(record)
+    roles = changed["tasks"]["visual_manipulation"]["roles"]
+    roles.setdefault(role, {"looks": []})["looks"].append({"objects": [look[0]], "textures": [look[1]]})
+    assert beyond_training(changed) == [f"visual_manipulation shows {look[0]!r} in {look[1]!r} as {role}."]
+
+
+def test_other_tasks_and_levels_are_named(record: dict[str, Any]) -> None:
+    changed = deepcopy(record)
+    changed["tasks"]["follow_motion"] = changed["tasks"]["rearrange"]
+    changed["tasks"]["rearrange"] = {**changed["tasks"]["rearrange"], "levels": ["L1", "train"]}
+    problems = beyond_training(changed)
+    assert "follow_motion is none of the training tasks." in problems
+    assert "rearrange has episodes of level L1." in problems
+    with pytest.raises(LevelError):
+        training_looks("follow_motion")
+
+
+def test_only_distractors_of_rearrangements_have_all_textures() -> None:
+    everything = set(TEXTURE_SETS["T"])
+    for task in ("rearrange", "twist", "visual_manipulation"):
+        for role, looks in training_looks(task).items():
+            has_all = {texture for _, texture in looks} >= everything
+            assert has_all == (task == "rearrange" and role == "distractor")
+
+
+def test_the_command_writes_the_table_and_says_what_does_not_belong(
+    demos: Path, record: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "training_data.json"
+    assert main(["data", "info", str(demos), "--looks", str(file)]) == 0
+    assert json.loads(file.read_text()) == record
+    assert "nothing is beyond the training partition" in capsys.readouterr().err
+    novel = generate(GenerateConfig(out=tmp_path / "novel", tasks=("rotate",), level="L3", episodes=2))
+    assert main(["data", "info", str(novel), "--looks", str(file)]) == 0
+    assert "rotate shows 'letter R'" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_not_finished_has_no_table(demos: Path, tmp_path: Path) -> None:
+    for shard in demos.glob("*.arrow"):
+        (tmp_path / shard.name).write_bytes(shard.read_bytes())
+    assert main(["data", "info", str(tmp_path), "--looks", str(tmp_path / "looks.json")]) == 2
+    assert not (tmp_path / "looks.json").exists()

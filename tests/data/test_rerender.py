@@ -1,0 +1,115 @@
+"""Demonstrations without images show on reading what the cameras saw, or say why they cannot."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima.data import Demonstration, Shard, ShardWriter, rollout_oracle
+from openvima.data.encoding import ShardInfo
+from openvima.data.records import package_versions
+from openvima.env.config import EnvConfig
+from openvima.errors import AssetError, ShardError
+
+
+def info_of(demo: Demonstration, setup: EnvConfig) -> ShardInfo:
+    return ShardInfo(
+        demo.task,
+        demo.level,
+        demo.domain,
+        number=0,
+        shard_size=4,
+        first_seed=0,
+        assets=demo.assets,
+        versions=demo.versions,
+        compat=setup.compat,
+        difficulty=setup.difficulty,
+        images=False,
+    )
+
+
+def stored(path: Path, demo: Demonstration, info: ShardInfo) -> Shard:
+    with ShardWriter(path, info) as writer:
+        writer.write(demo)
+    return Shard(path)
+
+
+@pytest.fixture
+def recorded() -> Demonstration:
+    return rollout_oracle(EnvConfig().make("visual_manipulation", "train", domain="train"), 0)
+
+
+@pytest.mark.parametrize(
+    ("task", "level", "setup"),
+    [
+        ("visual_manipulation", "L2", EnvConfig()),
+        ("visual_manipulation", "train", EnvConfig(compat=True)),
+        ("visual_manipulation", "train", EnvConfig(difficulty="medium")),
+        ("rearrange", "train", EnvConfig()),  # a scene in the prompt
+        ("twist", "train", EnvConfig()),  # scenes before and after
+        ("follow_motion", "L4", EnvConfig()),  # frames of a motion
+        ("follow_order", "train", EnvConfig(compat=True)),
+        ("sweep_without_exceeding", "train", EnvConfig()),  # the spatula
+        ("sweep_without_touching", "L4", EnvConfig(compat=True)),
+    ],
+)
+def test_redrawn_images_are_those_of_the_environment(
+    tmp_path: Path, task: str, level: str, setup: EnvConfig
+) -> None:
+    demo = rollout_oracle(setup.make(task, level, domain="train"), 3)
+    shard = stored(tmp_path / "a.arrow", demo, info_of(demo, setup))
+    read = shard[0]
+    for view in ("front", "top"):
+        assert read.rgb[view].shape == demo.rgb[view].shape
+        assert read.rgb[view].tobytes() == demo.rgb[view].tobytes()
+        assert read.segm[view].tobytes() == demo.segm[view].tobytes()
+    assert read.prompt.text == demo.prompt.text
+    for name, image in demo.prompt.images.items():
+        assert read.prompt.images[name].objects == image.objects
+        for view in image.rgb:
+            assert np.array_equal(read.prompt.images[name].rgb[view], image.rgb[view])
+            assert np.array_equal(read.prompt.images[name].segm[view], image.segm[view])
+    assert read.content_hash() == demo.content_hash()
+
+
+def test_files_without_images_are_small(tmp_path: Path, recorded: Demonstration) -> None:
+    info = info_of(recorded, EnvConfig())
+    stored(tmp_path / "without.arrow", recorded, info)
+    stored(tmp_path / "with.arrow", recorded, replace(info, images=True))
+    sizes = [(tmp_path / name).stat().st_size for name in ("without.arrow", "with.arrow")]
+    assert sizes[0] < 18_000 < sizes[1]
+
+
+def test_a_difference_names_the_versions_that_wrote_the_file(tmp_path: Path, recorded: Demonstration) -> None:
+    info = replace(info_of(recorded, EnvConfig()), versions={**package_versions(), "openvima": "0.0.1"})
+    shard = stored(tmp_path / "a.arrow", replace(recorded, seed=1), info)  # the scenes of another seed
+    with pytest.raises(ShardError) as caught:
+        _ = shard[0]
+    message = str(caught.value)
+    assert "a.arrow, record 0: visual_manipulation of seed 1" in message
+    assert f"openvima 0.0.1 (installed: {package_versions()['openvima']})" in message
+    assert "numpy" not in message
+
+
+def test_a_difference_between_equal_versions_has_other_causes(
+    tmp_path: Path, recorded: Demonstration
+) -> None:
+    shard = stored(tmp_path / "a.arrow", replace(recorded, seed=1), info_of(recorded, EnvConfig()))
+    with pytest.raises(ShardError, match=r"all versions as installed.*the task or the asset pack"):
+        _ = shard[0]
+
+
+def test_a_task_that_is_gone_is_named(
+    tmp_path: Path, made_up: Callable[..., Demonstration], info: ShardInfo
+) -> None:
+    shard = stored(tmp_path / "a.arrow", made_up(), replace(info, assets="procedural", images=False))
+    with pytest.raises(ShardError, match=r"cannot be redrawn.*'stack'.*openvima 0 \(installed"):
+        _ = shard[0]
+
+
+def test_a_missing_asset_pack_is_said_to_be_missing(tmp_path: Path, recorded: Demonstration) -> None:
+    info = replace(info_of(recorded, EnvConfig()), assets="nowhere")
+    with pytest.raises(AssetError, match="nowhere"):
+        _ = stored(tmp_path / "a.arrow", recorded, info)[0]

@@ -1,0 +1,116 @@
+"""Detectors named in a word: how they are found, named and made into tokens."""
+
+import pickle
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima.data import Dataset
+from openvima.data.object_cache.episode import preprocess
+from openvima.detector.hooks import detected_object_cache, plugged_boxes, plugged_extractor
+from openvima.env import TabletopEnv
+from openvima.errors import CheckpointError, ConfigError
+from openvima.perception.objects import GROUND_TRUTH, GroundTruth
+
+EXTRACTORS = Path(__file__).parents[1] / "plugged_extractors.py"
+
+
+def test_a_detector_of_a_module_is_found_by_name(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXTRACTORS.parent))
+    extractor = plugged_extractor("plugged_extractors:truth")
+    sys.modules.pop("plugged_extractors")
+    assert extractor.extractor == GROUND_TRUTH
+
+
+def test_where_something_is_found_it_is_left_as_it_is():
+    extractor = plugged_extractor("openvima.perception.objects:GroundTruth")
+    assert extractor.extractor == GroundTruth()
+    env = TabletopEnv("rotate", level="L1")
+    observation, _ = env.reset(seed=0)
+    assert np.array_equal(
+        extractor.in_observation(observation).ids, GroundTruth().in_observation(observation).ids
+    )
+
+
+@pytest.mark.parametrize(
+    ("hook", "message"),
+    [
+        ("extractor", "MODULE:FUNCTION"),
+        ("no_such_module:make", "cannot be imported"),
+        ("no/such/file.py:make", "cannot be imported"),
+        ("openvima.perception.objects:make", "has no function 'make'"),
+        ("builtins:dict", "gave a dict"),
+    ],
+)
+def test_what_makes_no_detector_is_named(hook, message):
+    with pytest.raises(ConfigError, match=message):
+        plugged_extractor(hook)
+
+
+def test_a_trained_detector_is_found_by_its_folder(tmp_path):
+    pytest.importorskip("torch")
+    with pytest.raises(CheckpointError, match="no folder"):
+        plugged_extractor(f"detector={tmp_path / 'none'}")
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        plugged_extractor(f"detector={tmp_path}")
+
+
+def test_only_what_a_view_shows_is_found_and_one_hidden_object_stands_for_nothing():
+    extractor = plugged_extractor(f"{EXTRACTORS}:Blind")
+    env = TabletopEnv("rotate", level="L1")
+    observation, _ = env.reset(seed=0)
+    found = extractor.in_observation(observation)
+    assert len(found) == 1
+    assert not found.masks.any()
+    assert len(extractor.in_prompt_image(next(iter(env.prompt.images.values())))) == 0
+
+
+def test_the_name_of_a_function_follows_from_its_file(tmp_path):
+    names = {plugged_boxes(f"{EXTRACTORS}:{function}").name for function in ("truth", "truth", "Blind")}
+    assert sorted(name.partition("-")[0] for name in names) == ["Blind", "truth"]
+    elsewhere = shutil.copy(EXTRACTORS, tmp_path / "copy.py")
+    assert plugged_boxes(f"{elsewhere}:truth").name in names
+    Path(elsewhere).write_text(EXTRACTORS.read_text() + "\n")
+    assert plugged_boxes(f"{elsewhere}:truth").name not in names
+
+
+def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tiny, data):
+    torch = pytest.importorskip("torch")
+    from openvima.detector.checkpoint import save_network
+    from openvima.detector.network import MaskRCNN
+
+    names = []
+    for number, config in enumerate((tiny, tiny, replace(tiny, overlap=0.4))):
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(min(number, 1))
+            save_network(MaskRCNN(config), tmp_path / str(number))
+        names.append(plugged_boxes(f"detector={tmp_path / str(number)}").name)
+    shutil.copytree(tmp_path / "0", tmp_path / "moved")
+    names.append(plugged_boxes(f"detector={tmp_path / 'moved'}").name)
+    assert names[3] == names[0]
+    assert len(set(names)) == 3
+    assert all(name.startswith("detector-") for name in names)
+
+
+def test_tokens_of_a_detector_are_those_of_its_extractor_on_one_thread(tmp_path, tiny, data):
+    torch = pytest.importorskip("torch")
+    from openvima.detector.checkpoint import save_network
+    from openvima.detector.network import MaskRCNN
+
+    save_network(MaskRCNN(replace(tiny, candidates=4, proposals=3)), tmp_path / "detector")
+    boxes = plugged_boxes(f"detector={tmp_path / 'detector'}")
+    assert pickle.loads(pickle.dumps(boxes)) == boxes
+    dataset, threads = Dataset(data, tasks=["rotate"]), torch.get_num_threads()
+    notes = []
+    cache = detected_object_cache(
+        dataset, boxes, folder=tmp_path / "tokens", report=lambda done, total, note: notes.append(note)
+    )
+    assert torch.get_num_threads() == threads
+    assert set(notes) == {"detecting objects"}
+    extractor = plugged_extractor(f"detector={tmp_path / 'detector'}")
+    demo, tokens = dataset[0], cache[0]
+    assert tokens.objects.tolist() == preprocess(demo, "objects", extractor).objects.tolist()

@@ -1,0 +1,214 @@
+"""The whole network: what it gives, that it learns, and that padding and folding change nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+torch = pytest.importorskip("torch")
+from openvima.detector.config import resnet50, small  # noqa: E402
+from openvima.detector.detector import FrameDetector, detections_of, folded  # noqa: E402
+from openvima.detector.network import MaskRCNN, Objects, prepared_size  # noqa: E402
+from openvima.errors import ShapeError  # noqa: E402
+from openvima.policies.detection import DetectedObjects  # noqa: E402
+
+NUM_STEPS = 120
+
+
+def made(config, seed: int = 0) -> MaskRCNN:
+    torch.manual_seed(seed)
+    return MaskRCNN(config).eval()
+
+
+def images(count: int, height: int = 64, width: int = 96) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (count, 3, height, width), dtype=torch.uint8, generator=generator)
+
+
+def objects_of(frame) -> Objects:
+    return Objects(torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes)))
+
+
+@pytest.fixture
+def trained(tiny, rectangles):
+    """A tiny network after some seconds with rectangles."""
+    network = made(tiny).train()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(NUM_STEPS):
+        optimizer.param_groups[0]["lr"] = 5e-3 * (1 - step / NUM_STEPS)
+        frames = [rectangles(4 * step + k) for k in range(4)]
+        batch = torch.from_numpy(np.stack([frame.rgb for frame in frames]))
+        losses = network.losses(batch, [objects_of(f) for f in frames], sampled=16, generator=generator)
+        optimizer.zero_grad()
+        torch.stack(list(losses.values())).sum().backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+    return network.eval()
+
+
+def test_a_trained_network_finds_what_is_there(trained, rectangles):
+    detector = FrameDetector(trained)
+    for seed in range(10_000, 10_005):
+        frame = rectangles(seed)
+        found = detector.detect(frame.rgb, "top")
+        found = found.select(found.scores >= 0.5)
+        assert len(found) == 2
+        order = np.argsort(found.boxes[:, 0])
+        assert np.abs(found.boxes[order] + [0, 0, 1, 1] - frame.boxes).max() <= 5
+        shared = found.masks[order] & frame.masks
+        whole = found.masks[order] | frame.masks
+        assert (shared.sum((1, 2)) / whole.sum((1, 2)) > 0.7).all()
+
+
+def test_every_weight_gets_a_gradient(tiny, rectangles):
+    network = made(tiny).train()
+    losses = network.losses(
+        images(2), [objects_of(rectangles(k)) for k in range(2)], sampled=16, generator=torch.Generator()
+    )
+    assert set(losses) == {"proposal_score", "proposal_box", "kind", "box", "mask"}
+    torch.stack(list(losses.values())).sum().backward()
+    assert all(parameter.grad is not None for parameter in network.parameters())
+
+
+def test_frames_without_objects_have_losses_too(tiny):
+    nothing = Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96, dtype=torch.bool), torch.zeros(0))
+    losses = made(tiny).losses(images(2), [nothing, nothing], sampled=16, generator=torch.Generator())
+    assert all(torch.isfinite(loss) for loss in losses.values())
+    assert losses["mask"] == losses["box"] == 0
+
+
+def test_equal_seeds_give_equal_losses(tiny, rectangles):
+    def loss(seed):
+        generator = torch.Generator().manual_seed(seed)
+        losses = made(tiny).losses(images(1), [objects_of(rectangles())], sampled=8, generator=generator)
+        return [float(loss.detach()) for loss in losses.values()]
+
+    assert loss(0) == loss(0) != loss(1)
+
+
+def test_an_image_of_a_batch_gives_what_it_gives_alone(tiny):
+    network = made(tiny)
+    batch = images(3)
+    alone = [network(batch[k : k + 1])[0] for k in range(3)]
+    for one, other in zip(network(batch), alone, strict=True):
+        assert torch.allclose(one.scores, other.scores, atol=1e-5)
+        assert torch.allclose(one.boxes, other.boxes, atol=1e-3)
+
+
+def test_images_of_odd_sizes_are_padded_and_boxes_stay_inside(tiny):
+    (found,) = made(replace(tiny, score=0.0))(images(1, 61, 83))
+    assert found.masks.shape[1:] == (61, 83)
+    assert len(found.boxes) and (found.boxes >= 0).all()
+    assert (found.boxes[:, 2] <= 83).all() and (found.boxes[:, 3] <= 61).all()
+
+
+def test_enlarged_images_give_boxes_in_pixels_of_the_image(tiny):
+    (found,) = made(replace(tiny, score=0.0, short_side=128, colours="bgr"))(images(1))
+    assert len(found.boxes) and (found.boxes[:, 2] <= 96).all() and (found.boxes[:, 3] <= 64).all()
+    assert found.boxes[:, 2].max() > 48
+
+
+@pytest.mark.parametrize(("height", "width"), [(128, 256), (480, 640), (1080, 1920), (333, 500), (801, 800)])
+def test_images_are_enlarged_to_the_size_that_detectron2_gives_them(height, width):
+    # Its rule in its own words: first the shorter side, then the longer one, then halves upwards.
+    low, high = 800.0, 800.0 * max(height, width) / min(height, width)
+    shrink = min(1.0, 1333 / high)
+    short, long = int(low * shrink + 0.5), int(high * shrink + 0.5)
+    assert prepared_size(resnet50(), height, width) == ((short, long) if height < width else (long, short))
+
+
+def test_a_frame_is_enlarged_to_667_by_1333_pixels():
+    assert prepared_size(resnet50(), 128, 256) == (667, 1333)
+    assert prepared_size(small(), 128, 256) == (128, 256)
+
+
+@pytest.mark.parametrize("short_side", [30, 100])
+def test_images_are_resized_as_pillow_does(tiny, short_side):
+    network = made(replace(tiny, short_side=short_side, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
+    prepared, scale, (height, width) = network._prepare(images(1))
+    picture = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
+    expected = np.asarray(picture.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
+    assert np.abs(prepared[0, :, :height, :width].numpy() - expected).max() <= 1  # it counts in integers
+    assert scale.tolist() == pytest.approx([width / 96, height / 64] * 2)
+
+
+def test_edges_grow_in_each_direction_by_as_much_as_the_image(tiny):
+    # 64 × 96 pixels become 10 × 15 in both, but 65 × 96 do not grow evenly.
+    network = made(replace(tiny, short_side=10))
+    _, scale, size = network._prepare(images(1, 65, 96))
+    assert size == (10, 15)
+    assert scale.tolist() == pytest.approx([15 / 96, 10 / 65] * 2)
+
+
+def test_folding_batch_normalisation_changes_nothing(tiny):
+    network = made(replace(tiny, score=0.0)).train()
+    network.losses(images(4), [Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))] * 4,
+                   sampled=8, generator=torch.Generator())  # moves the statistics  # fmt: skip
+    network.eval()
+    (plain,), (without,) = network(images(1)), folded(network)(images(1))
+    assert torch.allclose(plain.scores, without.scores, atol=1e-5)
+    assert torch.allclose(plain.boxes, without.boxes, atol=1e-3)
+
+
+def test_the_better_of_two_kinds_counts(tiny):
+    (found,) = made(replace(tiny, num_classes=3, score=0.0))(images(1))
+    assert len(found.boxes)
+
+
+def test_masks_are_those_of_the_kind_that_counts(tiny):
+    network = made(replace(tiny, num_classes=3, score=0.0))
+    with torch.no_grad():
+        network.box_head.kinds.bias.copy_(torch.tensor([0.0, 20.0, 0.0, 0.0]))
+        network.mask_head.masks.bias.copy_(torch.tensor([20.0, -20.0, 20.0]))  # all of the box, or nothing
+    (found,) = network(images(1))
+    assert len(found.masks) and not found.masks.any()
+
+
+def test_where_nothing_is_proposed_nothing_is_found(tiny, monkeypatch):
+    network = made(tiny)
+    monkeypatch.setattr(network.proposals, "propose", lambda *_, **__: [torch.zeros(0, 4)])
+    (found,) = network(images(1))
+    assert found.masks.shape == (0, 64, 96)
+
+
+def test_frozen_norms_stay_as_they_are(tiny):
+    config = replace(tiny, backbone=replace(tiny.backbone, frozen_norms=True))
+    network = MaskRCNN(config).train()
+    before = network.backbone.stem.norm.running_mean.clone()
+    nothing = Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
+    network.losses(images(2), [nothing] * 2, sampled=8, generator=torch.Generator())
+    assert torch.equal(network.backbone.stem.norm.running_mean, before)
+
+
+def test_the_small_variant_fits_into_the_package():
+    weights = [tensor for tensor in made(small()).state_dict().values() if tensor.is_floating_point()]
+    assert sum(tensor.numel() for tensor in weights) * 4 < 8e6
+
+
+def test_the_published_architecture_has_the_published_number_of_weights():
+    with torch.device("meta"):
+        network = MaskRCNN(replace(resnet50(), num_classes=80))
+    # 44.4 million without the constants of batch normalisation, as counted for Mask R-CNN R50-FPN on COCO
+    assert round(sum(parameter.numel() for parameter in network.parameters()) / 1e6, 1) == 44.4
+
+
+def test_edges_become_the_pixels_that_they_cover():
+    found = Objects(
+        torch.tensor([[2.4, 3.6, 10.4, 9.6], [95.8, 0.0, 96.0, 64.0]]),
+        torch.zeros(2, 64, 96, dtype=torch.bool),
+        torch.tensor([0.9, 0.8]),
+    )
+    assert detections_of(found).boxes.tolist() == [[2, 4, 9, 9], [95, 0, 95, 63]]
+
+
+def test_policies_take_the_detector_for_a_extractor(tiny):
+    extractor = DetectedObjects(FrameDetector(made(tiny)), min_score=0.0)
+    rgb = {view: images(1, 128, 256)[0].numpy() for view in ("front", "top")}
+    assert len(extractor.in_observation({"rgb": rgb, "ee": 0})) > 0
+
+
+def test_an_image_of_another_kind_is_refused(tiny):
+    with pytest.raises(ShapeError, match="uint8"):
+        FrameDetector(made(tiny)).detect(np.zeros((128, 256, 3), np.uint8), "top")

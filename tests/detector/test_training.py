@@ -1,0 +1,169 @@
+"""Training: what a run leaves, going on after an interruption, and what is refused."""
+
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima.errors import ConfigError, DatasetError
+
+torch = pytest.importorskip("torch")
+from safetensors.torch import load_file  # noqa: E402
+
+from openvima.data import Dataset  # noqa: E402
+from openvima.detector import config as sizes  # noqa: E402
+from openvima.detector import load_detector  # noqa: E402
+from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
+from openvima.detector.network import MaskRCNN  # noqa: E402
+from openvima.training.detector import DetectorTrainingConfig, train_detector  # noqa: E402
+from openvima.training.detector.split import split_episodes  # noqa: E402
+
+
+@pytest.fixture
+def settings(data: Path, tmp_path: Path, tiny, monkeypatch) -> DetectorTrainingConfig:
+    """Two steps of a tiny network."""
+    monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
+    return DetectorTrainingConfig(
+        data,
+        tmp_path / "run",
+        steps=2,
+        batch=4,
+        sampled=8,
+        validation_share=0.4,
+        validation_frames=4,
+        checkpoint_every=1,
+        device="cpu",
+    )
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return load_network(run).state_dict()
+
+
+def lines(run: Path) -> list[dict]:
+    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_a_run_leaves_a_detector_and_its_metrics(settings):
+    seen = []
+    run = train_detector(settings, lambda *progress: seen.append(progress))
+    assert seen[-1][:2] == (2, 2)
+    names = {"loss", "proposal_score", "proposal_box", "kind", "box", "mask"}
+    trained = [line for line in lines(run) if "loss" in line]
+    held_out = [line for line in lines(run) if "validation_loss" in line]
+    assert names <= trained[-1].keys() and {f"validation_{name}" for name in names} <= held_out[-1].keys()
+    assert [line["step"] for line in held_out] == [1, 2]
+    found = load_detector(run).detect(np.zeros((3, 128, 256), np.uint8), "top")
+    assert found.masks.shape[1:] == (128, 256)
+
+
+def test_an_interrupted_run_ends_with_the_weights_of_one_that_was_not(settings, tmp_path, monkeypatch):
+    whole = train_detector(replace(settings, out=tmp_path / "whole"))
+    from openvima.training.detector import loop
+
+    def stops(trainer, step, do=loop._Trainer._step):
+        if step == 1:
+            raise KeyboardInterrupt
+        return do(trainer, step)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(loop._Trainer, "_step", stops)
+        train_detector(settings)
+    run = train_detector(settings)
+    last = "checkpoints/detector-000002"
+    one, other = weights(whole / last), weights(run / last)
+    assert all(torch.equal(one[name], other[name]) for name in one if "num_batches" not in name)
+    assert [line["step"] for line in lines(run) if "loss" in line] == [1, 2]
+
+
+TRAIN = """
+import json, os, signal, sys
+from pathlib import Path
+from openvima.detector import config as sizes
+from openvima.detector.config import DetectorConfig
+from openvima.training.detector import DetectorTrainingConfig, learner, train_detector
+
+tiny, settings = json.loads(sys.argv[1])
+sizes.DETECTORS["small"] = lambda: DetectorConfig.from_dict(tiny)
+write, calls = learner.write_network, []
+
+def dying(*arguments):
+    calls.append(arguments)
+    write(*arguments)
+    if len(calls) == 2:  # metrics and weights are written, the optimizer's state is not
+        os.kill(os.getpid(), signal.SIGKILL)
+
+learner.write_network = dying
+folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
+train_detector(DetectorTrainingConfig(**folders, **settings))
+"""
+
+
+def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
+    plain = {
+        name: str(value) if isinstance(value, Path) else value for name, value in asdict(settings).items()
+    }
+    argument = json.dumps([tiny.to_dict(), plain])
+    killed = subprocess.run([sys.executable, "-c", TRAIN, argument], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    assert load_network(settings.out).config == tiny
+    run, whole = train_detector(settings), train_detector(replace(settings, out=tmp_path / "whole"))
+    for file in (whole / "checkpoints").rglob("*.safetensors"):
+        ours, theirs = load_file(run / file.relative_to(whole)), load_file(file)
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {
+        path.name for path in (whole / "checkpoints").iterdir()
+    }
+    assert (run / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
+
+
+def test_other_settings_do_not_continue_a_run(settings):
+    train_detector(settings)
+    with pytest.raises(ConfigError, match=r"learning_rate is 0\.001 there and 0\.01 here"):
+        train_detector(replace(settings, learning_rate=0.01))
+    train_detector(replace(settings, learning_rate=0.01, force=True))
+
+
+def test_training_begins_with_the_weights_of_another_detector(settings, tiny, tmp_path):
+    torch.manual_seed(5)
+    first = MaskRCNN(replace(tiny, proposals=7))
+    save_network(first, tmp_path / "first")
+    run = train_detector(replace(settings, init=tmp_path / "first", learning_rate=0.0))
+    assert load_network(run).config.proposals == 7
+    assert torch.equal(weights(run)["box_head.kinds.weight"], first.state_dict()["box_head.kinds.weight"])
+
+
+def test_every_demonstration_is_on_one_side_and_stays_there(data):
+    dataset = Dataset(data)
+    training, held_out = split_episodes(dataset, 0.4)
+    assert sorted([*training, *held_out]) == list(range(len(dataset)))
+    assert set(split_episodes(dataset, 0.2)[1]) <= set(held_out)
+
+
+def test_too_few_demonstrations_are_told(settings):
+    with pytest.raises(DatasetError, match="a batch of 400 frames needs 200"):
+        train_detector(replace(settings, batch=400))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"preset": "smal"}, "Did you mean 'small'"),
+        ({"batch": 5}, "must be even"),
+        ({"batch": 4.0}, "batch is 4.0; it must be a whole number"),
+        ({"learning_rate": "high", "augment": 1}, r"learning_rate is 'high'.*augment is 1; .* true or false"),
+        ({"learning_rate": float("nan")}, "learning_rate is nan; it must be between 0 and 1"),
+        ({"clip_norm": 0.0}, "clip_norm is 0"),
+        ({"preset": None}, "preset is None; it must be text"),
+        ({"learning_rate": -1.0, "steps": 0}, r"steps is 0.*learning_rate is -1"),
+    ],
+)
+def test_settings_that_cannot_be_are_told(data, tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        DetectorTrainingConfig(data, tmp_path, **changes)

@@ -1,0 +1,155 @@
+"""What is played: tasks, levels, seeds, batches, and the names of policies."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from openvima.errors import (
+    CheckpointError,
+    ConfigError,
+    LevelError,
+    UnknownPolicyError,
+    UnknownTaskError,
+)
+from openvima.evaluation.config import EvaluationConfig, cells, plan
+from openvima.evaluation.sources import policy_sources, weights_hash
+
+
+def test_every_seed_is_played_once_in_batches_of_the_given_size():
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=37, seed=100, batch=16)
+    batches = plan(config)
+    assert [batch.episodes for batch in batches] == [16, 16, 5]
+    assert [seed for batch in batches for seed in batch.seeds] == list(range(100, 137))
+
+
+def test_batches_do_not_depend_on_the_number_of_workers():
+    one, three = (EvaluationConfig(("oracle", "random"), workers=workers) for workers in (1, 3))
+    assert plan(one) == plan(three)
+    assert one.record() == three.record()
+
+
+def test_another_device_is_recorded_and_makes_other_batches():
+    usual, other = (EvaluationConfig(("untrained",), device=device) for device in ("cpu", "cuda"))
+    assert "device" not in usual.record()
+    assert other.record() == {**usual.record(), "device": "cuda"}
+    assert {batch.device for batch in plan(other)} == {"cuda"}
+    assert plan(usual)[0].key("same") != plan(other)[0].key("same")
+
+
+def test_all_takes_from_each_level_the_tasks_that_it_holds():
+    pairs = cells(EvaluationConfig(("oracle",), levels=("L1", "L3")))
+    assert ("sweep_without_exceeding", "L1") in pairs
+    assert ("sweep_without_exceeding", "L3") not in pairs
+    assert ("rotate", "L3") in pairs
+
+
+def test_a_named_task_is_left_out_only_at_levels_without_it():
+    tasks = ("rotate", "sweep_without_exceeding")
+    pairs = cells(EvaluationConfig(("oracle",), tasks, ("L2", "L3")))
+    assert pairs == [("rotate", "L2"), ("sweep_without_exceeding", "L2"), ("rotate", "L3")]
+
+
+def test_a_named_task_that_no_level_holds_is_an_error():
+    config = EvaluationConfig(("oracle",), ("rotate", "sweep_without_exceeding"), ("L3",))
+    with pytest.raises(LevelError, match="sweep_without_exceeding exists at train, L1, L2"):
+        cells(config)
+
+
+def test_an_unknown_level_is_refused_with_those_there_are():
+    with pytest.raises(LevelError, match="Allowed: train, L1"):
+        cells(EvaluationConfig(("oracle",), levels=("l1",)))
+
+
+def test_a_mistyped_task_gets_a_suggestion():
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        cells(EvaluationConfig(("oracle",), ("rotat",)))
+
+
+def test_all_problems_of_the_settings_are_named_together():
+    with pytest.raises(ConfigError, match=r"episodes is 0.*workers is -1.*policy is empty"):
+        EvaluationConfig((), episodes=0, workers=-1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"controls": ("no_promt",)}, "Did you mean 'no_prompt'"),
+        ({"controls": ("detected_boxes",)}, "needs a detector"),
+        ({"boxes": "extractor:make"}, "only the control detected_boxes"),
+        ({"precision": "float16"}, "allowed are float64, float32, bfloat16"),
+        ({"engine": "threads"}, "allowed are processes and ray"),
+        ({"address": "10.0.0.1:6379"}, "only 'ray' takes one"),
+        ({"film": ("rotate/3",), "report": False}, "no report is asked for"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        EvaluationConfig(("untrained",), **settings)
+
+
+def test_each_control_is_played_by_the_policies_that_it_takes_something_from():
+    config = EvaluationConfig(("mine=runs/a", "random"), ("rotate",), ("L1",), episodes=1, controls=("all",))
+    played = [(batch.policy, batch.control) for batch in plan(config)]
+    mine = ("", "no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects")
+    assert played == [*(("mine", control) for control in mine), ("random", ""), ("oracle", "")]
+    assert config.record()["policies"] == ["mine", "random", "oracle"]
+
+
+def test_boxes_are_detected_under_their_control_only_and_not_by_servers():
+    policies = ("mine=runs/a", "far=ws://127.0.0.1:8000")
+    config = EvaluationConfig(policies, ("rotate",), ("L1",), 1, controls=("all",), boxes="extractor.py:make")
+    detected = [batch for batch in plan(config) if batch.boxes]
+    assert [(batch.policy, batch.control) for batch in detected] == [("mine", "detected_boxes")]
+    (trained,) = (replace(batch, boxes="detector=run").with_whole_paths().boxes for batch in detected)
+    assert trained == f"detector={Path('run').absolute()}"
+    (moved,) = (batch.with_whole_paths().boxes for batch in detected)
+    assert moved.endswith("/extractor.py:make")
+
+
+def test_a_control_that_changes_nothing_for_any_policy_is_an_error():
+    with pytest.raises(ConfigError, match="no_prompt changes nothing for oracle, random"):
+        plan(EvaluationConfig(("oracle", "random"), controls=("no_prompt",)))
+
+
+def test_run_folders_are_named_after_themselves_or_as_asked():
+    sources = policy_sources(("runs/first", "best=runs/second", "oracle", "nano"))
+    assert [source.name for source in sources] == ["first", "best", "oracle", "nano"]
+    assert [source.kind for source in sources] == ["run", "run", "oracle", "untrained"]
+
+
+def test_two_policies_of_one_name_are_refused():
+    with pytest.raises(ConfigError, match="distinct names"):
+        policy_sources(("a/run", "b/run"))
+
+
+@pytest.mark.parametrize("given", ["../up=run", "a/b=run", "=run", "a b,c=run", "/"])
+def test_names_that_are_no_file_names_are_refused(given):
+    with pytest.raises(ConfigError, match="NAME=PATH"):
+        policy_sources((given,))
+
+
+def test_an_unknown_policy_is_refused_with_the_names_there_are():
+    with pytest.raises(UnknownPolicyError, match="Did you mean 'oracle'"):
+        policy_sources(("oracel",))[0].record()
+
+
+def test_a_folder_without_weights_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="holds no weights"):
+        weights_hash(tmp_path)
+
+
+def test_the_hash_of_a_run_changes_with_its_weights_only(tmp_path):
+    (tmp_path / "model.safetensors").write_bytes(b"one")
+    first = weights_hash(tmp_path)
+    (tmp_path / "train.log").write_text("noise")
+    assert weights_hash(tmp_path) == first
+    (tmp_path / "model.safetensors").write_bytes(b"two")
+    assert weights_hash(tmp_path) != first
+
+
+def test_stored_batches_of_other_weights_or_seeds_have_other_names():
+    first, second = plan(EvaluationConfig(("random",), ("rotate",), ("L1",), episodes=2, batch=1))
+    assert len({first.key("a"), first.key("b"), second.key("a")}) == 3
+    assert replace(first, control="no_prompt").key("a") != first.key("a")
+    assert replace(first, source="elsewhere").key("a") == first.key("a")

@@ -1,0 +1,44 @@
+"""A extractor that sees what the segmentation shows, but badly: as a detector does."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from openvima.perception.objects import ObjectViews, observe, observe_prompt_image, see_nothing
+from openvima.scene import PromptImage
+
+HOOK = f"{Path(__file__)}:make"
+
+
+@dataclass(frozen=True)
+class Clumsy:
+    """Moves boxes, loses every third object and ids, is blind now and then, and orders from right to left.
+
+    Args:
+        pixels: How far boxes are moved.
+    """
+
+    pixels: int = 2
+
+    def in_observation(self, observation: Mapping) -> ObjectViews:
+        """Find the objects of an observation."""
+        return self._seen(observe(observation), observation["rgb"]["front"])
+
+    def in_prompt_image(self, image: PromptImage) -> ObjectViews:
+        """Find the objects of a prompt's image."""
+        return self._seen(observe_prompt_image(image).left_to_right(), image.rgb["front"])
+
+    def _seen(self, true: ObjectViews, rgb: np.ndarray) -> ObjectViews:
+        if int(rgb.sum()) % 5 == 0:
+            return see_nothing()
+        found = true.select(np.array([slot for slot in range(len(true)) if slot % 3 != 1][::-1], np.int64))
+        found.boxes[..., :2] += self.pixels * found.masks[..., None]
+        found.ids[:] = -1
+        return found
+
+
+def make() -> Clumsy:
+    """Make one, for a hook."""
+    return Clumsy()

@@ -1,0 +1,187 @@
+"""The trained policy of the package under its name. Most tests put a small network in its place."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.cli import quickstart  # noqa: E402
+from openvima.cli.main import main  # noqa: E402
+from openvima.env.config import DEFAULT_SETUP  # noqa: E402
+from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError  # noqa: E402
+from openvima.evaluation import Results, report_assets  # noqa: E402
+from openvima.evaluation.config import Batch  # noqa: E402
+from openvima.evaluation.report_assets import find_metrics  # noqa: E402
+from openvima.evaluation.rollout import play  # noqa: E402
+from openvima.evaluation.rollout_policies import PolicyPlayer  # noqa: E402
+from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
+from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.base import CHECKPOINTS_FOLDER, Policy, find_checkpoint  # noqa: E402
+from openvima.policies.bundled import MODEL_CARD, PACKAGED, SMALL  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.training import TrainingConfig  # noqa: E402
+from openvima.training.building import build_learner  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
+
+
+@pytest.fixture
+def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of a small network in float16 that stands in for the policy of the package.
+
+    The working directory is another, empty one.
+    """
+    folder, elsewhere = tmp_path / "package", tmp_path / "elsewhere"
+    save_checkpoint(build_network(narrow_small(), seed=5), folder, dtype=torch.float16)
+    (folder / MODEL_CARD).write_text("# A card")
+    monkeypatch.setitem(PACKAGED, SMALL, replace(PACKAGED[SMALL], folder=folder))
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    return folder
+
+
+def test_it_is_loaded_by_its_name_and_never_computes_in_float16(packaged: Path, demonstrations) -> None:
+    expected = load_checkpoint(packaged).state_dict()
+    for load in (load_policy, NetworkPolicy.from_pretrained, Policy.from_pretrained):
+        policy = load(SMALL)
+        floats = [
+            t for t in [*policy.network.parameters(), *policy.network.buffers()] if t.is_floating_point()
+        ]
+        assert {tensor.dtype for tensor in floats} == {torch.float64}
+        assert all(
+            torch.equal(tensor, expected[name]) for name, tensor in policy.network.state_dict().items()
+        )
+    assert load_policy(SMALL, dtype=torch.float32).network.query.dtype == torch.float32
+    seen = set()
+    for module in policy.network.modules():
+        module.register_forward_pre_hook(
+            lambda _, given: seen.update(
+                t.dtype for t in given if isinstance(t, torch.Tensor) and t.is_floating_point()
+            )
+        )
+    policy.reset([demonstrations[0].prompt])
+    policy.act([demonstrations[0].observation(0)])
+    assert seen == {torch.float64}
+
+
+def test_storing_in_float16_and_then_in_float32_changes_nothing(packaged: Path, demonstrations) -> None:
+    assert main(["policies", "convert", SMALL, "wide"]) == 0
+    actions = []
+    for policy in (load_policy(SMALL), load_policy("wide")):
+        policy.reset([demonstrations[0].prompt])
+        actions.append(policy.act([demonstrations[0].observation(0)])[0])
+    assert all(np.array_equal(actions[0][key], actions[1][key]) for key in actions[0])
+
+
+def test_an_unknown_name_is_told_the_name_of_the_package(packaged: Path) -> None:
+    with pytest.raises(
+        UnknownPolicyError, match=r"Did you mean 'openvima-small'\?.*openvima-small, a preset"
+    ):
+        load_policy("openvima-smal")
+    with pytest.raises(UnknownPolicyError, match="oracle, random, untrained, openvima-small"):
+        weights_hash("something")
+    with pytest.raises(CheckpointError, match="openvima-small"):
+        find_checkpoint("something")
+
+
+def test_without_its_weights_the_message_says_where_they_belong(packaged: Path, capsys) -> None:
+    (packaged / "model.safetensors").unlink()
+    for work in (load_policy, weights_hash, find_checkpoint):
+        with pytest.raises(CheckpointError, match=f"lacks the weights of 'openvima-small'.*{packaged}"):
+            work(SMALL)
+    assert main(["policies", "--json"]) == 0
+    assert SMALL not in capsys.readouterr().out
+    assert main(["quickstart"]) == 2
+    assert "lacks the weights" in capsys.readouterr().err
+    assert not list(Path().iterdir())
+
+
+def test_a_checkpoint_here_of_the_same_name_is_not_mistaken_for_it(packaged: Path) -> None:
+    save_checkpoint(build_network(narrow_small(), seed=6), f"run/{CHECKPOINTS_FOLDER}/000001")
+    Path("run").rename(SMALL)
+    with pytest.raises(PolicyError, match=r"write \./openvima-small for the folder"):
+        load_policy(SMALL)
+    here = load_policy(f"./{SMALL}").network.query
+    assert torch.equal(here.float(), build_network(narrow_small(), seed=6).query)
+    assert weights_hash(f"./{SMALL}") == weights_hash(Path(SMALL)) != weights_hash(packaged)
+
+
+def test_other_folders_and_files_here_do_not_stand_in_for_it(packaged: Path) -> None:
+    Path(SMALL).mkdir()
+    Path(SMALL, "metrics.jsonl").write_text("{}")
+    Path("metrics.jsonl").write_text("{}")
+    load_policy(SMALL)
+    batch = Batch(SMALL, SMALL, "rotate", "L1", first_seed=0, episodes=1)
+    assert batch.with_whole_paths().source == SMALL
+    assert find_metrics(policy_sources((SMALL,))) is None
+
+
+def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(packaged: Path, capsys) -> None:
+    policies = f"{SMALL},mine={SMALL},copy={packaged}"
+    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--videos", "0", "--out", SMALL]
+    assert main(["evaluate", "--policy", policies, *words]) == 0
+    results = Results.read(Path(SMALL, "results.json"))
+    sha = weights_hash(packaged)
+    own = {"kind": "run", "packaged": SMALL, "sha256": sha}
+    assert results.policies == {SMALL: own, "mine": own, "copy": {"kind": "run", "sha256": sha}}
+    first, *others = (results.row(name, "rotate", "L1").outcomes for name in results.policies)
+    assert all(other == first for other in others)
+    assert main(["report", SMALL, "--out", "again.html"]) == 0
+    assert f"--policy {SMALL},mine={SMALL},copy=RUN " in Path("again.html").read_text(encoding="utf-8")
+
+
+def test_it_is_filmed_and_listed_and_shown(packaged: Path, capsys) -> None:
+    assert main(["demo", "rotate", "--policy", SMALL, "--out", "film.mp4"]) == 0
+    assert Path("film.mp4").stat().st_size > 0
+    size = (packaged / "model.safetensors").stat().st_size
+    capsys.readouterr()
+    for words in (["list"], ["show", SMALL]):
+        assert main(["policies", *words]) == 0
+        shown = capsys.readouterr().out
+        for text in (f"{size / 1e6:.1f} MB", PACKAGED[SMALL].trained_on, str(packaged / MODEL_CARD)):
+            assert text in shown
+    assert main(["policies", "list", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)[-1]
+    assert (record["name"], record["bytes"]) == (SMALL, size)
+    assert record["model_card"] == str(packaged / MODEL_CARD)
+
+
+def test_training_begins_with_it(packaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(presets.PRESETS, "narrow", narrow_small)
+    learner = build_learner(TrainingConfig(data=Path("data"), out=Path("out"), preset="narrow", init=SMALL))
+    expected = load_checkpoint(packaged).state_dict()
+    weights = learner.network.state_dict()
+    assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in weights.items())
+
+
+def test_quickstart_scores_it_beside_the_policy_that_it_trains(
+    packaged: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.setattr(quickstart, "TASKS", ("rotate",))
+    monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
+    monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
+    monkeypatch.setattr(quickstart, "_train", lambda *_: packaged)
+    monkeypatch.setattr(report_assets, "film_jobs", lambda *_: [])  # other tests film
+    assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
+    shown = capsys.readouterr().out.splitlines()
+    names = ["trained", SMALL, "oracle", "untrained", "random"]
+    assert [line.split()[0] for line in shown] == [*names, "Report:"]
+    assert len({line.index("L1") for line in shown[:-1]}) == 1
+    assert list(Results.read(Path("quick", "results.json")).policies) == names
+    assert SMALL in Path("quick", "report.html").read_text(encoding="utf-8")
+
+
+def test_the_weights_of_the_package_solve_tasks_with_novel_objects() -> None:
+    policy = load_policy(SMALL)
+    assert sum(parameter.numel() for parameter in policy.network.parameters()) <= 10_000_000
+    solved = []
+    for task in ("visual_manipulation", "rotate", "rearrange"):
+        envs = [DEFAULT_SETUP.make(task, "L3", domain="user") for _ in range(4)]
+        solved += [outcome.success for outcome in play(envs, range(4), PolicyPlayer(policy))]
+    assert sum(solved) >= 9

@@ -1,0 +1,362 @@
+"""Acting with what was read before gives what reading everything anew gives, whatever the batch."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
+from openvima.perception.image_stack import ImageStack  # noqa: E402
+from openvima.perception.objects import GroundTruth, observe  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
+from openvima.policies.inference import NetworkPolicy, drawing  # noqa: E402
+from openvima.policies.inputs import batch_histories, batch_prompts  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.trunk import MAX_PLACES  # noqa: E402
+from openvima.scene import RenderedPrompt  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
+
+NAMES = ("nano", "nano-bins", "small", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano")
+LENGTHS = (8, 3, 5, 8)  # steps of the episodes that are played together
+
+
+def network_of(name: str) -> PolicyNetwork:
+    """A network whose outputs depend visibly on everything; fresh heads start near zero."""
+    network = build_network(narrow_small() if name == "small" else preset(name), seed=3)
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def policy(request) -> NetworkPolicy:
+    """One policy in double precision for each kind of network; every test resets it."""
+    return NetworkPolicy(network_of(request.param))
+
+
+@pytest.fixture(scope="module")
+def pool(demonstrations) -> list[dict]:
+    """Observations of several tasks, with different numbers of objects."""
+    return [demo.observation(t) for demo in demonstrations for t in range(demo.num_steps + 1)]
+
+
+@pytest.fixture(scope="module")
+def prompts(demonstrations) -> list[RenderedPrompt]:
+    """Four prompts of different lengths."""
+    return [demonstrations[row].prompt for row in (0, 2, 4, 1)]
+
+
+def seen_by(row: int, step: int, pool: Sequence[dict]) -> dict:
+    return pool[(5 * row + 3 * step) % len(pool)]
+
+
+def batch_at(step: int, rows: Sequence[int], pool: Sequence[dict]) -> list[dict | None]:
+    return [seen_by(row, step, pool) if step < LENGTHS[row] else None for row in rows]
+
+
+def vector(action: dict[str, np.ndarray]) -> np.ndarray:
+    return np.concatenate([action[key] for key in ACTION_PARTS])
+
+
+@contextmanager
+def recorded_heads(policy: NetworkPolicy) -> Iterator[list[HeadInputs]]:
+    """Collect what the head is given at each step."""
+    head, given = policy.network.head, []
+    decide = head.decide
+    head.decide = lambda inputs, *choose: (given.append(inputs), decide(inputs, *choose))[1]
+    try:
+        yield given
+    finally:
+        del head.decide
+
+
+def played(policy: NetworkPolicy, prompts, pool, rows: Sequence[int] = (0, 1, 2, 3)) -> dict:
+    """Play episodes together; return (row, step) -> action and query, both as vectors."""
+    policy.reset([prompts[row] for row in rows])
+    result = {}
+    with recorded_heads(policy) as given:
+        for step in range(max(LENGTHS[row] for row in rows)):
+            actions = policy.act(batch_at(step, rows, pool))
+            running = [row for row in rows if step < LENGTHS[row]]
+            assert [row for row, action in zip(rows, actions, strict=True) if action is not None] == running
+            for place, row in enumerate(running):
+                action = actions[rows.index(row)]
+                result[row, step] = (vector(action), given[-1].query_BTD[place, 0].double().numpy())
+    return result
+
+
+@torch.no_grad()
+def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
+    """For every step of every episode read prompt and history from scratch; return (row, step) -> query."""
+    network, reader = policy.network, policy.reader
+    result = {}
+    for step in range(max(LENGTHS)):
+        rows = [row for row, length in enumerate(LENGTHS) if step < length]
+        stack = ImageStack(reader.image_size)
+        inputs = [reader.read_prompt(prompts[row]) for row in rows]
+        numbers = [stack.add(prompt.objects.crops) for prompt in inputs]
+        histories, history_numbers = [], []
+        for row in rows:
+            episode = reader.begin_episode()
+            histories.append([episode.read_step(seen_by(row, t, pool)) for t in range(step + 1)])
+            history_numbers.append([stack.add(each.objects.crops) for each in histories[-1]])
+        features = network.encode_images(torch.from_numpy(stack.stacked()))
+        memory = network.encode_prompts(batch_prompts(inputs, numbers), features)
+        taken = np.zeros((len(rows), step + 1, ACTION_WIDTH))
+        for place, row in enumerate(rows):
+            taken[place, :-1] = [actions[row, t][0] for t in range(step)] or taken[place, :-1]
+        heads = network(
+            memory, batch_histories(histories, history_numbers), features, torch.from_numpy(taken)
+        )
+        for place, row in enumerate(rows):
+            result[row, step] = heads.query_BTD[place, step].double().numpy()
+    return result
+
+
+def largest_difference(played_steps: dict, queries: dict) -> float:
+    assert played_steps.keys() == queries.keys()
+    return max(np.abs(played_steps[key][1] - queries[key]).max() for key in queries)
+
+
+def assert_same_actions(some: dict, others: dict) -> None:
+    for key, (action, _) in some.items():
+        np.testing.assert_array_equal(action, others[key][0], err_msg=f"episode and step {key}")
+
+
+def test_keeping_what_was_read_changes_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
+    steps = played(policy, prompts, pool)
+    assert len({len(policy.reader.read_prompt(prompt).words) for prompt in prompts}) > 2
+    assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-9
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_single_precision_it_agrees_to_a_ten_thousandth(name, prompts, pool) -> None:
+    policy = NetworkPolicy(network_of(name), dtype=torch.float32)
+    steps = played(policy, prompts, pool)
+    assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-4
+
+
+def test_neither_company_nor_order_changes_an_action(policy, prompts, pool) -> None:
+    together = played(policy, prompts, pool)
+    for rows in ((3, 2, 1, 0), (2,), (1, 3)):
+        assert_same_actions(played(policy, prompts, pool, rows), together)
+
+
+def test_history_and_prompt_change_the_action(policy, prompts, pool) -> None:
+    """Without this the tests above could pass for a network that looks at nothing."""
+    policy.reset([prompts[0], prompts[1], prompts[0]])
+    with recorded_heads(policy) as given:
+        policy.act([pool[0], pool[0], pool[3]])
+        policy.act([pool[5]] * 3)
+    first, other_prompt, other_past = given[-1].query_BTD[:, 0]
+    assert (first - other_prompt).abs().max() > 1e-3
+    assert (first - other_past).abs().max() > 1e-3
+
+
+def test_images_that_did_not_change_are_encoded_once(policy, prompts, pool, monkeypatch) -> None:
+    encode, counts = policy.network.encode_images, []
+    monkeypatch.setattr(
+        policy.network, "encode_images", lambda images: (counts.append(len(images)), encode(images))[1]
+    )
+    policy.reset([prompts[0], prompts[1]])
+    counts.clear()
+    first = [vector(action) for action in policy.act([pool[0], pool[0]])]
+    policy.act([pool[0], pool[0]])
+    assert counts[0] > 0
+    assert counts[1] == 0
+    policy.reset([prompts[0], prompts[1]])
+    np.testing.assert_array_equal(first, [vector(action) for action in policy.act([pool[0], pool[0]])])
+
+
+def test_a_reset_forgets(policy, prompts, pool) -> None:
+    first = played(policy, prompts, pool, (2, 0))
+    played(policy, prompts, pool, (1,))
+    assert_same_actions(played(policy, prompts, pool, (2, 0)), first)
+
+
+def test_an_episode_that_ended_stays_ended(policy, prompts, pool) -> None:
+    policy.reset(prompts[:3])
+    policy.act(pool[:3])
+    assert [action is None for action in policy.act([pool[0], None, pool[2]])] == [False, True, False]
+    with pytest.raises(PolicyError, match="episode 1 ended with a None before; call reset"):
+        policy.act([pool[0], pool[1], pool[2]])
+    assert policy.act([None, None, None]) == [None, None, None]
+
+
+def blank(observation: dict) -> dict:
+    """The same with nothing to see."""
+    return {**observation, "segm": {view: np.zeros_like(segm) for view, segm in observation["segm"].items()}}
+
+
+def broken(observation: dict) -> dict:
+    return {**observation, "rgb": {view: rgb.astype(np.float32) for view, rgb in observation["rgb"].items()}}
+
+
+def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
+    """Each call below fails in a different place; then the episodes go on as if it had not been made."""
+    expected = played(policy, prompts, pool)
+    crowded = max(pool, key=lambda observation: len(observe(observation)))
+    policy.reset(prompts)
+    for step in range(max(LENGTHS)):
+        seen = batch_at(step, range(4), pool)
+        with pytest.raises(ShapeError, match="rgb 'front' is float32"):
+            policy.act([crowded, None, None, broken(pool[0])])
+        with pytest.raises(PolicyError, match="got 1 observations for 4 prompts"):
+            policy.act(seen[:1])
+        with pytest.raises(PromptError, match="the prompt is empty"):
+            policy.reset([prompts[1], RenderedPrompt("", {})])
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="no luck"):
+            patch.setattr(
+                policy.network.head, "decide", lambda *_: (_ for _ in ()).throw(RuntimeError("no luck"))
+            )
+            policy.act([None, None, None, pool[2]] if seen[3] is not None else [None] * 4)
+        for row, action in enumerate(policy.act(seen)):
+            if action is not None:
+                np.testing.assert_array_equal(vector(action), expected[row, step][0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_half_precision_gives_valid_actions(name, prompts, pool) -> None:
+    policy = NetworkPolicy(network_of(name), dtype=torch.bfloat16)
+    for action, query in played(policy, prompts, pool).values():
+        assert np.isfinite(query).all()
+        assert ((action[[0, 6]] >= 0.25) & (action[[0, 6]] <= 0.75)).all()
+        assert (np.abs(action[[1, 7]]) <= 0.5).all()
+        assert (np.abs(action) <= 1).all()
+
+
+def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool) -> None:
+    """The grasp point is a measured place; rounding it to bfloat16 would move it by up to 2 mm."""
+    policy = NetworkPolicy(network_of("nano"), dtype=torch.bfloat16)
+    policy.reset([prompts[0]])
+    (action,) = policy.act([pool[0]])
+    grasps = policy.reader.begin_episode().read_step(pool[0]).grasps
+    assert np.abs(grasps - action["pose0_position"]).max(axis=1).min() < 1e-6
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_gpu_gives_valid_actions_and_in_single_precision_the_same_queries(
+    name, dtype, prompts, pool
+) -> None:
+    steps = played(NetworkPolicy(network_of(name), device="cuda", dtype=dtype), prompts, pool)
+    assert all(np.isfinite(action).all() and np.isfinite(query).all() for action, query in steps.values())
+    if dtype is torch.float32:
+        reference = NetworkPolicy(network_of(name))
+        assert largest_difference(steps, recomputed(reference, prompts, pool, steps)) < 1e-2
+
+
+def test_draws_follow_from_the_generator_alone_and_leave_it_alone(policy, prompts, pool) -> None:
+    generator = torch.Generator().manual_seed(11)
+    state = generator.get_state()
+    drawn = NetworkPolicy(policy.network, temperature=2.0, generator=generator)
+    together = played(drawn, prompts, pool)
+    for rows in ((3, 2, 1, 0), (2,), (1, 3)):
+        assert_same_actions(played(drawn, prompts, pool, rows), together)
+    assert torch.equal(generator.get_state(), state)
+    other = NetworkPolicy(policy.network, temperature=2.0, generator=torch.Generator().manual_seed(12))
+    others = played(other, prompts, pool)
+    assert any(not np.array_equal(others[key][0], together[key][0]) for key in together)
+
+
+def test_a_low_temperature_gives_the_likeliest_actions(policy, prompts, pool) -> None:
+    cold = NetworkPolicy(policy.network, temperature=1e-9, generator=torch.Generator().manual_seed(1))
+    assert_same_actions(played(cold, prompts, pool), played(policy, prompts, pool))
+
+
+def test_draws_have_the_distribution_of_the_scores() -> None:
+    """Chi-square over 4000 draws from five classes and a hidden one, at temperature 2."""
+    scores = torch.tensor([0.0, 3.0, 1.0, torch.finfo(torch.float32).min, 2.0, 4.0])
+    chances = torch.softmax(scores.double() / 2, dim=-1).numpy()
+    generators = [torch.Generator().manual_seed(seed) for seed in range(4000)]
+    drawn = drawing(generators, 2.0)(scores.expand(4000, 1, 6)).flatten()
+    counts = np.bincount(drawn.numpy(), minlength=6)
+    assert counts[3] == 0
+    shown = chances > 0
+    expected = 4000 * chances[shown]
+    assert ((counts[shown] - expected) ** 2 / expected).sum() < 23.5  # exceeded once in 10 000 times
+
+
+@pytest.mark.parametrize(("temperature", "generator"), [(-1.0, torch.Generator()), (0.5, None)])
+def test_a_temperature_that_makes_no_sense_is_refused(small_sizes, temperature, generator) -> None:
+    with pytest.raises(PolicyError, match=f"temperature is {temperature:g}; it must be 0, or above 0 with"):
+        NetworkPolicy(build_network(small_sizes, seed=0), temperature=temperature, generator=generator)
+
+
+def test_acting_before_a_reset_is_refused(small_sizes, pool) -> None:
+    policy = NetworkPolicy(build_network(small_sizes, seed=0))
+    with pytest.raises(PolicyError, match="no prompts yet; call reset"):
+        policy.act([pool[0]])
+
+
+def test_a_reset_without_prompts_is_refused(policy) -> None:
+    with pytest.raises(PolicyError, match="reset got no prompts"):
+        policy.reset([])
+
+
+def test_a_word_that_nobody_taught_is_refused(policy, prompts) -> None:
+    with pytest.raises(PromptError, match="'juggle'"):
+        policy.reset([replace(prompts[0], text="Juggle " + prompts[0].text)])
+
+
+def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:
+    name, _ = next(iter(prompts[0].images.items()))
+    images = {key: image for key, image in prompts[0].images.items() if key != name}
+    with pytest.raises(PromptError, match=name):
+        policy.reset([RenderedPrompt(prompts[0].text, images)])
+
+
+def test_a_prompt_longer_than_the_position_table_is_refused(policy, prompts) -> None:
+    text = "put the " * 150 + prompts[0].text
+    with pytest.raises(PolicyError, match=r"the prompt has 3\d\d tokens; this policy takes 256"):
+        policy.reset([prompts[1], RenderedPrompt(text, prompts[0].images)])
+
+
+def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
+    policy.reset([prompts[0]])
+    with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_PLACES}"):
+        for _ in range(MAX_PLACES):
+            policy.act([pool[-1]])
+
+
+class Doubled(GroundTruth):
+    """Finds every object a hundred times."""
+
+    def in_observation(self, observation):
+        found = super().in_observation(observation)
+        return found.select(np.tile(np.arange(len(found)), 600 // len(found) + 1))
+
+
+@pytest.mark.parametrize(("name", "limit"), [("nano", 511), ("vima-nano", 255)])
+def test_more_objects_than_fit_are_refused(name, limit, prompts, pool) -> None:
+    policy = NetworkPolicy(network_of(name), extractor=Doubled())
+    policy.reset([prompts[0]])
+    with pytest.raises(PolicyError, match=rf"shows 6\d\d objects; this policy takes {limit}"):
+        policy.act([pool[0]])
+
+
+def test_an_observation_without_objects_is_refused_where_objects_are_what_is_seen(
+    policy, prompts, pool
+) -> None:
+    policy.reset([prompts[0]])
+    if policy.reader.layout == "frames":
+        assert policy.act([blank(pool[0])]) != [None]
+        return
+    with pytest.raises(PolicyError, match="shows no object"):
+        policy.act([blank(pool[0])])
+
+
+def test_frames_of_another_size_are_refused(policy, prompts, pool) -> None:
+    policy.reset([prompts[0]])
+    small = {view: np.ascontiguousarray(rgb[:, :64]) for view, rgb in pool[0]["rgb"].items()}
+    segm = {view: np.ascontiguousarray(segm[:64]) for view, segm in pool[0]["segm"].items()}
+    with pytest.raises(ShapeError, match=r"64, 256\)"):
+        policy.act([{**pool[0], "rgb": small, "segm": segm}])

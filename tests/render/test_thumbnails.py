@@ -1,0 +1,116 @@
+"""Large pictures of single objects, and the page that shows them all."""
+
+import html
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from openvima.catalog import OBJECTS, TEXTURES, load_assets
+from openvima.catalog.procedural import ProceduralAssets
+from openvima.errors import AssetError
+from openvima.render import Rasteriser, gallery
+from openvima.render.gallery import PICTURES, write_gallery
+from openvima.render.thumbnails import draw_portrait
+
+
+@pytest.fixture(scope="module")
+def rasteriser() -> Rasteriser:
+    return Rasteriser(load_assets())
+
+
+@pytest.mark.parametrize("view", ["front", "top"])
+@pytest.mark.parametrize("name", list(OBJECTS))
+def test_every_object_fills_its_portrait_and_none_is_cut_off(rasteriser, name, view) -> None:
+    opacity = draw_portrait(rasteriser, name, "tiger", view)[..., 3]
+    assert opacity.shape == (240, 320)
+    border = np.concatenate([opacity[0], opacity[-1], opacity[:, 0], opacity[:, -1]])
+    assert not border.any()
+    rows, columns = np.flatnonzero(opacity.any(axis=1)), np.flatnonzero(opacity.any(axis=0))
+    assert max(np.ptp(rows) / 240, np.ptp(columns) / 320) > 0.85
+    assert abs(rows[0] + rows[-1] - 239) <= 2 and abs(columns[0] + columns[-1] - 319) <= 2
+
+
+def test_a_portrait_has_the_lit_colours_of_its_texture(rasteriser) -> None:
+    picture = draw_portrait(rasteriser, "block", "red", "top", detail=2)
+    assert picture.shape == (480, 640, 4)
+    assert picture[240, 320].tolist() == [239, 81, 83, 255]  # 0.93967 of red, as light from above gives
+    assert picture[5, 5].tolist() == [0, 0, 0, 0]
+
+
+def test_letters_stand_upright_and_a_hole_is_transparent(rasteriser) -> None:
+    letter = draw_portrait(rasteriser, "letter A", "blue", "top")[..., 3]
+    assert letter[:80].astype(bool).sum() < letter[160:].astype(bool).sum()  # narrow above, wide below
+    assert draw_portrait(rasteriser, "ring", "blue", "top")[120, 160, 3] == 0
+
+
+class _Incomplete(ProceduralAssets):
+    """A pack without tiger fur and hearts."""
+
+    def texture(self, texture_name: str) -> np.ndarray:
+        if texture_name == "tiger":
+            raise AssetError("textures/tiger.jpg is missing")
+        return super().texture(texture_name)
+
+    def geometry(self, object_name, size, scale=(1.0, 1.0, 1.0)):
+        if object_name == "heart":
+            raise AssetError("kitting/heart.obj is missing")
+        return super().geometry(object_name, size, scale)
+
+
+@pytest.fixture
+def quick_portraits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Portraits of one pixel that still need shape and texture."""
+
+    def one_pixel(rasteriser, object_name, texture_name, view, *, detail) -> np.ndarray:
+        rasteriser.assets.geometry(object_name, OBJECTS[object_name].size_max)
+        rasteriser.assets.texture(texture_name)
+        return np.zeros((1, 1, 4), np.uint8)
+
+    monkeypatch.setattr(gallery, "draw_portrait", one_pixel)
+
+
+def test_the_page_names_every_object_and_texture_and_all_its_pictures_exist(
+    tmp_path, quick_portraits
+) -> None:
+    seen = []
+    page, problems = write_gallery(
+        tmp_path, load_assets(), report=lambda done, total, _: seen.append((done, total))
+    )
+    assert problems == ()
+    assert page == tmp_path / "index.html"
+    text = html.unescape(page.read_text(encoding="utf-8"))
+    titles = re.findall(r'<article class="card" id="[^"]+"><h3>([^<]+)</h3>', text)
+    assert titles[: len(OBJECTS)] == list(OBJECTS)
+    assert sorted(titles[len(OBJECTS) :]) == sorted([*TEXTURES, "gray"])
+    sources = re.findall(r'<img src="([^"]+)"', text)
+    assert len(sources) == len(OBJECTS) * 8 + (len(TEXTURES) + 1) * 2
+    assert {f"{PICTURES}/{file.name}" for file in (tmp_path / PICTURES).iterdir()} == set(sources)
+    assert seen[-1] == (len(OBJECTS) + len(TEXTURES) + 1,) * 2
+    assert "http" not in text.replace("http://www.w3.org", "")
+
+
+def test_the_page_says_where_things_are_used(tmp_path, quick_portraits) -> None:
+    text = write_gallery(tmp_path, load_assets())[0].read_text(encoding="utf-8")
+    cards = {card.split("</h3>")[0].split("<h3>")[1]: card for card in text.split("<article")[1:]}
+    assert 'class="on" title="visual_manipulation' not in cards["pallet"].split("L3")[0]
+    assert "used by no task" in cards["disk"] and "used by no task" not in cards["pallet"]
+    assert "D_train" in cards["letter A"] and "9.0 × 10.3 × 3.3 cm" in cards["letter A"]
+    assert "78, 121, 167" in cards["blue"] and "C2" in cards["blue"]
+    assert "256 × 256 pixels" in cards["tiger"]
+
+
+def test_swatches_show_the_whole_texture_in_a_bounded_size(tmp_path, quick_portraits) -> None:
+    write_gallery(tmp_path, load_assets())
+    with Image.open(tmp_path / PICTURES / "texture-polka-dot.png") as swatch:
+        assert swatch.size == (288, 240)
+    with Image.open(tmp_path / PICTURES / "texture-blue.png") as swatch:
+        assert swatch.getcolors() == [(swatch.width * swatch.height, (78, 121, 167))]
+
+
+def test_what_a_pack_lacks_is_reported_and_the_rest_is_shown(tmp_path, quick_portraits) -> None:
+    page, problems = write_gallery(tmp_path, _Incomplete())
+    assert set(problems) == {"textures/tiger.jpg is missing", "kitting/heart.obj is missing"}
+    text = page.read_text(encoding="utf-8")
+    assert "texture tiger is missing" in text and 'id="heart"' in text

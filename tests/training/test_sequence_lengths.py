@@ -1,0 +1,85 @@
+"""Demonstrations that are too long for a network are named before it learns from any."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data import Dataset  # noqa: E402
+from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.errors import DatasetError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.nn import trunk  # noqa: E402
+from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
+from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.dataset import input_kind  # noqa: E402
+from openvima.training.inverse_dynamics import as_motion  # noqa: E402
+
+NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def case(request, data):
+    """A cache, a network and its reader."""
+    sizes = preset(request.param)
+    reader = Reader.of(sizes.images)
+    return open_object_cache(Dataset(data), input_kind(reader)), build_network(sizes, seed=0), reader
+
+
+def num_places(tokens, reader) -> int:
+    return len(Collator(reader)._prompt(tokens).places.words)
+
+
+def test_widths_are_those_of_the_episodes(case) -> None:
+    cache, _, _ = case
+    expected = [
+        (max(tokens.prompt_counts, default=0), max(*tokens.steps[:, 0], len(tokens.final)))
+        for tokens in cache
+    ]
+    np.testing.assert_array_equal(cache.widths(), expected)
+
+
+@pytest.mark.parametrize("is_motion", [False, True])
+def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
+    cache, _, reader = case
+    prompt, whole = sequence_lengths._at_most(cache, reader, is_motion)
+    episodes = [as_motion(tokens) if is_motion else tokens for tokens in cache]
+    found = np.array([num_places(tokens, reader) for tokens in episodes])
+    assert (found <= prompt).all() and (prompt < whole).all()
+    assert prompt.max() <= 2 * found.max()  # or else too many would be read
+
+
+def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
+    cache, network, reader = case
+    tasks, motions = ([num_places(f(t), reader) for t in cache] for f in (lambda t: t, as_motion))
+    limit = max(motions) - 1
+    for module in (sequence_lengths, trunk):
+        monkeypatch.setattr(module, "MAX_PROMPT_PLACES", limit)
+    with pytest.raises(DatasetError, match=r"^episode \d+ of \w+ read as a motion is too long to learn from"):
+        sequence_lengths.check_lengths(cache, network, reader, motion_share=1.0)
+    if max(tasks) <= limit:
+        sequence_lengths.check_lengths(cache, network, reader)
+        with pytest.raises(DatasetError, match="read as a motion"):
+            sequence_lengths.check_lengths(cache, network, reader, motion_share=0.5)
+
+
+def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
+    for module in (sequence_lengths, trunk):
+        monkeypatch.setattr(module, "MAX_PLACES", 30)
+    config = TrainingConfig(
+        **{**settings, "preset": "midas-nano", "pretraining_steps": 0, "checkpoint_every": 1}
+    )
+    with pytest.raises(DatasetError, match=r"of sweep_without_exceeding is too long .* takes 30\. .*--tasks"):
+        train(config)
+    assert not list(config.out.glob("checkpoints/*"))
+
+
+def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
+    cache, network, reader = case
+    monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_PLACES", 1)  # so that all are read
+    before = torch.get_rng_state()
+    sequence_lengths.check_lengths(cache, network.train(), reader, motion_share=0.5)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(parameter.grad is None for parameter in network.parameters())
