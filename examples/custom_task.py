@@ -28,7 +28,9 @@ POOLS: dict[Level, Pool] = {
 }
 
 
-@register_task("put_between", family="spatial_relations", template=TEMPLATE, oracle_max_steps=2, pools=POOLS)
+@register_task(
+    "put_between", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=2, pools=POOLS
+)
 def sample(table: TableSampler, *, tolerance_m: float = TOLERANCE.position_m) -> Problem:
     """Sample one problem; keyword arguments are the task's options."""
 

@@ -40,6 +40,17 @@ def test_a_task_describes_itself(task: str) -> None:
     assert spec.max_steps == spec.oracle_max_steps + 2
 
 
+def test_the_families_are_those_of_the_paper() -> None:
+    assert {task_spec(task).family for task in TASKS} == {
+        "simple_object_manipulation",
+        "visual_goal_reaching",
+        "novel_concept_grounding",
+        "one_shot_video_imitation",
+        "visual_constraint_satisfaction",
+        "visual_reasoning",
+    }
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_every_prompt_follows_the_template(task: str) -> None:
     spec = task_spec(task)

@@ -30,7 +30,7 @@ NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
 
 @register_task(
     "follow_motion",
-    family="one_shot_imitation",
+    family="one_shot_video_imitation",
     template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
     oracle_max_steps=NUM_FRAMES["easy"] - 1,
 )

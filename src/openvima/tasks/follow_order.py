@@ -34,7 +34,7 @@ Stacks = tuple[tuple[int, ...], ...]
 
 @register_task(
     "follow_order",
-    family="one_shot_imitation",
+    family="one_shot_video_imitation",
     template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
     oracle_max_steps=NUM_FRAMES["easy"] + 1,
 )

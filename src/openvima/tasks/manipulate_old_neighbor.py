@@ -36,7 +36,7 @@ NUM_COLUMNS = {"easy": 2, "medium": 3, "hard": 4}
 NUM_EMPTY = {"easy": 1, "medium": 3, "hard": 4}
 
 
-@register_task("manipulate_old_neighbor", family="require_memory", template=TEMPLATE, oracle_max_steps=4)
+@register_task("manipulate_old_neighbor", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=4)
 def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 

@@ -29,7 +29,7 @@ class TaskSpec:
 
     Args:
         name: Name as in "rotate".
-        family: Group under which results are usually reported.
+        family: Group of the paper under which results are reported, as in "visual_reasoning".
         template: The prompt with its slots, as documentation.
         end_effector: "suction" or "spatula".
         pools: What the task may draw from, for each level at which it is defined.
@@ -101,7 +101,7 @@ def register_task(
 
     Args:
         name: Name of the task.
-        family: Group under which results are usually reported.
+        family: Group of the paper under which results are reported, as in "visual_reasoning".
         template: The prompt with its slots.
         oracle_max_steps: Steps within which the oracle must be done.
         end_effector: Tool of the arm.

@@ -18,7 +18,7 @@ from openvima.tasks.table import TableSampler
 TEMPLATE = "Put all objects with the same profile as {base_obj} into it."
 
 
-@register_task("same_shape", family="require_reasoning", template=TEMPLATE, oracle_max_steps=4)
+@register_task("same_shape", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=4)
 def sample(
     table: TableSampler,
     *,

@@ -15,7 +15,7 @@ from openvima.tasks.table import TableSampler
 TEMPLATE = "Put all objects with the same texture as {base_obj} into it."
 
 
-@register_task("same_texture", family="require_reasoning", template=TEMPLATE, oracle_max_steps=4)
+@register_task("same_texture", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=4)
 def sample(
     table: TableSampler,
     *,

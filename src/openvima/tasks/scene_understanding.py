@@ -16,7 +16,9 @@ from openvima.tasks.table import TableSampler
 TEMPLATE = "Put the {dragged_texture} object in {scene} into the {base_texture} object."
 
 
-@register_task("scene_understanding", family="simple_manipulation", template=TEMPLATE, oracle_max_steps=3)
+@register_task(
+    "scene_understanding", family="simple_object_manipulation", template=TEMPLATE, oracle_max_steps=3
+)
 def sample(
     table: TableSampler,
     *,

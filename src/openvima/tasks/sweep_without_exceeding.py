@@ -22,7 +22,7 @@ DISTRACTOR_SPREAD_M = 0.09
 
 @register_task(
     "sweep_without_exceeding",
-    family="constraint_satisfaction",
+    family="visual_constraint_satisfaction",
     template=TEMPLATE,
     end_effector="spatula",
     oracle_max_steps=8,

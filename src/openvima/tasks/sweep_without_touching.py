@@ -23,7 +23,7 @@ DISTRACTOR_SPREAD_M = 0.18
 
 @register_task(
     "sweep_without_touching",
-    family="constraint_satisfaction",
+    family="visual_constraint_satisfaction",
     template=TEMPLATE,
     end_effector="spatula",
     oracle_max_steps=14,
