@@ -41,6 +41,7 @@ from openvima.data.records import package_versions
 from openvima.data.schema import ARRAYS, VIEWS
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError, SamplingError
+from openvima.render import channels_last
 from openvima.tasks import list_tasks
 from sim import circumstances
 
@@ -193,12 +194,12 @@ def write_files(folder: Path, demo: Demonstration, layout: str) -> None:
     for view in VIEWS:
         (folder / f"rgb_{view}").mkdir(parents=True)
         for step, image in enumerate(demo.rgb[view]):
-            Image.fromarray(np.moveaxis(image, 0, -1)).save(folder / f"rgb_{view}" / f"{step}.{kind}")
+            Image.fromarray(channels_last(image)).save(folder / f"rgb_{view}" / f"{step}.{kind}")
         if layout == "png_all":
             for step, ids in enumerate(demo.segm[view]):
                 Image.fromarray(ids).save(folder / f"segm_{view}_{step}.png")
             for name, image in shown.items():
-                Image.fromarray(np.moveaxis(image.rgb[view], 0, -1)).save(folder / f"{name}_rgb_{view}.png")
+                Image.fromarray(channels_last(image.rgb[view])).save(folder / f"{name}_rgb_{view}.png")
                 Image.fromarray(image.segm[view]).save(folder / f"{name}_segm_{view}.png")
     is_raw = layout != "png_all"
     actions = [action.to_arrays() for action in demo.actions]

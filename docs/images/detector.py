@@ -20,6 +20,7 @@ from openvima.detector.masks import cut_masks, paste_masks
 from openvima.detector.matching import match
 from openvima.detector.proposals import BACKGROUND_OVERLAP
 from openvima.detector.roi_align import box_levels
+from openvima.render import channels_last
 from openvima.render.camera import FRONT
 from openvima.scene import FIRST_OBJECT_ID
 
@@ -103,7 +104,7 @@ def draw() -> Figure:
     with rc_context(STYLE):
         figure = Figure(figsize=(13.5, 2.7), layout="constrained")
         for axes, step in zip(figure.subplots(1, 3), (draw_anchors, draw_grids, draw_masks), strict=True):
-            axes.imshow(shown.rgb.transpose(1, 2, 0), extent=(0, FRONT.width, FRONT.height, 0))
+            axes.imshow(channels_last(shown.rgb), extent=(0, FRONT.width, FRONT.height, 0))
             step(axes, shown)
             axes.set_axis_off()
     return figure

@@ -23,6 +23,7 @@ from openvima.policies.heads.bins import NUM_BINS, encode_bins
 from openvima.policies.inputs import WORD, Reader
 from openvima.policies.nn.trunk import PrefixConfig
 from openvima.policies.tokenizer import END_ID, word_ids
+from openvima.render import channels_last
 from openvima.scene import PromptImage, RenderedPrompt
 
 SEED = 21  # a scene whose objects differ in colour; any other will do
@@ -116,7 +117,7 @@ def image_token(reader: Reader, images: ObjectViews, entry: int, part: int) -> T
 
 def picture(image: np.ndarray) -> np.ndarray:
     """Turn (3, height, width) into (height, width, 3)."""
-    return image.transpose(1, 2, 0)
+    return channels_last(image)
 
 
 # Drawing.

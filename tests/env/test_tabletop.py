@@ -18,6 +18,7 @@ from openvima.errors import (
     SamplingError,
     UnknownTaskError,
 )
+from openvima.render import channels_first
 from openvima.scene import Action, Outcome
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
@@ -351,8 +352,8 @@ def test_rendering_shows_both_views() -> None:
     env = TabletopEnv("rotate", render_mode="rgb_array")
     observation, _ = env.reset(seed=0)
     image = env.render()
-    assert np.array_equal(np.moveaxis(image[:128], -1, 0), observation["rgb"]["front"])
-    assert np.array_equal(np.moveaxis(image[128:], -1, 0), observation["rgb"]["top"])
+    assert np.array_equal(channels_first(image[:128]), observation["rgb"]["front"])
+    assert np.array_equal(channels_first(image[128:]), observation["rgb"]["top"])
 
 
 def test_the_arm_is_shown_only_if_asked_for() -> None:

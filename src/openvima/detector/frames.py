@@ -10,6 +10,7 @@ from openvima.data.reader import Dataset
 from openvima.data.schema import VIEWS
 from openvima.errors import DatasetError
 from openvima.perception.objects import MIN_PIXELS
+from openvima.render import channels_first
 from openvima.scene import BACKGROUND_ID, FIRST_OBJECT_ID
 
 _NUM_IDS = 256
@@ -121,7 +122,7 @@ def _both_views(
 ) -> list[Frame]:  # Any: columns of several types
     return [
         frame_of(
-            np.ascontiguousarray(values[f"{prefix}rgb_{view}"][number].transpose(2, 0, 1)),
+            np.ascontiguousarray(channels_first(values[f"{prefix}rgb_{view}"][number])),
             values[f"{prefix}segm_{view}"][number],
             ids,
         )

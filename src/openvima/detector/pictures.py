@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 from openvima.atomic_io import atomic_write_file
 from openvima.detector.frames import Frame
 from openvima.policies.detection import Detections
+from openvima.render import channels_last
 
 COLOURS = ((0, 158, 115), (230, 159, 0), (86, 180, 233), (204, 121, 167), (240, 228, 66), (213, 94, 0))
 KNOWN, UNDER_KNOWN = (255, 255, 255), (0, 0, 0)  # one of them can be seen on any background
@@ -28,7 +29,7 @@ def draw_detections(frame: Frame, found: Detections, *, score: float = 0.5) -> I
     """
     scores = np.ones(len(found)) if found.scores is None else found.scores
     found = found.select(scores >= score)
-    rgb = frame.rgb.transpose(1, 2, 0).astype(np.float64)
+    rgb = channels_last(frame.rgb).astype(np.float64)
     for number, mask in enumerate(found.masks if found.masks is not None else ()):
         rgb[mask] = 0.55 * rgb[mask] + 0.45 * np.array(COLOURS[number % len(COLOURS)])
     height, width = rgb.shape[:2]

@@ -14,6 +14,7 @@ from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.env.object_names import ObjectNames
 from openvima.errors import ConfigError, EpisodeError, SamplingError
+from openvima.render import channels_last
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Image, Rasteriser
 from openvima.scene import (
@@ -236,7 +237,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         if self.render_mode is None:
             return None
         images = self._images()
-        return np.concatenate([np.moveaxis(images[view].rgb, 0, -1) for view in VIEWS])
+        return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
 
     def close(self) -> None:
         """Free the simulation; a `reset` brings it back."""

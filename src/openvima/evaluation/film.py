@@ -12,6 +12,7 @@ from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import Player
 from openvima.evaluation.video import VideoWriter
+from openvima.render import channels_last
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
 from openvima.sim.arm_view import arm_drawables
@@ -46,7 +47,7 @@ class Artist:
         """
         arm = () if joints is None else arm_drawables(joints, scene.end_effector)
         images = self._rasteriser.scene(scene, views=("front",), extra=arm, enlarge=self._enlarge)
-        return np.ascontiguousarray(np.moveaxis(images["front"].rgb, 0, -1))
+        return np.ascontiguousarray(channels_last(images["front"].rgb))
 
 
 def film_episode(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from openvima.render import channels_last
 from openvima.scene import BACKGROUND_ID, PromptImage, RenderedPrompt
 
 Colour = tuple[int, int, int]
@@ -48,7 +49,7 @@ def thumbnail(image: PromptImage, height: int = 72) -> Image.Image:
     Returns:
         RGB picture of that height, with rounded corners on white.
     """
-    pixels = np.ascontiguousarray(image.rgb["front"].transpose(1, 2, 0))
+    pixels = np.ascontiguousarray(channels_last(image.rgb["front"]))
     if image.kind == "object":
         pixels = _cut_to_object(pixels, image.segm["front"])
     rows, columns = pixels.shape[:2]

@@ -1,6 +1,7 @@
 """Images of scenes: fixed cameras, a triangle rasteriser, and the map of the table from above."""
 
 from openvima.render.camera import CAMERAS, FRONT, TOP, VIEWS, Camera, View, project, unproject
+from openvima.render.image_layout import channels_first, channels_last
 from openvima.render.labels import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
 from openvima.render.rasteriser import Drawable, Image, Rasteriser
 
@@ -17,6 +18,8 @@ __all__ = [
     "Rasteriser",
     "View",
     "cell_centres",
+    "channels_first",
+    "channels_last",
     "empty_labels",
     "label_raster",
     "project",

@@ -6,6 +6,7 @@ import numpy as np
 
 from openvima.catalog import object_spec
 from openvima.catalog.geometry import TriangleMesh
+from openvima.render import channels_last
 from openvima.render.camera import View
 from openvima.render.rasteriser import Drawable, Rasteriser
 from openvima.scene import Pose, Scene
@@ -55,7 +56,7 @@ def draw_portrait(
     enlarge = 2 * detail * _SAMPLES
     image = rasteriser.scene(Scene(()), views=(view,), extra=(body,), enlarge=enlarge)[view]
     opaque = image.segm == _OBJECT_ID
-    return _smoothed(_framed(np.moveaxis(image.rgb, 0, -1), opaque, enlarge), _SAMPLES)
+    return _smoothed(_framed(channels_last(image.rgb), opaque, enlarge), _SAMPLES)
 
 
 def _framed(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 from openvima.data.lerobot.layout import VIDEO_PATH, FileNumber
 from openvima.data.schema import IMAGE_SHAPE
 from openvima.films import import_av, open_film
+from openvima.render import channels_last
 
 PixelFormat = Literal["yuv444p", "yuv420p"]
 PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
@@ -85,7 +86,7 @@ class NumberedVideo:
         frame: Any = None  # Any: PyAV is optional
         for index in range(num_frames):
             if index < len(pictures):
-                picture = np.ascontiguousarray(np.moveaxis(pictures[index], 0, -1))
+                picture = np.ascontiguousarray(channels_last(pictures[index]))
                 frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame.pts, frame.pict_type = self._num_frames, kinds.NONE if index else kinds.I
             self._mux(self._stream.encode(frame))

@@ -10,6 +10,7 @@ from PIL import Image
 
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.render import channels_last
 from openvima.render.camera import CAMERAS, View, project
 from openvima.scene import BACKGROUND_ID, Action, PromptImage
 
@@ -49,7 +50,7 @@ def episode_card(demo: Demonstration) -> str:
 
 
 def _prompt_picture(image: PromptImage) -> str:
-    pixels = np.moveaxis(image.rgb["front"], 0, -1)
+    pixels = channels_last(image.rgb["front"])
     if image.kind == "object":
         pixels = _cut_to_object(pixels, image.segm["front"])
     kind = "scene" if image.kind == "scene" else "object"
@@ -71,7 +72,7 @@ def _frame(demo: Demonstration, step: int) -> str:
     picture = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
     for place, view in enumerate(VIEWS):
         top = place * (height + _GAP)
-        picture[top : top + height] = np.moveaxis(demo.rgb[view][step], 0, -1)
+        picture[top : top + height] = channels_last(demo.rgb[view][step])
     arrows = "" if step == demo.num_steps else "".join(_arrow(demo.actions[step], view) for view in VIEWS)
     caption = html.escape(_caption(demo, step))
     return (

@@ -15,6 +15,7 @@ from openvima.data.published.unpickling import as_array, as_plain, kind_of, read
 from openvima.data.records import Demonstration, versions_of
 from openvima.data.schema import IMAGE_SHAPE, UNKNOWN_ID, VIEWS
 from openvima.errors import MemberError, PromptError
+from openvima.render import channels_first
 from openvima.scene import (
     ACTION_SHAPES,
     END_EFFECTORS,
@@ -256,7 +257,7 @@ def _frames(files: Mapping[str, bytes], folder: str, num_images: int) -> np.ndar
     stacked = np.empty((num_images, *IMAGE_SHAPE, 3), np.uint8)
     for number in range(num_images):
         stacked[number] = _decoded(numbered[number], f"{folder}/{number}.jpg")
-    return np.moveaxis(stacked, -1, 1)
+    return channels_first(stacked)
 
 
 def _decoded(content: bytes, name: str) -> np.ndarray:
