@@ -62,6 +62,42 @@ def test_a_package_imports_only_from_lower_ones(package: str) -> None:
                 assert not inside, f"{file.relative_to(SOURCE)} imports {module}"
 
 
+def module_name(file: Path) -> str:
+    parts = file.relative_to(SOURCE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_within(package: str) -> dict[str, set[str]]:
+    """Which modules of a package each of its modules imports, at module level or inside functions."""
+    files = {module_name(file): file for file in (SOURCE / package).rglob("*.py")}
+    graph: dict[str, set[str]] = {}
+    for name, file in files.items():
+        targets = imported_modules(file)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                inner = {f"{node.module}.{alias.name}" for alias in node.names} & files.keys()
+                targets |= inner
+                if len(inner) == len(node.names):  # modules of a package, none of its own names
+                    targets.discard(node.module or "")
+        graph[name] = (targets & files.keys()) - {name}
+    return graph
+
+
+def cycle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other, or lead to such; empty if there are none."""
+    graph = {name: set(targets) for name, targets in graph.items()}
+    while leaves := {name for name, targets in graph.items() if not targets}:
+        graph = {name: targets - leaves for name, targets in graph.items() if name not in leaves}
+    return sorted(graph)
+
+
+@pytest.mark.parametrize("package", ORDER)
+def test_no_modules_of_a_package_import_each_other(package: str) -> None:
+    if package == "policies":  # base, checkpoint and inference still do
+        pytest.skip("the circle of policies is not broken yet")
+    assert cycle_in(imports_within(package)) == []
+
+
 def test_data_imports_torch_in_its_dataset_adapter_only() -> None:
     for file in (SOURCE / "data").rglob("*.py"):
         assert file.name == "torch_dataset.py" or "torch" not in imported_modules(file)

@@ -11,8 +11,8 @@ import pytest
 
 from naive import interleaved
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
-from openvima.data.columns import Scratch, pixels, planes
 from openvima.data.encoding import ShardInfo, encode
+from openvima.data.image_layout import ImageBuffers, pixels, planes
 from openvima.data.manifest import finish_folder
 from openvima.data.schema import ARRAYS, COLUMNS, VIEWS
 from openvima.errors import DatasetError, ShardError
@@ -178,7 +178,7 @@ def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
 
 
 def test_memory_that_is_used_again_changes_nothing(made_up: MadeUp) -> None:
-    scratch = Scratch()
+    scratch = ImageBuffers()
     for demo in (made_up(1, num_steps=4, num_images=3), made_up(2, num_steps=0, num_images=0), made_up(3)):
         assert encode(demo, scratch=scratch).equals(encode(demo))
 

@@ -7,8 +7,9 @@ if TYPE_CHECKING:
     from openvima.data.generation import generate
     from openvima.data.planning import GenerateConfig, plan
     from openvima.data.progress import GenerationProgress, TaskProgress
-    from openvima.data.reader import Dataset, Shard
+    from openvima.data.reader import Dataset
     from openvima.data.records import Demonstration, Step, rollout_oracle
+    from openvima.data.shard import Shard
     from openvima.data.verification import VerifyConfig, repair, verify
     from openvima.data.writer import ShardWriter
 
@@ -18,7 +19,7 @@ _HOMES = {
     "Demonstration": "records",
     "GenerateConfig": "planning",
     "GenerationProgress": "progress",
-    "Shard": "reader",
+    "Shard": "shard",
     "ShardWriter": "writer",
     "Step": "records",
     "TaskProgress": "progress",

@@ -40,7 +40,7 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class Envelope:
     """What lies around the records.
 
     Args:
@@ -56,7 +56,7 @@ class Frame:
     crc32: int
 
     def to_entry(self) -> dict[str, int]:
-        """Return what the manifest holds of a shard's frame."""
+        """Return what the manifest holds of a shard's envelope."""
         return {
             "bytes": self.file_bytes,
             "head_bytes": self.head_bytes,
@@ -68,13 +68,13 @@ class Frame:
         """Say what is wrong around the records in a file's content; nothing if all is as it was."""
         if len(content) != self.file_bytes:
             return f"it has {len(content):,} of {self.file_bytes:,} bytes"
-        is_same = _frame_crc32(content, self.head_bytes, self.tail_bytes) == self.crc32
+        is_same = _envelope_crc32(content, self.head_bytes, self.tail_bytes) == self.crc32
         return "" if is_same else "the checksum of its schema and footer is wrong"
 
     @staticmethod
-    def from_entry(entry: Mapping[str, Any]) -> "Frame":  # Any: numbers and texts
+    def from_entry(entry: Mapping[str, Any]) -> "Envelope":  # Any: numbers and texts
         """Read a shard's entry in the manifest."""
-        return Frame(entry["bytes"], entry["head_bytes"], entry["tail_bytes"], entry["frame_crc32"])
+        return Envelope(entry["bytes"], entry["head_bytes"], entry["tail_bytes"], entry["frame_crc32"])
 
 
 def mapped(path: Path) -> memoryview:
@@ -83,7 +83,7 @@ def mapped(path: Path) -> memoryview:
         return memoryview(file.read_buffer())
 
 
-def measure(path: Path) -> tuple[Frame, list[Span]]:
+def measure(path: Path) -> tuple[Envelope, list[Span]]:
     """Find the parts of a whole shard and their checksums.
 
     Raises:
@@ -99,7 +99,7 @@ def measure(path: Path) -> tuple[Frame, list[Span]]:
         for start, end in itertools.pairwise([head, *ends])
     ]
     tail = len(content) - (ends[-1] if ends else head)
-    return Frame(len(content), head, tail, _frame_crc32(content, head, tail)), spans
+    return Envelope(len(content), head, tail, _envelope_crc32(content, head, tail)), spans
 
 
 def spans_of(index: pa.Table) -> list[Span]:
@@ -108,7 +108,7 @@ def spans_of(index: pa.Table) -> list[Span]:
     return [Span(*numbers) for numbers in zip(*columns, strict=True)]
 
 
-def _frame_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
+def _envelope_crc32(content: memoryview, head_bytes: int, tail_bytes: int) -> int:
     return zlib.crc32(content[len(content) - tail_bytes :], zlib.crc32(content[:head_bytes]))
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.columns import planes
 from openvima.data.encoding import ShardInfo
+from openvima.data.image_layout import planes
 from openvima.data.records import Demonstration
 from openvima.data.schema import ARRAYS, VIEWS
 from openvima.scene import (

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 import pyarrow as pa
 
-from openvima.data.columns import Scratch, columns_of
-from openvima.data.records import Demonstration
+from openvima.data.image_layout import ImageBuffers
+from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
 
@@ -114,7 +114,7 @@ def encode(
     skipped: Sequence[Skipped] = (),
     *,
     with_images: bool = True,
-    scratch: Scratch | None = None,
+    buffers: ImageBuffers | None = None,
 ) -> pa.RecordBatch:
     """Make one row of a demonstration.
 
@@ -122,12 +122,12 @@ def encode(
         demo: The demonstration.
         skipped: Seeds tried just before it in vain.
         with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
-        scratch: Memory for the images, good until it is used again; None gives them their own.
+        buffers: Memory for the images, good until it is used again; None gives them their own.
 
     Returns:
         A record batch of one row with the columns of `schema.COLUMNS`.
     """
-    columns = columns_of(demo, scratch)
+    columns = columns_of(demo, buffers)
     others = {
         **columns.records,
         "content_hash": columns.content_hash,

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from openvima.atomic_io import atomic_write_file
 from openvima.data.checksums import Span, measure
 from openvima.data.schema import SCHEMA_VERSION
+from openvima.data.shard import Shard
 from openvima.errors import DatasetError
 
 INDEX_NAME = "index.parquet"
@@ -154,12 +155,10 @@ def summarise(
     Raises:
         ShardError: It is damaged.
     """
-    from openvima.data.reader import Shard  # which reads manifests
-
     table = Shard(path).table(_COLUMNS)
-    frame, spans = measure(path)
+    envelope, spans = measure(path)
     counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
-    entry = {**counts, **(known or fingerprint(path)), **frame.to_entry()}
+    entry = {**counts, **(known or fingerprint(path)), **envelope.to_entry()}
     return ShardSummary(path.name, entry, _index_part(table, path.name, spans), _counts(table))
 
 

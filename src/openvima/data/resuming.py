@@ -7,7 +7,8 @@ from pathlib import Path
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.planning import COMMAND, Block, GenerateConfig
-from openvima.data.reader import Shard, read_manifest
+from openvima.data.reader import read_manifest
+from openvima.data.shard import Shard
 from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve

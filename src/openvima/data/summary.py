@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
-from openvima.data.reader import Dataset, Shard
+from openvima.data.reader import Dataset
 from openvima.data.schema import COLUMNS, IMAGES
+from openvima.data.shard import Shard
 from openvima.errors import ShardError
 
 _NUM_MEASURED = 3  # episodes of each task whose images are told from the rest

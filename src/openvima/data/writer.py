@@ -9,8 +9,8 @@ from typing import BinaryIO
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
-from openvima.data.columns import Scratch
 from openvima.data.encoding import ShardInfo, Skipped, encode
+from openvima.data.image_layout import ImageBuffers
 from openvima.data.manifest import BROKEN_NAME, INDEX_NAME, MANIFEST_NAME
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
@@ -33,7 +33,7 @@ class ShardWriter:
     def __init__(self, path: Path, info: ShardInfo) -> None:
         self.path = path
         self._info = info
-        self._scratch = Scratch()
+        self._buffers = ImageBuffers()
         self._schema = COLUMNS.with_metadata(info.to_metadata())
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
@@ -50,7 +50,7 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self.copy(encode(demo, skipped, with_images=self._info.images, scratch=self._scratch))
+        self.copy(encode(demo, skipped, with_images=self._info.images, buffers=self._buffers))
 
     def copy(self, batch: pa.RecordBatch) -> None:
         """Append one episode as another shard holds it.

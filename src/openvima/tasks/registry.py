@@ -162,9 +162,7 @@ def list_tasks() -> tuple[str, ...]:
 @functools.cache
 def _load_task_files() -> None:
     """Import all modules of this package, so that a task is found by its file being there, and users' own."""
-    import openvima.tasks as package
-
-    for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)], f"{__package__}."):
         if not module.name.endswith(".kernels"):  # compiled code, loaded when an episode is sampled
             importlib.import_module(module.name)
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):

@@ -11,7 +11,7 @@ import pytest
 from openvima.cli.main import main
 from openvima.data import Dataset
 from openvima.data.published import ImportConfig, PublishedData, import_published, importing
-from openvima.data.reader import Shard
+from openvima.data.shard import Shard
 from openvima.errors import ConfigError, DatasetError
 from published_data import PUBLISHED, MadeEpisode, write_folder, write_zip
 

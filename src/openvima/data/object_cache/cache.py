@@ -11,11 +11,12 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import remove_abandoned
-from openvima.data.checksums import Frame, spans_of
+from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, write_cache_file
 from openvima.data.object_cache.episode import KINDS, InputKind, PreprocessedEpisode, preprocess
-from openvima.data.reader import Dataset, Shard
+from openvima.data.reader import Dataset
+from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.multiprocess import in_processes
 from openvima.perception.objects import ObjectExtractor
@@ -133,7 +134,7 @@ class Source:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Work:
     shard: Path
-    frame: Frame
+    envelope: Envelope
     source: Source
     path: Path
     kind: InputKind
@@ -168,7 +169,7 @@ def open_object_cache(
     work = [
         _Work(
             dataset.path / source.name,
-            Frame.from_entry(dataset.manifest["shards"][source.name]),
+            Envelope.from_entry(dataset.manifest["shards"][source.name]),
             source,
             target / source.name,
             kind,
@@ -235,7 +236,7 @@ def _made(folder: Path, source: Source, kind: InputKind, boxes: str) -> CacheFil
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
-    shard, episodes = Shard(work.shard, work.frame), []
+    shard, episodes = Shard(work.shard, work.envelope), []
     extractor = _extractor(work.boxes) if work.boxes else None
     for row, span in enumerate(spans_of(work.source.index)):
         shard.check(row, span)

@@ -23,7 +23,7 @@ from openvima.data.object_cache.episode import (
     InputKind,
     PreprocessedEpisode,
 )
-from openvima.data.reader import ODD_ERRORS
+from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
 
 CACHE_VERSION = 2  # grows whenever the same demonstration gives other tokens

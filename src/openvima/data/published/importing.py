@@ -19,8 +19,8 @@ from openvima.data.published.reader import (
     open_source,
     read_place,
 )
-from openvima.data.reader import Shard
 from openvima.data.resuming import FULL_DISK, clear, is_finished, storage_error
+from openvima.data.shard import Shard
 from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.errors import ConfigError, DatasetError
 from openvima.multiprocess import MAX_WORKERS, Counts, in_watched_processes

@@ -18,7 +18,8 @@ from openvima.data.manifest import (
     parse_manifest,
 )
 from openvima.data.planning import COMMAND
-from openvima.data.reader import remedy, why_no_data_set
+from openvima.data.reader import why_no_data_set
+from openvima.data.shard import remedy
 from openvima.data.verification.findings import Problem
 from openvima.errors import DatasetError
 

@@ -13,9 +13,9 @@ from openvima.data.manifest import FAILED_FOLDER, fingerprint
 from openvima.data.oracle_rollouts import write_block
 from openvima.data.planning import Block, GenerateConfig, plan
 from openvima.data.progress import NUM_COUNTS
-from openvima.data.reader import Shard
 from openvima.data.records import package_versions
 from openvima.data.resuming import is_done
+from openvima.data.shard import Shard
 from openvima.data.verification.findings import Report, VerifyConfig
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OpenVimaError

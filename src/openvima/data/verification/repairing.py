@@ -11,7 +11,7 @@ import pyarrow as pa
 from openvima.data.checksums import spans_of
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, finish_folder
 from openvima.data.planning import COMMAND, GenerateConfig
-from openvima.data.reader import Shard
+from openvima.data.shard import Shard
 from openvima.data.verification.checks import DEFAULT, verify
 from openvima.data.verification.findings import Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.reader import Shard
 from openvima.data.records import Demonstration, package_versions
+from openvima.data.shard import Shard
 from openvima.data.verification.episodes import PUBLISHED
 from openvima.data.verification.findings import Problem, Report, VerifyConfig, by_cause
 from openvima.data.verification.inventory import Inventory

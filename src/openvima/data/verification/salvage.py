@@ -11,9 +11,9 @@ import pyarrow as pa
 from openvima.data.checksums import MAGIC_BYTES, Span, mapped
 from openvima.data.decoding import decode
 from openvima.data.encoding import ShardInfo
-from openvima.data.reader import ODD_ERRORS, Shard
 from openvima.data.rerender import redrawn
 from openvima.data.schema import COLUMNS
+from openvima.data.shard import ODD_ERRORS, Shard
 from openvima.data.writer import ShardWriter
 from openvima.errors import OpenVimaError, ShardError
 

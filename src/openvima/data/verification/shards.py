@@ -9,10 +9,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from openvima.data.checksums import Frame, mapped, spans_of
+from openvima.data.checksums import Envelope, mapped, spans_of
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import ShardSummary, fingerprint, summarise
-from openvima.data.reader import Shard, remedy
+from openvima.data.shard import Shard, remedy
 from openvima.data.verification.episodes import faults
 from openvima.data.verification.findings import Problem, by_cause
 from openvima.errors import OpenVimaError, ShardError
@@ -108,7 +108,7 @@ def _byte_faults(task: ShardTask) -> Iterator[str]:
     if (found["bytes"], found["sha256"]) == (task.entry["bytes"], task.entry["sha256"]):
         return
     content = memoryview(b"") if found["bytes"] == 0 else mapped(task.path)
-    places = [Frame.from_entry(task.entry).fault_in(content)]
+    places = [Envelope.from_entry(task.entry).fault_in(content)]
     if task.index is not None:
         broken = [row for row, span in enumerate(spans_of(task.index)) if span.fault_in(content)]
         places += by_cause(((row, "damaged") for row in broken), task.index.num_rows)

@@ -12,7 +12,7 @@ import numpy as np
 from openvima.data.manifest import CACHE_FOLDER
 from openvima.data.object_cache.cache_file import CacheFile
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
-from openvima.data.reader import Shard
+from openvima.data.shard import Shard
 from openvima.data.verification.findings import Problem, Report, by_cause
 from openvima.errors import OpenVimaError, ShardError
 from openvima.multiprocess import in_processes
