@@ -14,7 +14,7 @@ pytest.importorskip("torch")
 from tests.policies.golden import (
     Arrays,
     Recording,
-    assert_agrees,
+    assert_close_to_golden,
     needs,
     recorded_names,
     recording,
@@ -37,7 +37,7 @@ def recorded_and_computed(policy: str) -> tuple[Recording, Arrays]:
 )
 def test_golden_baseline_agrees_in(policy: str, name: str):
     recorded, computed = recorded_and_computed(policy)
-    assert_agrees(computed[name], recorded[name])
+    assert_close_to_golden(computed[name], recorded[name])
 
 
 @pytest.mark.parametrize("policy", [pytest.param(policy, marks=needs(policy)) for policy in NAMES])

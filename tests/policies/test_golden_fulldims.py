@@ -19,7 +19,7 @@ import torch
 from tests.policies.golden import (
     FOLDER,
     Arrays,
-    assert_agrees,
+    assert_close_to_golden,
     described,
     needs,
     network_of,
@@ -73,7 +73,7 @@ def recorded() -> Arrays:
 @pytest.mark.parametrize("name", recorded_names("fulldims"))
 def test_golden_full_width_agrees_in(name: str, computed: dict[str, Arrays], recorded: Arrays):
     model, stage = name.split("/")
-    assert_agrees(computed[model][stage], recorded[name])
+    assert_close_to_golden(computed[model][stage], recorded[name])
 
 
 def test_golden_weights_follow_from_their_names(made: dict[str, torch.Tensor], computed: dict[str, Arrays]):

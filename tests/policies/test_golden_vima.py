@@ -9,7 +9,7 @@ import torch
 from tests.policies.golden import (
     Arrays,
     Recording,
-    assert_agrees,
+    assert_close_to_golden,
     needs,
     recorded_names,
     recording,
@@ -57,7 +57,7 @@ def within_table(name: str, bins: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", recorded_names(NAME))
 def test_golden_vima_agrees_in(name: str, computed: Arrays, recorded: Recording):
-    assert_agrees(computed[name], within_table(name, recorded[name]))
+    assert_close_to_golden(computed[name], within_table(name, recorded[name]))
 
 
 @pytest.mark.usefixtures("computed")
@@ -69,4 +69,4 @@ def test_golden_closed_loop_acts_alike_with_and_without_kept_keys(computed: Arra
     """What was recorded of a step repeats all steps before it; the last is what the policy acted from."""
     for t in range(len(recorded["in.ee"])):
         again = computed[f"roll.step{t}.pred_tokens"][-1]
-        np.testing.assert_allclose(computed[f"roll.step{t}.pred_token"], again, rtol=0, atol=1e-5)
+        assert_close_to_golden(computed[f"roll.step{t}.pred_token"], again, tolerance=1e-5)
