@@ -33,7 +33,7 @@ from openvima.env.config import EnvConfig
 from openvima.evaluation.config import PRECISIONS, Batch
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.runner import Job
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.inputs import EpisodeReader, Reader
@@ -111,7 +111,7 @@ def play_one(policy: NetworkPolicy, batch: Batch) -> Sequence[EpisodeOutcome]:
     """Play a batch as a worker process does."""
     batch = pickle.loads(pickle.dumps(Job(batch, ""))).batch
     envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-    return pickle.loads(pickle.dumps(tuple(play(envs, batch.seeds, PolicyPlayer(policy)))))
+    return pickle.loads(pickle.dumps(tuple(play(envs, batch.seeds, PromptedRolloutPolicy(policy)))))
 
 
 def measure(name: str, precision: str, sizes: Sequence[int], num_rounds: int) -> dict[str, dict[str, Any]]:

@@ -17,10 +17,10 @@ RECORD = Path(__file__).parents[1] / "src/openvima/tasks/oracle_success.json"
 
 
 def counts(results: Results) -> dict[str, dict[str, dict[str, int]]]:
-    """Return task → level → episodes, successes and redraws."""
+    """Return task → level → episodes, successes and resamples."""
     found: dict[str, dict[str, dict[str, int]]] = {}
     for row in sorted(results.rows, key=lambda row: (row.task, LEVELS.index(row.level))):
-        entry = {"episodes": row.episodes, "successes": row.successes, "redraws": row.redraws}
+        entry = {"episodes": row.episodes, "successes": row.successes, "resamples": row.resamples}
         found.setdefault(row.task, {})[row.level] = entry
     return found
 
@@ -50,8 +50,8 @@ def main() -> None:
     found = counts(results)
     for task, levels in found.items():
         cells = "   ".join(f"{level} {e['successes']}/{e['episodes']}" for level, e in levels.items())
-        redraws = sum(entry["redraws"] for entry in levels.values())
-        print(f"{task:<28}{cells}   redraws {redraws}")
+        resamples = sum(entry["resamples"] for entry in levels.values())
+        print(f"{task:<28}{cells}   resamples {resamples}")
     for row in results.rows:
         for outcome in row.outcomes:
             if not outcome.success:

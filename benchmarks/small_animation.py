@@ -22,11 +22,11 @@ from openvima.env import EnvConfig
 from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.config import Batch
-from openvima.evaluation.film import Artist
+from openvima.evaluation.film import SceneRenderer
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import Player, load_player
+from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.scene import RenderedPrompt
 from openvima.sim.ur5 import HOME
 from openvima.tasks import task_spec
@@ -94,7 +94,7 @@ class Scenes:
     outcome: EpisodeOutcome
 
 
-def play_shown(player: Player, wanted: Wanted, *, first_seed: int, width: int) -> Scenes:
+def play_shown(player: RolloutPolicy, wanted: Wanted, *, first_seed: int, width: int) -> Scenes:
     """Play one episode and draw it.
 
     Args:
@@ -107,7 +107,7 @@ def play_shown(player: Player, wanted: Wanted, *, first_seed: int, width: int) -
         ConfigError: The policy solves none of the first 50.
     """
     env = EnvConfig().make(wanted.task, wanted.level, domain="user", realtime=True)
-    artist = Artist(env, ENLARGE)
+    artist = SceneRenderer(env, ENLARGE)
     seeds = [wanted.seed] if wanted.seed is not None else range(first_seed, first_seed + MAX_TRIES)
     for seed in seeds:
         env.reset(seed=seed)
@@ -294,7 +294,7 @@ def main() -> None:
             episodes=1,
             setup=EnvConfig(),
         )
-        player = load_player(batch)
+        player = load_rollout_policy(batch)
         played = [play_shown(player, entry, first_seed=options.seed, width=width) for entry in wanted]
     except OpenVimaError as error:
         parser.error(str(error))

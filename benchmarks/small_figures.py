@@ -85,7 +85,7 @@ def levels(findings: Findings) -> Figure:
         axes.grid(visible=False, axis="y")
     figure.axes[0].get_yticklabels()[0].set(color=OURS, fontweight="bold")
     figure.supxlabel(
-        "Solved episodes in per cent, mean over the tasks of the level. Blue: measured, with its 95 % "
+        "Solved episodes (%), mean over the tasks of the level. Blue: measured, with its 95 % "
         "interval. Grey: published.",
         fontsize=8.5,
         color=FAINT,

@@ -47,7 +47,7 @@ class Training:
 
     def means(self) -> dict[str, LevelMean]:
         """Success by level."""
-        return {mean.level: mean for mean in self.results.level_means() if not mean.control}
+        return {mean.level: mean for mean in self.results.level_means() if not mean.ablation}
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Findings:
 
     Args:
         policy: Name of the policy of the package in `results`.
-        results: Its evaluation, controls included.
+        results: Its evaluation, ablations included.
         demonstrations: It learnt from.
         trainings: Smaller trainings, to be compared with each other.
         baseline: The one of them with all parts.
@@ -89,7 +89,7 @@ class Findings:
         return {
             mean.level: mean
             for mean in self.results.level_means()
-            if mean.policy == self.policy and not mean.control
+            if mean.policy == self.policy and not mean.ablation
         }
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/small_results.py EVALUATION --trainings ablations/*.json [--out OUT]
 
-EVALUATION is made by `openvima evaluate --policy openvima-small --controls all --out EVALUATION`. Each file
+EVALUATION is made by `openvima evaluate --policy openvima-small --ablations all --out EVALUATION`. Each file
 of `--trainings` holds what `benchmarks/small_ablations.py` writes, or a list of such records: name, what,
 demonstrations, steps, minutes, and evaluation, the path of a results.json. Those of as many demonstrations
 and steps as the one named `--baseline` are compared with it, and those of other numbers of demonstrations
@@ -75,9 +75,9 @@ TODO(numbers): what it shows, and what it does not.
 
 {tasks}
 
-## Controls
+## Input ablations
 
-{controls}
+{input_ablations}
 
 ## Parts
 
@@ -101,7 +101,7 @@ def record(findings: Findings) -> dict[str, Any]:  # Any: plain JSON values
         "weights": results.policies.get(findings.policy, {}).get("sha256", ""),
         "demonstrations": findings.demonstrations,
         "levels": [
-            _mean_record(mean) | {"control": mean.control, "within_oracle_steps": _strict(mean, own)}
+            _mean_record(mean) | {"ablation": mean.ablation, "within_oracle_steps": _strict(mean, own)}
             for mean in results.level_means()
             if mean.policy == findings.policy
         ],
@@ -125,15 +125,15 @@ def _mean_record(mean: LevelMean) -> dict[str, Any]:  # Any: plain JSON values
 
 def _strict(mean: LevelMean, rows: Sequence[Row]) -> float:
     """The same mean with no more steps than the oracle may take."""
-    chosen = [row for row in rows if (row.level, row.control) == (mean.level, mean.control)]
-    return round(mean_of_rates([(row.successes_strict, row.episodes) for row in chosen])[0], 6)
+    chosen = [row for row in rows if (row.level, row.ablation) == (mean.level, mean.ablation)]
+    return round(mean_of_rates([(row.successes_oracle_horizon, row.episodes) for row in chosen])[0], 6)
 
 
 def _row_record(row: Row) -> dict[str, Any]:  # Any: plain JSON values
     return {
         "task": row.task,
         "level": row.level,
-        "control": row.control,
+        "ablation": row.ablation,
         "successes": row.successes,
         "episodes": row.episodes,
         "interval": [round(end, 6) for end in row.interval],
@@ -160,12 +160,12 @@ def _training_record(training: Training) -> dict[str, Any]:  # Any: plain JSON v
 def tables(findings: Findings) -> dict[str, str]:
     """Return all tables in Markdown, by the name of their place."""
     from_paper = {table.label: table for table in paper_tables(findings.results)}
-    controls = from_paper.get(f"controls-{findings.policy}")
+    input_ablations = from_paper.get(f"input-ablations-{findings.policy}")
     made = {
         "short": _level_table(findings, _beside()),
         "levels": _level_table(findings, [*_beside(), *(m for m in leading_models() if m not in _beside())]),
         "tasks": from_paper[f"tasks-{findings.policy}"],
-        "controls": controls or _empty("no control was played"),
+        "input_ablations": input_ablations or _empty("no input ablation was evaluated"),
         "ablations": _ablation_table(findings) if findings.differences else _empty("none"),
         "scaling": _scaling_table(findings) if findings.trainings else _empty("none"),
     }

@@ -120,7 +120,7 @@ def test_evaluate_plays_with_the_boxes_of_a_trained_detector(detector, tmp_path,
     more = ["--boxes", f"detector={detector}", "--out", str(tmp_path / "out"), "--no-report", "--json"]
     assert main(["evaluate", *words, *more]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row.get("control", "") for row in rows] == ["", "detected_boxes"]
+    assert [row.get("ablation", "") for row in rows] == ["", "detected_boxes"]
 
 
 def test_demo_films_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):

@@ -95,7 +95,7 @@ def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], 
     assert not (tmp_path / "quick").exists()
 
 
-def test_a_killed_training_goes_on_and_is_scored_with_controls(tmp_path: Path, capsys) -> None:
+def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, capsys) -> None:
     demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
     run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
     train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--batch", 2]
@@ -112,10 +112,10 @@ def test_a_killed_training_goes_on_and_is_scored_with_controls(tmp_path: Path, c
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines if "loss" in line] == list(range(1, 13))
 
-    evaluate = ["evaluate", "--policy", f"mine={trained}", "--controls", "no_prompt,shuffled_objects"]
+    evaluate = ["evaluate", "--policy", f"mine={trained}", "--ablations", "no_prompt,shuffled_objects"]
     run(*evaluate, "--tasks", "rotate", "--levels", "L1", "--episodes", 2, "--videos", 0, "--out", results)
     rows = json.loads((results / "results.json").read_text(encoding="utf-8"))["rows"]
-    assert {row.get("control", "") for row in rows} == {"", "no_prompt", "shuffled_objects"}
+    assert {row.get("ablation", "") for row in rows} == {"", "no_prompt", "shuffled_objects"}
     run("report", results, "--runs", trained, "--out", tmp_path / "page.html")
     assert "mine" in (tmp_path / "page.html").read_text(encoding="utf-8")
     capsys.readouterr()

@@ -1,20 +1,20 @@
-"""What policies get to see under each control, and that it follows from task, level and seed alone."""
+"""What policies get to see under each ablation, and that it follows from task, level and seed alone."""
 
 import numpy as np
 import pytest
 
 from openvima.env import TabletopEnv
 from openvima.evaluation.ablations import (
-    CONTROLS,
+    ABLATIONS,
     NEUTRAL_PROMPT,
     NO_PROMPT,
     OTHER_PROMPT_IMAGES,
     SCRAMBLED_WORDS,
     SHUFFLED_OBJECTS,
-    sight,
+    ablate,
 )
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.perception.objects import observe, observe_prompt_image
 from openvima.policies import RandomPolicy
 from openvima.policies.tokenizer import encode_text
@@ -45,26 +45,26 @@ def same(a: RenderedPrompt, b: RenderedPrompt) -> bool:
 
 
 @pytest.mark.parametrize("task", list_tasks())
-def test_controls_of_one_episode_are_equal_whenever_they_are_drawn(task):
+def test_ablations_of_one_episode_are_equal_whenever_they_are_drawn(task):
     env, _ = begun(task)
-    for control in CONTROLS:
-        first = sight(env, control)
+    for ablation in ABLATIONS:
+        first = ablate(env, ablation)
         TabletopEnv(task, level=env.level, domain="eval").reset(seed=4)
-        again = sight(begun(task)[0], control)
+        again = ablate(begun(task)[0], ablation)
         assert same(first.prompt, again.prompt)
-        assert np.array_equal(first.new_ids, again.new_ids)
+        assert np.array_equal(first.id_map, again.id_map)
         encode_text(" ".join(piece for piece in again.prompt.sequence() if isinstance(piece, str)))
 
 
 def test_without_a_prompt_all_tasks_are_told_the_same():
-    told = [sight(begun(task)[0], NO_PROMPT).prompt for task in ("rotate", "rearrange")]
+    told = [ablate(begun(task)[0], NO_PROMPT).prompt for task in ("rotate", "rearrange")]
     assert told == [NEUTRAL_PROMPT, NEUTRAL_PROMPT]
     assert NEUTRAL_PROMPT.sequence() == ["."]
 
 
 def test_images_of_another_episode_stand_in_the_words_of_this_one():
     env, _ = begun("visual_manipulation")
-    changed = sight(env, OTHER_PROMPT_IMAGES).prompt
+    changed = ablate(env, OTHER_PROMPT_IMAGES).prompt
     assert changed.text == env.prompt.text
     assert list(changed.images) == list(env.prompt.images)
     assert not any(
@@ -75,13 +75,13 @@ def test_images_of_another_episode_stand_in_the_words_of_this_one():
 
 def test_scrambled_words_leave_images_and_their_order():
     env, _ = begun("twist")
-    changed = sight(env, SCRAMBLED_WORDS).prompt
+    changed = ablate(env, SCRAMBLED_WORDS).prompt
     assert changed.images == env.prompt.images
     shown = [[part.name for part in p.sequence() if not isinstance(part, str)] for p in (changed, env.prompt)]
     assert shown[0] == shown[1]
     assert changed.text.split() != env.prompt.text.split()
     assert not any(character in changed.text for character in ".:,")
-    other = sight(begun("twist", seed=4)[0], SCRAMBLED_WORDS).prompt
+    other = ablate(begun("twist", seed=4)[0], SCRAMBLED_WORDS).prompt
     assert changed.text != other.text
 
 
@@ -90,7 +90,7 @@ def test_scrambled_words_leave_images_and_their_order():
 )
 def test_shuffled_objects_change_ids_and_nothing_that_can_be_seen(task):
     env, observation = begun(task)
-    changed = sight(env, SHUFFLED_OBJECTS)
+    changed = ablate(env, SHUFFLED_OBJECTS)
     seen = changed.observation(observation)
     plain, shuffled = observe(observation), observe(seen)
     assert sorted(plain.ids) == sorted(shuffled.ids)
@@ -106,7 +106,7 @@ def test_ids_are_dealt_out_differently_in_other_episodes():
     deals = set()
     for seed in range(8):
         env, observation = begun("rearrange", seed=seed, level="L1")
-        ids = observe(sight(env, SHUFFLED_OBJECTS).observation(observation)).ids
+        ids = observe(ablate(env, SHUFFLED_OBJECTS).observation(observation)).ids
         deals.add(tuple(ids != observe(observation).ids))
     assert len(deals) > 1
     assert any(any(deal) for deal in deals)
@@ -114,7 +114,7 @@ def test_ids_are_dealt_out_differently_in_other_episodes():
 
 def test_shuffled_objects_keep_their_new_ids_through_an_episode_and_its_images():
     env, observation = begun("follow_order")
-    changed = sight(env, SHUFFLED_OBJECTS)
+    changed = ablate(env, SHUFFLED_OBJECTS)
     again = changed.observation({**observation, "ee": 0})
     assert np.array_equal(again["segm"]["top"], changed.observation(observation)["segm"]["top"])
     pairs = {
@@ -129,8 +129,8 @@ def test_shuffled_objects_keep_their_new_ids_through_an_episode_and_its_images()
 def test_the_environment_is_left_as_it_was():
     env, _ = begun("rearrange")
     untouched, _ = begun("rearrange")
-    for control in CONTROLS:
-        sight(env, control)
+    for ablation in ABLATIONS:
+        ablate(env, ablation)
     assert env.scene == untouched.scene
     assert same(env.prompt, untouched.prompt)
 
@@ -147,12 +147,12 @@ class Noting(RandomPolicy):
         return super().act(observations)
 
 
-def test_players_show_policies_what_the_control_leaves():
+def test_players_show_policies_what_the_ablation_leaves():
     envs = [begun("visual_manipulation")[0] for _ in range(2)]
     noting = Noting()
-    play(envs, [5, 6], PolicyPlayer(noting, NO_PROMPT))
+    play(envs, [5, 6], PromptedRolloutPolicy(noting, NO_PROMPT))
     assert noting.prompts == [NEUTRAL_PROMPT] * 2
-    play(envs, [5, 6], PolicyPlayer(noting, SHUFFLED_OBJECTS))
+    play(envs, [5, 6], PromptedRolloutPolicy(noting, SHUFFLED_OBJECTS))
     for env, seed, shown in zip(envs, (5, 6), noting.segms, strict=False):
         observation, _ = env.reset(seed=seed)
-        assert np.array_equal(shown, sight(env, SHUFFLED_OBJECTS).observation(observation)["segm"]["top"])
+        assert np.array_equal(shown, ablate(env, SHUFFLED_OBJECTS).observation(observation)["segm"]["top"])

@@ -1,4 +1,4 @@
-"""Detectors that are plugged in for the control `detected_boxes`."""
+"""Detectors that are plugged in for the ablation `detected_boxes`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ CONFIG = EvaluationConfig(
     ("L1",),
     episodes=2,
     report=False,
-    controls=("detected_boxes",),
+    ablations=("detected_boxes",),
     boxes="x:y",
 )
 

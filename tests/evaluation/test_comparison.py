@@ -10,10 +10,10 @@ from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import PairCounts, mcnemar, mean_difference
 
 
-def row(policy: str, task: str, level: str, solved: str, first_seed: int = 0, control: str = "") -> Row:
+def row(policy: str, task: str, level: str, solved: str, first_seed: int = 0, ablation: str = "") -> Row:
     """A row with one letter for each episode, "x" where it was solved."""
     outcomes = (EpisodeOutcome(first_seed + i, letter == "x", 1) for i, letter in enumerate(solved))
-    return Row(policy, task, level, 1, tuple(outcomes), control)
+    return Row(policy, task, level, 1, tuple(outcomes), ablation)
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def found() -> Results:
         row("a", "rotate", "L1", "xxxxxxxx.."),
         row("a", "twist", "L1", "x.x......."),
         row("a", "rotate", "L2", "xx........"),
-        row("a", "rotate", "L1", "x.........", control="no_prompt"),
+        row("a", "rotate", "L1", "x.........", ablation="no_prompt"),
         row("b", "rotate", "L1", "x........x"),
         row("b", "twist", "L1", ".xx......."),
         row("b", "rotate", "L2", "xx........"),
@@ -81,7 +81,7 @@ def test_p_values_take_the_number_of_pairs_into_account(found):
     assert of_two[0].overall.p_holm == pytest.approx(min(1, 2 * alone.overall.p_value))
 
 
-def test_a_policy_is_compared_with_itself_under_a_control(found):
+def test_a_policy_is_compared_with_itself_under_a_ablation(found):
     comparison = compare(found, "a:no_prompt", "a")
     assert [(d.level, d.task, d.difference) for d in comparison.tasks] == [("L1", "rotate", -0.7)]
     assert comparison.unpaired == 20
@@ -101,10 +101,10 @@ def test_policies_without_a_common_episode_are_refused():
     assert default_pairs(Results(rows)) == []
 
 
-def test_unknown_policies_and_controls_are_named(found):
+def test_unknown_policies_and_ablations_are_named(found):
     with pytest.raises(UnknownPolicyError, match=r"no policy 'bb'\. Did you mean 'b'"):
         compare(found, "a", "bb")
-    with pytest.raises(UnknownPolicyError, match=r"no control of a 'no_promt'\. Did you mean 'no_prompt'"):
+    with pytest.raises(UnknownPolicyError, match=r"no ablation of a 'no_promt'\. Did you mean 'no_prompt'"):
         compare(found, "a", "a:no_promt")
 
 
@@ -132,7 +132,7 @@ def test_the_record_is_plain_values(found):
     }
 
 
-def test_a_colon_in_the_name_of_a_policy_is_no_mark_of_a_control(found):
+def test_a_colon_in_the_name_of_a_policy_is_no_mark_of_a_ablation(found):
     renamed = replace(found, rows=tuple(replace(r, policy=f"{r.policy}@10:30") for r in found.rows))
     pairs = [("a@10:30", "b@10:30"), ("a@10:30:no_prompt", "a@10:30")]
     assert [c.a for c in compare_pairs(renamed, pairs)] == [a for a, _ in pairs]

@@ -74,9 +74,9 @@ def test_all_problems_of_the_settings_are_named_together():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"controls": ("no_promt",)}, "Did you mean 'no_prompt'"),
-        ({"controls": ("detected_boxes",)}, "needs a detector"),
-        ({"boxes": "extractor:make"}, "only the control detected_boxes"),
+        ({"ablations": ("no_promt",)}, "Did you mean 'no_prompt'"),
+        ({"ablations": ("detected_boxes",)}, "needs a detector"),
+        ({"boxes": "extractor:make"}, "only the ablation detected_boxes"),
         ({"precision": "float16"}, "allowed are float64, float32, bfloat16"),
         ({"engine": "threads"}, "allowed are processes and ray"),
         ({"address": "10.0.0.1:6379"}, "only 'ray' takes one"),
@@ -88,28 +88,30 @@ def test_settings_that_cannot_be_are_refused(settings, message):
         EvaluationConfig(("untrained",), **settings)
 
 
-def test_each_control_is_played_by_the_policies_that_it_takes_something_from():
-    config = EvaluationConfig(("mine=runs/a", "random"), ("rotate",), ("L1",), episodes=1, controls=("all",))
-    played = [(batch.policy, batch.control) for batch in plan(config)]
+def test_each_ablation_is_played_by_the_policies_that_it_takes_something_from():
+    config = EvaluationConfig(("mine=runs/a", "random"), ("rotate",), ("L1",), episodes=1, ablations=("all",))
+    played = [(batch.policy, batch.ablation) for batch in plan(config)]
     mine = ("", "no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects")
-    assert played == [*(("mine", control) for control in mine), ("random", ""), ("oracle", "")]
+    assert played == [*(("mine", ablation) for ablation in mine), ("random", ""), ("oracle", "")]
     assert config.record()["policies"] == ["mine", "random", "oracle"]
 
 
-def test_boxes_are_detected_under_their_control_only_and_not_by_servers():
+def test_boxes_are_detected_under_their_ablation_only_and_not_by_servers():
     policies = ("mine=runs/a", "far=ws://127.0.0.1:8000")
-    config = EvaluationConfig(policies, ("rotate",), ("L1",), 1, controls=("all",), boxes="extractor.py:make")
+    config = EvaluationConfig(
+        policies, ("rotate",), ("L1",), 1, ablations=("all",), boxes="extractor.py:make"
+    )
     detected = [batch for batch in plan(config) if batch.boxes]
-    assert [(batch.policy, batch.control) for batch in detected] == [("mine", "detected_boxes")]
+    assert [(batch.policy, batch.ablation) for batch in detected] == [("mine", "detected_boxes")]
     (trained,) = (replace(batch, boxes="detector=run").with_whole_paths().boxes for batch in detected)
     assert trained == f"detector={Path('run').absolute()}"
     (moved,) = (batch.with_whole_paths().boxes for batch in detected)
     assert moved.endswith("/extractor.py:make")
 
 
-def test_a_control_that_changes_nothing_for_any_policy_is_an_error():
+def test_a_ablation_that_changes_nothing_for_any_policy_is_an_error():
     with pytest.raises(ConfigError, match="no_prompt changes nothing for oracle, random"):
-        plan(EvaluationConfig(("oracle", "random"), controls=("no_prompt",)))
+        plan(EvaluationConfig(("oracle", "random"), ablations=("no_prompt",)))
 
 
 def test_run_folders_are_named_after_themselves_or_as_asked():
@@ -151,5 +153,5 @@ def test_the_hash_of_a_run_changes_with_its_weights_only(tmp_path):
 def test_stored_batches_of_other_weights_or_seeds_have_other_names():
     first, second = plan(EvaluationConfig(("random",), ("rotate",), ("L1",), episodes=2, batch=1))
     assert len({first.key("a"), first.key("b"), second.key("a")}) == 3
-    assert replace(first, control="no_prompt").key("a") != first.key("a")
+    assert replace(first, ablation="no_prompt").key("a") != first.key("a")
     assert replace(first, source="elsewhere").key("a") == first.key("a")

@@ -18,7 +18,7 @@ NETWORK = EvaluationConfig(
     seed=7,
     batch=2,
     report=False,
-    controls=("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", "random"),
+    ablations=("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", "random"),
 )
 
 
@@ -47,24 +47,24 @@ def test_batches_of_one_give_the_same_outcomes(whole: Path, tmp_path: Path) -> N
     assert single.rows == Results.read(whole).rows
 
 
-def test_each_control_has_rows_of_its_own(whole: Path) -> None:
+def test_each_ablation_has_rows_of_its_own(whole: Path) -> None:
     results = Results.read(whole)
-    played = list(dict.fromkeys((row.policy, row.control) for row in results.rows))
+    played = list(dict.fromkeys((row.policy, row.ablation) for row in results.rows))
     assert played == [
         ("untrained", ""),
-        *(("untrained", control) for control in NETWORK.controls[:4]),
+        *(("untrained", ablation) for ablation in NETWORK.ablations[:4]),
         ("random", ""),
     ]
     seeds = {tuple(outcome.seed for outcome in row.outcomes) for row in results.rows}
     assert seeds == {(7, 8, 9, 10)}
-    assert results.config["controls"] == list(NETWORK.controls)
+    assert results.config["ablations"] == list(NETWORK.ablations)
 
 
 def test_a_policy_that_looks_at_no_ids_plays_alike_with_shuffled_objects(whole: Path) -> None:
     results = Results.read(whole)
     for task in NETWORK.tasks:
         plain, shuffled = (
-            results.row("untrained", task, "L1", control) for control in ("", "shuffled_objects")
+            results.row("untrained", task, "L1", ablation) for ablation in ("", "shuffled_objects")
         )
         assert plain is not None and shuffled is not None
         assert shuffled.outcomes == plain.outcomes

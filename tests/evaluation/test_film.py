@@ -6,9 +6,9 @@ import pytest
 from PIL import Image
 
 from openvima.env.tabletop import TabletopEnv
-from openvima.evaluation import save_episode_picture
-from openvima.evaluation.film import Artist, film_episode
-from openvima.evaluation.rollout_policies import OraclePlayer
+from openvima.evaluation import save_episode_image
+from openvima.evaluation.film import SceneRenderer, record_episode
+from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.sim.ur5 import HOME
 
 
@@ -23,7 +23,7 @@ def read(path) -> list[np.ndarray]:
 
 
 def test_a_film_shows_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
-    outcome = film_episode(env, OraclePlayer(), 0, tmp_path / "film.mp4", title="rotate", enlarge=2)
+    outcome = record_episode(env, OracleRolloutPolicy(), 0, tmp_path / "film.mp4", title="rotate", enlarge=2)
     frames = read(tmp_path / "film.mp4")
     assert outcome.success
     assert 3 < len(frames) / 30 < 15
@@ -34,7 +34,7 @@ def test_a_film_shows_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
         np.abs(frame[: top - 2].astype(int) - frames[0][: top - 2]).mean() < 2 for frame in frames[::10]
     )
     env.reset(seed=0)
-    start = Artist(env, enlarge=2).draw(env.scene).astype(int)
+    start = SceneRenderer(env, enlarge=2).draw(env.scene).astype(int)
     assert np.abs(frames[0][top : top + 256] - start).mean() < 4
     assert (
         np.abs(frames[-1][top : top + 256] - start).mean() > np.abs(frames[0][top : top + 256] - start).mean()
@@ -43,13 +43,13 @@ def test_a_film_shows_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
 
 def test_equal_episodes_give_equal_films(env, tmp_path):
     for name in ("a.mp4", "b.mp4"):
-        film_episode(env, OraclePlayer(), 1, tmp_path / name, with_prompt=False, enlarge=1)
+        record_episode(env, OracleRolloutPolicy(), 1, tmp_path / name, with_prompt=False, enlarge=1)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
 
 
 def test_the_arm_is_drawn_only_when_asked(env):
     env.reset(seed=2)
-    artist = Artist(env, enlarge=1)
+    artist = SceneRenderer(env, enlarge=1)
     bare, with_arm = artist.draw(env.scene, joints=None), artist.draw(env.scene, HOME)
     assert bare.shape == (128, 256, 3)
     assert np.array_equal(bare, np.moveaxis(env.reset(seed=2)[0]["rgb"]["front"], 0, -1))
@@ -59,7 +59,7 @@ def test_the_arm_is_drawn_only_when_asked(env):
 def test_the_picture_of_an_episode_has_prompt_start_and_end(tmp_path):
     env = TabletopEnv("visual_manipulation")
     path = tmp_path / "new" / "look.png"
-    outcome = save_episode_picture(env, path, seed=0)
+    outcome = save_episode_image(env, path, seed=0)
     picture = np.asarray(Image.open(path)).astype(int)
     assert outcome.success
     width, middle = picture.shape[1], picture.shape[1] // 2

@@ -8,10 +8,10 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation import EvaluationConfig, Results
-from openvima.evaluation.ablations import CONTROLS, IN_CONTEXT, sight
+from openvima.evaluation.ablations import ABLATIONS, IN_CONTEXT, ablate
 from openvima.evaluation.in_context import HELD_OUT_TASKS, held_out_tasks
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import RandomPolicy
 from openvima.policies.tokenizer import encode_text
@@ -23,7 +23,7 @@ def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
     env = TabletopEnv(task, level=task_spec(task).levels[-1], domain="eval")
     observation, _ = env.reset(seed=3)
     before = env.scene
-    prompt = sight(env, IN_CONTEXT).prompt
+    prompt = ablate(env, IN_CONTEXT).prompt
     assert env.scene == before
     demo = rollout_oracle(TabletopEnv(task, level=env.level, domain="eval"), 3)
     assert demo.outcome.success
@@ -42,7 +42,7 @@ def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
 def test_an_oracle_that_finds_no_action_shows_what_it_did_until_then(monkeypatch) -> None:
     env = TabletopEnv("follow_order", level="L1", domain="eval")
     env.reset(seed=3)
-    whole = sight(env, IN_CONTEXT).prompt
+    whole = ablate(env, IN_CONTEXT).prompt
     decide, asked = TabletopEnv.oracle_decision, []
 
     def once(own):
@@ -52,7 +52,7 @@ def test_an_oracle_that_finds_no_action_shows_what_it_did_until_then(monkeypatch
         return decide(own)
 
     monkeypatch.setattr(TabletopEnv, "oracle_decision", once)
-    prompt = sight(env, IN_CONTEXT).prompt
+    prompt = ablate(env, IN_CONTEXT).prompt
     assert list(prompt.images) == ["frame_0", "frame_1"]
     np.testing.assert_array_equal(prompt.images["frame_1"].rgb["top"], whole.images["frame_1"].rgb["top"])
 
@@ -67,15 +67,15 @@ class Noting(RandomPolicy):
 
 def test_players_are_told_the_motion() -> None:
     policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
-    play([env], [0], PolicyPlayer(policy, IN_CONTEXT))
+    play([env], [0], PromptedRolloutPolicy(policy, IN_CONTEXT))
     assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")
 
 
 def test_it_is_asked_for_by_name_only() -> None:
     (source,) = policy_sources(("untrained",))
-    asked = EvaluationConfig(("untrained",), controls=("all", IN_CONTEXT)).controls_of(source)
-    assert asked == (*(name for name in CONTROLS if name != "detected_boxes"), IN_CONTEXT)
-    assert IN_CONTEXT not in EvaluationConfig(("untrained",), controls=("all",)).controls_of(source)
+    asked = EvaluationConfig(("untrained",), ablations=("all", IN_CONTEXT)).ablations_of(source)
+    assert asked == (*(name for name in ABLATIONS if name != "detected_boxes"), IN_CONTEXT)
+    assert IN_CONTEXT not in EvaluationConfig(("untrained",), ablations=("all",)).ablations_of(source)
 
 
 def test_by_default_the_tasks_are_those_that_the_levels_hold() -> None:
@@ -90,6 +90,6 @@ def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> No
     words = ["evaluate", "--policy", "untrained", "--in-context", "--episodes", "1", "--no-report"]
     assert main([*words, "--levels", "L1", "--out", str(tmp_path), "--batch", "1"]) == 0
     rows = Results.read(tmp_path / "results.json").rows
-    assert {(row.task, row.control) for row in rows} == {
-        (task, control) for task in ("twist", "follow_order") for control in ("", IN_CONTEXT)
+    assert {(row.task, row.ablation) for row in rows} == {
+        (task, ablation) for task in ("twist", "follow_order") for ablation in ("", IN_CONTEXT)
     }

@@ -13,7 +13,7 @@ from openvima.evaluation.results import Results
 @pytest.fixture
 def tables(results):
     controlled = tuple(
-        replace(row, control="no_prompt", outcomes=row.outcomes[5:])
+        replace(row, ablation="no_prompt", outcomes=row.outcomes[5:])
         for row in results.rows
         if row.policy == "mine"
     )
@@ -33,7 +33,7 @@ def test_tables_are_those_a_paper_prints(tables):
         "tasks-mine",
         "tasks-oracle",
         "tasks-random",
-        "controls-mine",
+        "input-ablations-mine",
         "difference-mine-random",
         "difference-mine-no_prompt-mine",
     ]

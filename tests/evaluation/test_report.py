@@ -218,14 +218,14 @@ def test_a_difference_inside_the_noise_is_said_to_be_so(results, tmp_path):
     assert comparison.count("≈ inside the noise") == 6  # three tasks, two levels, all
 
 
-def test_controls_stand_beside_the_score_with_what_they_change(results, tmp_path):
+def test_ablations_stand_beside_the_score_with_what_they_change(results, tmp_path):
     rows = [row for row in results.rows if row.policy == "mine"]
-    without = (replace(r, control="no_prompt", outcomes=outcomes(r.successes - 3)) for r in rows)
-    named = (replace(r, control="somebody_elses", outcomes=r.outcomes[:4]) for r in rows)
+    without = (replace(r, ablation="no_prompt", outcomes=outcomes(r.successes - 3)) for r in rows)
+    named = (replace(r, ablation="somebody_elses", outcomes=r.outcomes[:4]) for r in rows)
     path = write_report(replace(results, rows=(*results.rows, *without, *named)), tmp_path / "a.html")
     text = path.read_text(encoding="utf-8")
-    controls = section(text, "controls")
-    table = Page(controls).tables[0]
+    ablations = section(text, "ablations")
+    table = Page(ablations).tables[0]
     heads = [cell.strip() for cell in table[0]]
     assert heads == ["level", "mine", "no prompt", "somebody elses", "oracle", "random"]
     assert "75.0 %" in table[1][1] and "45.0 %" in table[1][2] and "−30 (" in table[1][2]
@@ -234,7 +234,7 @@ def test_controls_stand_beside_the_score_with_what_they_change(results, tmp_path
     plain = write_report(results, tmp_path / "b.html").read_text(encoding="utf-8")
     for name in ("overview", "results", "failures", "comparison", "published"):
         assert section(text, name) == section(plain, name)
-    assert not section(plain, "controls")
+    assert not section(plain, "ablations")
 
 
 def test_published_means_are_marked_and_said_to_rest_on_more_tasks(text):

@@ -13,7 +13,7 @@ from openvima.evaluation.sources import PolicySource
 
 def test_solved_episodes_are_filmed_and_of_trained_policies_unsolved_ones_too(results, monkeypatch):
     config = EvaluationConfig(("mine=runs/a", "oracle", "random"), videos=2)
-    jobs = report_assets.film_jobs(config, results)
+    jobs = report_assets.recording_jobs(config, results)
     filmed = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
     assert filmed == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
@@ -26,12 +26,12 @@ def test_solved_episodes_are_filmed_and_of_trained_policies_unsolved_ones_too(re
 
 
 def test_where_nobody_is_trained_all_are_filmed(results):
-    jobs = report_assets.film_jobs(EvaluationConfig(("random",)), results)
+    jobs = report_assets.recording_jobs(EvaluationConfig(("random",)), results)
     assert {job.batch.policy for job in jobs} == {"random"}
 
 
 def test_no_films_are_made_where_none_are_asked_for(results):
-    assert report_assets.film_jobs(EvaluationConfig(("oracle",), videos=0), results) == []
+    assert report_assets.recording_jobs(EvaluationConfig(("oracle",), videos=0), results) == []
 
 
 def test_episodes_chosen_by_name_are_filmed_of_every_policy(results):
@@ -39,7 +39,7 @@ def test_episodes_chosen_by_name_are_filmed_of_every_policy(results):
     config = EvaluationConfig(
         ("mine=runs/a", "oracle"), **settings, videos=0, film=("rotate/4", "rotate/L3/5")
     )
-    assert [job.episode for job in report_assets.film_jobs(config, results)] == [
+    assert [job.episode for job in report_assets.recording_jobs(config, results)] == [
         *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
         *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
     ]
@@ -49,7 +49,7 @@ def test_episodes_chosen_by_name_are_filmed_of_every_policy(results):
 def test_episodes_to_film_that_are_not_played_are_refused(text):
     config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=10, film=(text,))
     with pytest.raises(ConfigError, match=f"film is '{text}'"):
-        report_assets.chosen_episodes(config)
+        report_assets.requested_episodes(config)
 
 
 def test_films_of_more_episodes_are_added_to_those_that_are_there(tmp_path):

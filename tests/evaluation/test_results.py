@@ -26,30 +26,30 @@ def test_rows_hold_what_scripts_rely_on(results):
 def test_strict_successes_leave_out_those_slower_than_the_oracle_may_be():
     quick, slow = EpisodeOutcome(0, True, 1), EpisodeOutcome(1, True, 3)
     row = Row("mine", "rotate", "L1", 1, (quick, slow))
-    assert (row.successes, row.successes_strict) == (2, 1)
+    assert (row.successes, row.successes_oracle_horizon) == (2, 1)
 
 
 def test_the_strict_limit_of_an_episode_goes_before_that_of_its_row():
     row = Row("mine", "rotate", "L1", 1, (EpisodeOutcome(0, True, 3, oracle_max_steps=3),))
-    assert row.successes_strict == 1
+    assert row.successes_oracle_horizon == 1
 
 
-def test_rows_under_controls_stand_beside_the_plain_ones(results):
+def test_rows_under_ablations_stand_beside_the_plain_ones(results):
     plain = results.rows[0]
     under = Row("mine", "rotate", "L1", 1, plain.outcomes[5:], "no_prompt")
     both = Results((*results.rows, under), results.config, results.versions, results.policies)
     assert both.row("mine", "rotate", "L1") == plain
     assert both.row("mine", "rotate", "L1", "no_prompt") == under
-    means = {(mean.policy, mean.level, mean.control): mean.mean for mean in both.level_means()}
+    means = {(mean.policy, mean.level, mean.ablation): mean.mean for mean in both.level_means()}
     assert means["mine", "L1", "no_prompt"] == pytest.approx(0.8)
     assert means["mine", "L1", ""] == pytest.approx(0.75)
-    assert json.loads(both.to_json())["rows"][-1]["control"] == "no_prompt"
+    assert json.loads(both.to_json())["rows"][-1]["ablation"] == "no_prompt"
 
 
-def test_results_of_before_there_were_controls_are_read(results, tmp_path):
+def test_results_of_before_there_were_ablations_are_read(results, tmp_path):
     content = json.loads(results.to_json())
     for row in content["rows"]:
-        del row["control"]
+        del row["ablation"]
         for outcome in row["outcomes"]:
             del outcome["near_ties"], outcome["oracle_max_steps"]
     path = tmp_path / "results.json"

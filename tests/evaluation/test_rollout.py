@@ -13,7 +13,7 @@ from openvima.evaluation.rollout import (
     WRONG_PICKED,
     play,
 )
-from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.scene import RenderedPrompt
 
 
@@ -52,7 +52,7 @@ class Env:
         return {"seed": 0, "step": self.steps}, 0.0, terminated, truncated, info
 
 
-class Player:
+class RolloutPolicy:
     """Gives numbered actions and notes whom it was asked for."""
 
     def __init__(self, decision="go"):
@@ -74,14 +74,14 @@ def test_success_failure_and_step_limit_are_told_apart():
     solved = Env({}, {"success": True})
     failed = Env({"failure": True, "reason": "object 5 (red letter A) left the workspace"})
     slow = Env({"grasped": 5}, {}, {})
-    outcomes = play([solved, failed, slow], [10, 11, 12], Player())
+    outcomes = play([solved, failed, slow], [10, 11, 12], RolloutPolicy())
     assert [(o.seed, o.success, o.steps) for o in outcomes] == [(10, True, 2), (11, False, 1), (12, False, 3)]
     assert outcomes[1].reason == "object 5 (red letter A) left the workspace"
     assert [o.kind for o in outcomes] == ["", "object left the workspace", OUT_OF_STEPS]
 
 
 def test_the_player_is_asked_for_running_episodes_only():
-    player = Player()
+    player = RolloutPolicy()
     play([Env({"success": True}), Env({}, {}, {})], [0, 1], player)
     assert player.num_envs == 2
     assert player.asked == [[True, True], [False, True], [False, True]]
@@ -89,18 +89,18 @@ def test_the_player_is_asked_for_running_episodes_only():
 
 def test_an_episode_without_any_pick_is_counted_apart_with_the_suction_cup_only():
     cup, spatula = Env({}, {}), Env({}, {}, end_effector="spatula")
-    assert [o.kind for o in play([cup, spatula], [0, 1], Player())] == [NOTHING_PICKED, OUT_OF_STEPS]
+    assert [o.kind for o in play([cup, spatula], [0, 1], RolloutPolicy())] == [NOTHING_PICKED, OUT_OF_STEPS]
 
 
 def test_an_episode_in_which_only_other_objects_were_picked_is_counted_apart():
     wrong, right = Env({"grasped": 9}, {}), Env({"grasped": 9}, {"grasped": 6})
-    outcomes = play([wrong, right], [0, 1], Player())
+    outcomes = play([wrong, right], [0, 1], RolloutPolicy())
     assert [o.kind for o in outcomes] == [WRONG_PICKED, OUT_OF_STEPS]
     assert outcomes[1].reason == f"{OUT_OF_STEPS}: 1 of 2 goals were met"
 
 
 def test_outcomes_hold_the_strict_limit_and_the_decisions_that_rounding_may_have_made():
-    class Wavering(Player):
+    class Wavering(RolloutPolicy):
         def near_ties(self):
             return [True, len(self.asked) == 2]
 
@@ -110,7 +110,7 @@ def test_outcomes_hold_the_strict_limit_and_the_decisions_that_rounding_may_have
 
 
 def test_an_impossible_action_fails_its_episode_alone():
-    class HalfBad(Player):
+    class HalfBad(RolloutPolicy):
         def decide(self, observations):
             return ["bad", *super().decide(observations)[1:]]
 
@@ -121,17 +121,17 @@ def test_an_impossible_action_fails_its_episode_alone():
 
 
 def test_an_oracle_without_an_action_fails_the_episode():
-    (outcome,) = play([Env({})], [0], Player(OracleError("object 5 cannot be seen")))
+    (outcome,) = play([Env({})], [0], RolloutPolicy(OracleError("object 5 cannot be seen")))
     assert (outcome.kind, outcome.reason) == (NO_ORACLE_ACTION, "object 5 cannot be seen")
 
 
 def test_a_policy_that_leaves_out_a_running_episode_is_an_error():
     with pytest.raises(PolicyError, match="no action for seed 7"):
-        play([Env({})], [7], Player(None))
+        play([Env({})], [7], RolloutPolicy(None))
 
 
 def test_a_policy_with_too_few_actions_is_an_error():
-    class Short(Player):
+    class Short(RolloutPolicy):
         def decide(self, observations):
             return ["go"]
 
@@ -149,12 +149,12 @@ def test_policies_get_prompts_and_observations():
             return ["go"] * len(observations)
 
     policy = Policy()
-    play([Env({"success": True})], [3], PolicyPlayer(policy))
+    play([Env({"success": True})], [3], PromptedRolloutPolicy(policy))
     assert policy.texts == ["Wait."]
     assert policy.seen == [{"seed": 3, "step": 0}]
 
 
 def test_whoever_watches_sees_every_step():
     env, seen = Env({}, {}, {"success": True}), []
-    play([env], [0], Player(), after_step=lambda env: seen.append(env.steps))
+    play([env], [0], RolloutPolicy(), after_step=lambda env: seen.append(env.steps))
     assert seen == [1, 2, 3]

@@ -41,9 +41,9 @@ def test_each_policy_has_rows_under_its_own_name():
     assert idle.batches == [3] * 4
 
 
-def test_controls_are_played_with_objects_too():
-    results = score({"idle": Idle()}, **{**CELLS, "episodes": 1}, controls=("no_prompt", "oracle"))
-    played = {(row.policy, row.control): row.successes for row in results.rows}
+def test_ablations_are_played_with_objects_too():
+    results = score({"idle": Idle()}, **{**CELLS, "episodes": 1}, ablations=("no_prompt", "oracle"))
+    played = {(row.policy, row.ablation): row.successes for row in results.rows}
     assert played == {("idle", ""): 0, ("idle", "no_prompt"): 0, ("oracle", ""): 1}
     assert results.policies == {"idle": {"kind": "object"}, "oracle": {"kind": "oracle"}}
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageSequence
 
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.results import EpisodeOutcome
-from openvima.evaluation.rollout_policies import OraclePlayer
+from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from small_animation import SHOWN, Scenes, Wanted, compose, encoded, play_shown, tracks_of
 
 WIDTH = 200
@@ -52,7 +52,7 @@ def test_an_animation_runs_without_end_and_equal_frames_are_stored_once() -> Non
 
 
 def test_an_episode_is_played_and_drawn() -> None:
-    played = play_shown(OraclePlayer(), Wanted("rotate", "L1"), first_seed=0, width=WIDTH)
+    played = play_shown(OracleRolloutPolicy(), Wanted("rotate", "L1"), first_seed=0, width=WIDTH)
     assert played.outcome.success and played.wanted.seed is not None
     assert len(played.pictures) > 20
     assert {picture.shape for picture in played.pictures} == {(100, WIDTH, 3)}

@@ -20,13 +20,13 @@ TASKS = {"L1": ("rotate", "twist"), "L2": ("rotate",), "L3": ("twist",), "L4": (
 WHERE = {"machine": "a machine", "commit": "abc"}
 
 
-def evaluation(policy: str, solved: int, *, control: str = "", late: int = 0) -> Results:
+def evaluation(policy: str, solved: int, *, ablation: str = "", late: int = 0) -> Results:
     """The first `solved` of ten episodes of each task end well, `late` of them a step late."""
     outcomes = tuple(
         EpisodeOutcome(seed, seed < solved, 1 + (seed < late), "", "" if seed < solved else "missed")
         for seed in range(EPISODES)
     )
-    rows = tuple(Row(policy, task, x, 1, outcomes, control) for x, tasks in TASKS.items() for task in tasks)
+    rows = tuple(Row(policy, task, x, 1, outcomes, ablation) for x, tasks in TASKS.items() for task in tasks)
     return Results(rows, {"episodes": EPISODES}, {}, {policy: {"kind": "run", "sha256": "ab" * 32}})
 
 
@@ -58,7 +58,7 @@ def records(tmp_path: Path) -> list[dict[str, object]]:
 @pytest.fixture
 def shipped() -> Results:
     plain = evaluation("openvima-small", 9, late=2)
-    blind = evaluation("openvima-small", 1, control="no_prompt")
+    blind = evaluation("openvima-small", 1, ablation="no_prompt")
     return replace(plain, rows=(*plain.rows, *blind.rows))
 
 
@@ -79,7 +79,7 @@ def test_numbers_are_those_of_the_statistics(findings: Findings) -> None:
     content = record(findings)
     mean, interval = mean_of_rates([(9, EPISODES)] * 2)
     level = content["levels"][0]
-    assert (level["level"], level["control"], level["mean"]) == ("L1", "", mean)
+    assert (level["level"], level["ablation"], level["mean"]) == ("L1", "", mean)
     assert level["interval"] == [round(end, 6) for end in interval]
     assert level["within_oracle_steps"] == 0.7
     (blind, same, _) = content["differences"]
@@ -95,7 +95,7 @@ def test_tables_show_ours_beside_the_published(findings: Findings) -> None:
     lines = {line.split(" | ")[0].strip("| "): line for line in made["short"].splitlines()}
     assert "| 90.0 (" in lines["openvima-small"] and "52,000" in lines["openvima-small"]
     assert lines["MIDAS, published"].endswith("97.8 | 97.9 | 93.4 | 59.1 |")
-    assert "no prompt" in made["controls"] and "same\\_texture" in made["tasks"]
+    assert "no prompt" in made["input_ablations"] and "same\\_texture" in made["tasks"]
     assert made["ablations"].count("≈") == 4  # of the one that is the same, at every level
     assert [line.split(" | ")[1] for line in made["scaling"].splitlines()[2:]] == ["50", "500", "50", "500"]
 

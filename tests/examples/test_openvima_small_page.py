@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 TEXT = (DOCS / "openvima_small.md").read_text(encoding="utf-8")
 MARKS = {
     *(f"{name}-figure" for name in ("animation", "levels", "scaling", "ablations")),
-    *("short", "levels", "tasks", "controls", "ablations", "scaling"),
+    *("short", "levels", "tasks", "input_ablations", "ablations", "scaling"),
 }
 
 

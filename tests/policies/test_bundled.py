@@ -17,7 +17,7 @@ from openvima.evaluation import Results, report_assets  # noqa: E402
 from openvima.evaluation.config import Batch  # noqa: E402
 from openvima.evaluation.report_assets import find_metrics  # noqa: E402
 from openvima.evaluation.rollout import play  # noqa: E402
-from openvima.evaluation.rollout_policies import PolicyPlayer  # noqa: E402
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy  # noqa: E402
 from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.base import CHECKPOINTS_FOLDER, Policy, find_checkpoint  # noqa: E402
@@ -167,7 +167,7 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
     monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
     monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
     monkeypatch.setattr(quickstart, "_train", lambda *_: packaged)
-    monkeypatch.setattr(report_assets, "film_jobs", lambda *_: [])  # other tests film
+    monkeypatch.setattr(report_assets, "recording_jobs", lambda *_: [])  # other tests film
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out.splitlines()
     names = ["trained", SMALL, "oracle", "untrained", "random"]
@@ -183,5 +183,5 @@ def test_the_weights_of_the_package_solve_tasks_with_novel_objects() -> None:
     solved = []
     for task in ("visual_manipulation", "rotate", "rearrange"):
         envs = [DEFAULT_SETUP.make(task, "L3", domain="user") for _ in range(4)]
-        solved += [outcome.success for outcome in play(envs, range(4), PolicyPlayer(policy))]
+        solved += [outcome.success for outcome in play(envs, range(4), PromptedRolloutPolicy(policy))]
     assert sum(solved) >= 9

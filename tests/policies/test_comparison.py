@@ -25,7 +25,7 @@ IMAGES = ObjectEncoderConfig(
 )
 
 
-def sights(count: int, seed: int, **known) -> Sights:
+def inputs(count: int, seed: int, **known) -> Sights:
     generator = torch.Generator().manual_seed(seed)
 
     def drawn(*shape):
@@ -81,22 +81,22 @@ def weights(comparison: Comparison, own: Sights, other: Sights, allowed=ANY) -> 
 
 
 def test_each_object_is_compared_with_the_one_that_looks_like_it(comparison):
-    other = sights(M, seed=1)
-    own = sights(N, seed=2, appearance_NA=other.appearance_NA[:, [2, 0, 3]])
+    other = inputs(M, seed=1)
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, [2, 0, 3]])
     looks = weights(comparison, own, other)
     assert (looks.argmax(-1) == torch.tensor([2, 0, 3])).all()
     assert (looks.amax(-1) > 0.9).all()
 
 
 def test_what_looks_like_nothing_there_is_compared_with_nothing(comparison):
-    other = sights(M, seed=1, appearance_NA=torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A))
+    other = inputs(M, seed=1, appearance_NA=torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A))
     lonely = torch.eye(A, dtype=torch.float64)[M:].expand(B, N, A)
-    assert weights(comparison, sights(N, seed=2, appearance_NA=lonely), other).sum(-1).max() < 0.01
+    assert weights(comparison, inputs(N, seed=2, appearance_NA=lonely), other).sum(-1).max() < 0.01
 
 
 def test_of_pictures_that_look_alike_one_look_takes_the_latest_and_one_the_earliest(comparison):
     same = torch.nn.functional.normalize(torch.ones(B, 4, A, dtype=torch.float64), dim=-1)
-    frames = sights(4, seed=1, appearance_NA=same, numbers_N=torch.arange(4).expand(B, 4))
+    frames = inputs(4, seed=1, appearance_NA=same, numbers_N=torch.arange(4).expand(B, 4))
     looks = weights(comparison, frames, frames, earlier(frames))
     assert (looks[:, 0, 3].argmax(-1) == 2).all()
     assert (looks[:, 1, 3].argmax(-1) == 0).all()
@@ -105,17 +105,17 @@ def test_of_pictures_that_look_alike_one_look_takes_the_latest_and_one_the_earli
 
 
 def test_others_are_all_but_the_object_itself():
-    assert torch.equal(others(sights(3, seed=0)), ~torch.eye(3, dtype=torch.bool))
+    assert torch.equal(others(inputs(3, seed=0)), ~torch.eye(3, dtype=torch.bool))
 
 
 def test_what_lies_on_the_table_is_shown_alike_and_so_is_what_is_shown_alone():
     on_table = torch.tensor([[False, True, True]]).expand(B, -1)
-    alike = alike_shown(sights(3, seed=0, on_table_N=on_table))
+    alike = alike_shown(inputs(3, seed=0, on_table_N=on_table))
     assert alike[0].tolist() == [[True, False, False], [False, True, True], [False, True, True]]
 
 
 def test_the_way_that_an_object_has_gone_is_told_and_nothing_else_if_all_else_is_equal(comparison):
-    before = sights(N, seed=1)
+    before = inputs(N, seed=1)
     way = torch.tensor([0.05, -0.02], dtype=torch.float64)
     after = replace(before, positions_N2=before.positions_N2 + way)
     told = []
@@ -134,8 +134,8 @@ def test_the_way_that_an_object_has_gone_is_told_and_nothing_else_if_all_else_is
 
 
 def test_places_of_what_is_shown_alone_say_nothing(comparison, encoder):
-    other = sights(M, seed=1, on_table_N=torch.zeros(B, M, dtype=torch.bool))
-    own = sights(N, seed=2, appearance_NA=other.appearance_NA[:, :N])
+    other = inputs(M, seed=1, on_table_N=torch.zeros(B, M, dtype=torch.bool))
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, :N])
     moved = replace(other, positions_N2=other.positions_N2 + 0.3)
     turns = encoder.turn_between
     assert torch.equal(comparison(own, other, ANY, turns)[0], comparison(own, moved, ANY, turns)[0])
@@ -144,8 +144,8 @@ def test_places_of_what_is_shown_alone_say_nothing(comparison, encoder):
 def test_neither_order_nor_what_does_not_exist_matters(comparison, encoder):
     masks = torch.ones(B, V, M, dtype=torch.bool)
     masks[:, :, 3] = False
-    other = sights(M, seed=1, masks_VN=masks)
-    own = sights(N, seed=2, appearance_NA=other.appearance_NA[:, [3, 1, 0]])
+    other = inputs(M, seed=1, masks_VN=masks)
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, [3, 1, 0]])
     told, turns = comparison(own, other, ANY, encoder.turn_between)
     order, own_order = torch.tensor([1, 3, 0, 2]), torch.tensor([2, 0, 1])
     mixed, mixed_turns = comparison(placed(own, own_order), placed(other, order), ANY, encoder.turn_between)
@@ -160,7 +160,7 @@ def test_neither_order_nor_what_does_not_exist_matters(comparison, encoder):
 
 
 def test_there_may_be_nothing_to_compare_with(comparison, encoder):
-    own, none = sights(N, seed=1), sights(0, seed=2)
+    own, none = inputs(N, seed=1), inputs(0, seed=2)
     told, turns = comparison(own, none, ANY[:, :0], encoder.turn_between)
     assert told.shape == (B, N, D)
     assert told.isfinite().all()
@@ -169,8 +169,8 @@ def test_there_may_be_nothing_to_compare_with(comparison, encoder):
 
 def test_turns_are_those_from_what_is_looked_at(comparison, encoder):
     """The features of pictures come back from the look as they are, if it is at one of them alone."""
-    before = sights(N, seed=1)
-    after = replace(sights(N, seed=2), appearance_NA=before.appearance_NA)
+    before = inputs(N, seed=1)
+    after = replace(inputs(N, seed=2), appearance_NA=before.appearance_NA)
     _, turns = comparison(after, before, torch.eye(N, dtype=torch.bool), encoder.turn_between)
     asked = encoder.turn_between(before.features_VNF, after.features_VNF, before.masks_VN, after.masks_VN)
     torch.testing.assert_close(turns, asked, atol=1e-6, rtol=1e-4)
@@ -181,8 +181,8 @@ def test_in_training_some_crops_are_left_out(encoder):
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         module = Comparison(ComparisonConfig(hidden_width=16), images).double()
-        before = sights(N, seed=1)
-        own = sights(N, seed=2, appearance_NA=before.appearance_NA)
+        before = inputs(N, seed=1)
+        own = inputs(N, seed=2, appearance_NA=before.appearance_NA)
         seen = []
         module.difference.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
         match = torch.eye(N, dtype=torch.bool)

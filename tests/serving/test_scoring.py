@@ -16,7 +16,7 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError, ServerError  # noqa: E402
 from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E402
 from openvima.evaluation.config import Batch, policy_sources  # noqa: E402
-from openvima.evaluation.rollout_policies import PolicyPlayer, load_player  # noqa: E402
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
@@ -144,7 +144,7 @@ def test_one_connection_serves_all_that_a_process_plays() -> None:
     with serve_in_thread(Telltale()) as url:  # which lets in one client at a time
         batch = Batch("p", url, "rotate", "L1", first_seed=0, episodes=1)
         for fingerprint in ("for the scores", "for the films"):
-            assert isinstance(load_player(batch, fingerprint), PolicyPlayer)
+            assert isinstance(load_rollout_policy(batch, fingerprint), PromptedRolloutPolicy)
 
 
 def test_servers_are_named_after_their_address_or_as_asked() -> None:

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 from openvima.cli.main import main  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.evaluation import score  # noqa: E402
-from openvima.evaluation.online_eval import Trial  # noqa: E402
+from openvima.evaluation.online_eval import OnlineEval  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.learner import Learner, make_learner  # noqa: E402
 
@@ -101,7 +101,7 @@ def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
 
     def rollout(checkpoint: Path) -> dict[str, float]:
         seen.append(checkpoint.name)
-        return Trial(("rotate",), episodes=2)(checkpoint)
+        return OnlineEval(("rotate",), episodes=2)(checkpoint)
 
     config = TrainingConfig(**settings, rollout_every=4)
     train(config, rollout=rollout)

@@ -52,8 +52,8 @@ def main(
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} looks at no boxes; name a trained policy.")
     from openvima.env import EnvConfig
     from openvima.evaluation.config import Batch
-    from openvima.evaluation.film import film_episode
-    from openvima.evaluation.rollout_policies import load_player
+    from openvima.evaluation.film import record_episode
+    from openvima.evaluation.rollout_policies import load_rollout_policy
 
     setup = EnvConfig(assets, compat, difficulty)
     batch = Batch(
@@ -69,7 +69,7 @@ def main(
     )
     env = setup.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
-    outcome = film_episode(env, load_player(batch), seed, out, title=title)
+    outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
     steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
     print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {steps}")

@@ -30,7 +30,7 @@ def main(
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
-    controls: str = "",
+    ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
     batch: int = 16,
@@ -49,7 +49,7 @@ def main(
     The numbers depend on neither the number of workers nor the machine's load. An interrupted evaluation
     goes on where it stopped.
 
-    Example: openvima evaluate --policy mine=runs/first --controls all --levels L1,L2 --workers 2
+    Example: openvima evaluate --policy mine=runs/first --ablations all --levels L1,L2 --workers 2
 
     Args:
         policy: One or more of openvima-small (trained, comes with the package), oracle, random, untrained,
@@ -65,7 +65,7 @@ def main(
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
         difficulty: easy, as for all published results, medium or hard.
-        controls: What to play besides, to show what the score is made of, with commas in between: no_prompt,
+        ablations: What to play besides, to show what the score is made of, with commas in between: no_prompt,
             other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
         boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
             comes with the package, detector=FOLDER for one that `openvima detector train` made, or
@@ -93,7 +93,7 @@ def main(
     from openvima.evaluation.in_context import held_out_tasks
 
     if in_context:
-        controls = f"{controls},{IN_CONTEXT}"
+        ablations = f"{ablations},{IN_CONTEXT}"
     config = EvaluationConfig(
         policies=words_in(policy),
         tasks=held_out_tasks(words_in(levels)) if in_context and tasks == "all" else words_in(tasks),
@@ -109,7 +109,7 @@ def main(
         force=force,
         device=device,
         precision=precision,
-        controls=_with_boxes(words_in(controls), boxes),
+        ablations=_with_boxes(words_in(ablations), boxes),
         boxes=boxes,
         film=words_in(film),
         engine=engine,
@@ -135,13 +135,13 @@ def main(
 
 
 def print_results(results: "Results") -> None:
-    """Print success rates as a table, a row a task and level, a column a policy; then the controls."""
+    """Print success rates as a table, a row a task and level, a column a policy; then the ablations."""
     from rich.console import Console
     from rich.table import Table
 
     policies = results.policy_names()
     means = results.means()
-    table = Table("level", title="solved episodes in per cent (95 % interval)")
+    table = Table("level", title="success rates in % (95 % interval)")
     table.add_column("task", overflow="fold", min_width=12)
     for policy in policies:
         table.add_column(policy, justify="right", no_wrap=True)
@@ -152,32 +152,34 @@ def print_results(results: "Results") -> None:
         level_means = (means.get((policy, "", level)) for policy in policies)
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in level_means)
         table.add_row(level, "mean", *cells, style="bold")
-        strict = (_strict_mean(results, policy, level) for policy in policies)
-        table.add_row(level, "mean, strict limit", *strict, end_section=True)
+        oracle_horizon = (_oracle_horizon_mean(results, policy, level) for policy in policies)
+        table.add_row(level, "mean, oracle horizon", *oracle_horizon, end_section=True)
     Console().print(table)
-    if any(row.control for row in results.rows):
-        Console().print(_control_table(results, means))
+    if any(row.ablation for row in results.rows):
+        Console().print(_ablation_table(results, means))
 
 
-def _control_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":
-    """Level means of each policy, plain and under each control."""
+def _ablation_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":
+    """Level means of each policy, plain and under each ablation."""
     from rich.table import Table
 
-    table = Table("policy", "control", title="what the scores are made of: means in per cent (95 % interval)")
+    table = Table("policy", "ablation", title="input ablations: means in % (95 % interval)")
     for level in results.levels():
         table.add_column(level, justify="right", no_wrap=True)
-    for policy, control in dict.fromkeys((row.policy, row.control) for row in results.rows):
-        found = (means.get((policy, control, level)) for level in results.levels())
+    for policy, ablation in dict.fromkeys((row.policy, row.ablation) for row in results.rows):
+        found = (means.get((policy, ablation, level)) for level in results.levels())
         cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in found)
-        table.add_row(policy, control.replace("_", " ") or "–", *cells)
+        table.add_row(policy, ablation.replace("_", " ") or "–", *cells)
     return table
 
 
-def _strict_mean(results: "Results", policy: str, level: str) -> str:
-    """The mean with the time limit of the oracle, which is two steps shorter."""
+def _oracle_horizon_mean(results: "Results", policy: str, level: str) -> str:
+    """Mean success rate within the oracle's step limit, which is two steps shorter."""
     rows = [row for task in results.tasks(level) if (row := results.row(policy, task, level)) is not None]
     return (
-        f"{100 * sum(row.successes_strict / row.episodes for row in rows) / len(rows):.1f}" if rows else "–"
+        f"{100 * sum(row.successes_oracle_horizon / row.episodes for row in rows) / len(rows):.1f}"
+        if rows
+        else "–"
     )
 
 
@@ -185,9 +187,9 @@ def _cell(rate: float, interval: tuple[float, float]) -> str:
     return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
 
 
-def _with_boxes(controls: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
-    """Add the control that uses the boxes, if some are given and it is not asked for yet."""
+def _with_boxes(ablations: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
+    """Add the ablation that uses the boxes, if some are given and it is not asked for yet."""
     from openvima.evaluation.ablations import DETECTED_BOXES
 
-    asked = boxes is None or {"all", DETECTED_BOXES} & set(controls)
-    return controls if asked else (*controls, DETECTED_BOXES)
+    asked = boxes is None or {"all", DETECTED_BOXES} & set(ablations)
+    return ablations if asked else (*ablations, DETECTED_BOXES)

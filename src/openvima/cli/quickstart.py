@@ -70,10 +70,10 @@ def _check(**counts: int | None) -> None:
 def _first_look(path: Path, seed: int) -> None:
     """Show within seconds that the installation works: one episode solved by the oracle, as a picture."""
     from openvima.env import TabletopEnv
-    from openvima.evaluation.picture import save_episode_picture
+    from openvima.evaluation.picture import save_episode_image
 
     env = TabletopEnv("visual_manipulation", level="train")
-    save_episode_picture(env, path, seed=seed)
+    save_episode_image(env, path, seed=seed)
     _say(f"First look: the oracle solves an episode, see {path}")
 
 

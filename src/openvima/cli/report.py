@@ -42,7 +42,7 @@ def main(
         out: File to write: .html, .md or .tex; by default report.html beside the results, or in the current
             folder if there are several.
         compare: Policies with commas in between; each is compared with the first, seed by seed.
-            POLICY:CONTROL stands for its score under a control.
+            POLICY:ABLATION stands for its score under an ablation.
         runs: Folders of training runs whose learning curves to show.
         metrics: The same for a single metrics.jsonl.
         markdown: Print tables in Markdown for a paper.

@@ -70,7 +70,7 @@ def main(
         table.add_row(*(cells[name] for name in columns))
     console.print(table)
     console.print("steps: those that the oracle may take, and what a policy is given on top")
-    console.print("oracle: episodes that it solves in per cent, over all levels; --json has each level")
+    console.print("oracle: its success rate in %, over all levels; --json has each level")
     return 0
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from openvima.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from openvima.evaluation.online_eval import Trial
+    from openvima.evaluation.online_eval import OnlineEval
     from openvima.training import TrainingConfig
 
 DESCRIPTION = """Train a policy on demonstrations, or go on with a run that was interrupted.
@@ -85,13 +85,13 @@ def run(words: Sequence[str]) -> int:
     return 0
 
 
-def _rollout(config: "TrainingConfig") -> "Trial":
+def _rollout(config: "TrainingConfig") -> "OnlineEval":
     """What plays a checkpoint in the simulator, on the tasks of the data."""
     from openvima.data.reader import read_manifest
     from openvima.env import EnvConfig
-    from openvima.evaluation.online_eval import TRIAL_LEVEL, Trial
+    from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.tasks.registry import task_spec
 
     tasks = sorted(read_manifest(config.data)["tasks"])
-    playable = tuple(task for task in tasks if TRIAL_LEVEL in task_spec(task).levels)
-    return Trial(playable, config.rollout_episodes, EnvConfig(config.assets))
+    playable = tuple(task for task in tasks if ONLINE_EVAL_LEVEL in task_spec(task).levels)
+    return OnlineEval(playable, config.rollout_episodes, EnvConfig(config.assets))

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison, compare
     from openvima.evaluation.config import EvaluationConfig
     from openvima.evaluation.merging import merge
-    from openvima.evaluation.picture import save_episode_picture
+    from openvima.evaluation.picture import save_episode_image
     from openvima.evaluation.report import write_report
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
     from openvima.evaluation.runner import evaluate
@@ -23,7 +23,7 @@ _HOMES = {
     "compare": "comparison",
     "evaluate": "runner",
     "merge": "merging",
-    "save_episode_picture": "picture",
+    "save_episode_image": "picture",
     "score": "scoring",
     "wilson_interval": "statistics",
     "write_report": "report",
@@ -38,7 +38,7 @@ __all__ = [
     "compare",
     "evaluate",
     "merge",
-    "save_episode_picture",
+    "save_episode_image",
     "score",
     "wilson_interval",
     "write_report",

@@ -1,6 +1,6 @@
-"""Controls: what a score is made of. Each takes one thing away from a policy; the episode stays.
+"""Ablations: what a score is made of. Each takes one thing away from a policy; the episode stays.
 
-| control | what the policy gets |
+| ablation | what the policy gets |
 |---|---|
 | `no_prompt` | the same prompt in all episodes of all tasks: one full stop and no image |
 | `other_prompt_images` | its own words, with the images of another episode of the task and level |
@@ -13,7 +13,7 @@ What is drawn follows from the episode's task, level and seed, so neither the ba
 changes it. Starts, goals and time limits are those of the plain score.
 
 A prompt goes on listing the objects of an image in the same order under `shuffled_objects`: a policy that
-does not look at ids, nor orders by them, acts exactly as without the control.
+does not look at ids, nor orders by them, acts exactly as without the ablation.
 """
 
 import re
@@ -39,7 +39,7 @@ SCRAMBLED_WORDS = "scrambled_words"
 SHUFFLED_OBJECTS = "shuffled_objects"
 DETECTED_BOXES = "detected_boxes"
 IN_CONTEXT = "in_context"  # takes the task away and gives its solution; not among "all"
-CONTROLS = (NO_PROMPT, OTHER_PROMPT_IMAGES, SCRAMBLED_WORDS, SHUFFLED_OBJECTS, DETECTED_BOXES)
+ABLATIONS = (NO_PROMPT, OTHER_PROMPT_IMAGES, SCRAMBLED_WORDS, SHUFFLED_OBJECTS, DETECTED_BOXES)
 
 NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
 _MAX_TRIES = 100  # for tasks whose placeholders vary; those of the benchmark's own tasks never do
@@ -48,47 +48,47 @@ _PIECE = re.compile(r"\{\w+\}|[A-Za-z]+(?:-[A-Za-z]+)*|\d+|\S")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class AblatedInput:
     """What a policy gets to see of one episode.
 
     Args:
         prompt: What it is told.
-        new_ids: For each object id the one that it is shown under, shape (256,), uint8; None: its own.
+        id_map: For each object id the one that it is shown under, shape (256,), uint8; None: its own.
     """
 
     prompt: RenderedPrompt
-    new_ids: np.ndarray | None = None
+    id_map: np.ndarray | None = None
 
     def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
         """Return an observation as the policy sees it."""
-        if self.new_ids is None:
+        if self.id_map is None:
             return observation
-        return {**observation, "segm": _renumbered(observation["segm"], self.new_ids)}
+        return {**observation, "segm": _renumbered(observation["segm"], self.id_map)}
 
 
-def sight(env: TabletopEnv, control: str) -> Sight:
+def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
     """Return what a policy gets to see of the episode that an environment has begun.
 
     Args:
         env: The environment; it is left as it is.
-        control: One of `CONTROLS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
+        ablation: One of `ABLATIONS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
             `openvima.detector.hooks`.
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.
     """
-    if control == IN_CONTEXT:
-        return Sight(demonstrated(env))
-    if control == NO_PROMPT:
-        return Sight(NEUTRAL_PROMPT)
-    if control in ("", DETECTED_BOXES):
-        return Sight(env.prompt)
+    if ablation == IN_CONTEXT:
+        return AblatedInput(demonstrated(env))
+    if ablation == NO_PROMPT:
+        return AblatedInput(NEUTRAL_PROMPT)
+    if ablation in ("", DETECTED_BOXES):
+        return AblatedInput(env.prompt)
     episode = env.episode
-    rng = stream(episode.domain, episode.task, episode.level, episode.seed, f"control {control}")
-    if control == OTHER_PROMPT_IMAGES:
-        return Sight(_with_images_of_another(env, rng))
-    if control == SCRAMBLED_WORDS:
-        return Sight(replace(env.prompt, text=_scrambled(env.prompt.text, rng)))
+    rng = stream(episode.domain, episode.task, episode.level, episode.seed, f"control {ablation}")
+    if ablation == OTHER_PROMPT_IMAGES:
+        return AblatedInput(_with_images_of_another(env, rng))
+    if ablation == SCRAMBLED_WORDS:
+        return AblatedInput(replace(env.prompt, text=_scrambled(env.prompt.text, rng)))
     return _shuffled(env, rng)
 
 
@@ -117,7 +117,7 @@ def _with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> Rende
             return Rasteriser(env.assets).prompt(Prompt(prompt.text, images))
     raise SamplingError(
         f"{_MAX_TRIES} other episodes of {episode.task} at level {episode.level} have no images for "
-        f"{prompt.text!r}; evaluate this task without the control {OTHER_PROMPT_IMAGES}."
+        f"{prompt.text!r}; evaluate this task without the ablation {OTHER_PROMPT_IMAGES}."
     )
 
 
@@ -137,18 +137,18 @@ def _words() -> tuple[str, ...]:
     return tuple(sorted(word for word in word_ids() if word[0].isalpha()))
 
 
-def _shuffled(env: TabletopEnv, rng: np.random.Generator) -> Sight:
+def _shuffled(env: TabletopEnv, rng: np.random.Generator) -> AblatedInput:
     """Deal the ids out anew among the objects on the table, and among those in the prompt's scenes."""
     prompt = env.prompt
-    new_ids = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
+    id_map = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
     scenes = [image for image in prompt.images.values() if image.kind == "scene"]
     # One permutation for all images, as in the environment: an object keeps its id from frame to frame.
-    new_shown = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
+    prompt_id_map = _permutation({record.object_id for image in scenes for record in image.objects}, rng)
     images = {
-        name: _relabelled(image, new_shown) if image.kind == "scene" else image
+        name: _relabelled(image, prompt_id_map) if image.kind == "scene" else image
         for name, image in prompt.images.items()
     }
-    return Sight(RenderedPrompt(prompt.text, images), new_ids)
+    return AblatedInput(RenderedPrompt(prompt.text, images), id_map)
 
 
 def _permutation(ids: set[int], rng: np.random.Generator) -> np.ndarray:
@@ -157,13 +157,12 @@ def _permutation(ids: set[int], rng: np.random.Generator) -> np.ndarray:
     return table
 
 
-def _relabelled(image: PromptImage, new_ids: np.ndarray) -> PromptImage:
+def _relabelled(image: PromptImage, id_map: np.ndarray) -> PromptImage:
     records = tuple(
-        ObjectRecord(int(new_ids[record.object_id]), record.object, record.texture)
-        for record in image.objects
+        ObjectRecord(int(id_map[record.object_id]), record.object, record.texture) for record in image.objects
     )
-    return replace(image, segm=_renumbered(image.segm, new_ids), objects=records)
+    return replace(image, segm=_renumbered(image.segm, id_map), objects=records)
 
 
-def _renumbered(segm: Mapping[str, np.ndarray], new_ids: np.ndarray) -> dict[str, np.ndarray]:
-    return {view: new_ids[ids] for view, ids in segm.items()}
+def _renumbered(segm: Mapping[str, np.ndarray], id_map: np.ndarray) -> dict[str, np.ndarray]:
+    return {view: id_map[ids] for view, ids in segm.items()}

@@ -10,7 +10,7 @@ from openvima.evaluation.results import Results, Row
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
 
 Verdict = Literal["a", "b", "unsure", "noise"]
-CONTROL_MARK = ":"  # "mine:no_prompt" is the policy `mine` under the control `no_prompt`
+ABLATION_SEPARATOR = ":"  # "mine:no_prompt" is the policy `mine` under the ablation `no_prompt`
 _LEARNED = ("run", "remote")
 _FALSE_ALARMS = 0.05
 _MOST_PAIRS = 6  # that are compared unasked
@@ -96,7 +96,7 @@ class Comparison:
     """Two policies on the episodes that both played.
 
     Args:
-        a: Name of the first policy, with its control if any, as in "mine:no_prompt".
+        a: Name of the first policy, with its ablation if any, as in "mine:no_prompt".
         b: Name of the second one.
         tasks: Differences on single tasks, in the order level, task.
         levels: Mean over the tasks of each level.
@@ -133,14 +133,14 @@ def compare(results: Results, a: str, b: str) -> Comparison:
 
     Args:
         results: The evaluation; `merging.merge` joins several.
-        a: A policy, or "POLICY:CONTROL" for its rows under that control.
+        a: A policy, or "POLICY:ABLATION" for its rows under that ablation.
         b: Another one.
 
     Returns:
         Differences a minus b by task, level and in all.
 
     Raises:
-        UnknownPolicyError: The results hold no such policy or control.
+        UnknownPolicyError: The results hold no such policy or ablation.
         ConfigError: The two have no episode in common.
     """
     return compare_pairs(results, [(a, b)])[0]
@@ -161,7 +161,7 @@ def default_pairs(results: Results) -> list[tuple[str, str]]:
 
 
 def can_be_compared(results: Results, a: str, b: str) -> bool:
-    """Whether two policies, or a policy under a control, played any episode in common."""
+    """Whether two policies, or a policy under an ablation, played any episode in common."""
     rows_a, rows_b = _rows(results, a), _rows(results, b)
     return any(_pair(rows_a[cell], rows_b[cell]) for cell in rows_a.keys() & rows_b.keys())
 
@@ -189,16 +189,18 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 
 
 def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
-    """Rows of a policy, plain or under a control, by level and task, levels one after the other."""
+    """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
     known = results.policy_names()
-    policy, _, control = (name, "", "") if name in known else name.rpartition(CONTROL_MARK)  # mine@10:30
+    policy, _, ablation = (
+        (name, "", "") if name in known else name.rpartition(ABLATION_SEPARATOR)
+    )  # mine@10:30
     if policy not in known:
         raise UnknownPolicyError(unknown_name("policy", policy or name, known))
     of_policy = [row for row in results.rows if row.policy == policy]
-    rows = [row for row in of_policy if row.control == control]
-    if control and not rows:
-        controls = dict.fromkeys(row.control for row in of_policy if row.control)
-        raise UnknownPolicyError(unknown_name(f"control of {policy}", control, controls))
+    rows = [row for row in of_policy if row.ablation == ablation]
+    if ablation and not rows:
+        ablations = dict.fromkeys(row.ablation for row in of_policy if row.ablation)
+        raise UnknownPolicyError(unknown_name(f"ablation of {policy}", ablation, ablations))
     order = results.levels()
     return {(row.level, row.task): row for row in sorted(rows, key=lambda row: order.index(row.level))}
 

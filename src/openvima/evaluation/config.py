@@ -15,14 +15,14 @@ from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_SETUP, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
-from openvima.evaluation.ablations import CONTROLS, DETECTED_BOXES, IN_CONTEXT
+from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, IN_CONTEXT
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import PACKAGED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
-POLICY_CONTROLS = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
+REFERENCE_POLICIES = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
 DEFAULT_EPISODES = 200  # as in the published tables
 PRECISIONS = ("float64", "float32", "bfloat16")
 Engine = Literal["processes", "ray"]
@@ -55,13 +55,13 @@ class EvaluationConfig:
             float64, does the division into batches not change what they decide.
         precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a processor, float32
             elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
-        controls: What to play besides, to show what a score is made of: names of
-            `openvima.evaluation.ablations.CONTROLS`, of which each policy that reads prompts plays all;
+        ablations: What to play besides, to show what a score is made of: names of
+            `openvima.evaluation.ablations.ABLATIONS`, of which each policy that reads prompts plays all;
             "random" and "oracle", which then are played too; or ("all",). "in_context", which prompts with a
             demonstration of the episode, is asked for by its name.
-        boxes: For the control "detected_boxes": "detector" for the one that comes with the package,
+        boxes: For the ablation "detected_boxes": "detector" for the one that comes with the package,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
-            the `ObjectExtractor` to plug in. "all" takes this control in only where boxes are given.
+            the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
         film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
             levels that holds the task, or "task/level/seed".
         engine: "processes" of this machine, or "ray".
@@ -85,7 +85,7 @@ class EvaluationConfig:
     force: bool = False
     device: str = DEFAULT_DEVICE
     precision: str | None = None
-    controls: tuple[str, ...] = ()
+    ablations: tuple[str, ...] = ()
     boxes: str | None = None
     film: tuple[str, ...] = ()
     engine: Engine = "processes"
@@ -114,8 +114,8 @@ class EvaluationConfig:
             raise ConfigError(" ".join(problems))
 
     def _unknown_names(self) -> Iterator[str]:
-        allowed = ("all", *CONTROLS, IN_CONTEXT, *POLICY_CONTROLS)
-        yield from (unknown_name("control", name, allowed) for name in self.controls if name not in allowed)
+        allowed = ("all", *ABLATIONS, IN_CONTEXT, *REFERENCE_POLICIES)
+        yield from (unknown_name("ablation", name, allowed) for name in self.ablations if name not in allowed)
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
         if self.engine not in ("processes", "ray"):
@@ -124,36 +124,36 @@ class EvaluationConfig:
     def _contradictions(self) -> Iterator[str]:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
-        if DETECTED_BOXES in self.controls and self.boxes is None:
-            yield f"control {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
-        if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.controls):
-            yield f"boxes is {self.boxes!r}, which only the control {DETECTED_BOXES} plugs in; ask for it."
+        if DETECTED_BOXES in self.ablations and self.boxes is None:
+            yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
+        if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.ablations):
+            yield f"boxes is {self.boxes!r}, which only the ablation {DETECTED_BOXES} plugs in; ask for it."
         if self.film and not self.report:
             yield "film names episodes, but no report is asked for; films are part of it."
 
     @property
     def sources(self) -> tuple[PolicySource, ...]:
-        """The policies that are played, those that the controls add last.
+        """The policies that are played, those that the ablations add last.
 
         Raises:
             ConfigError: As for `policy_sources`.
         """
         given = policy_sources(self.policies)
-        asked = POLICY_CONTROLS if "all" in self.controls else self.controls
+        asked = REFERENCE_POLICIES if "all" in self.ablations else self.ablations
         there = {source.source for source in given}
-        added = [name for name in POLICY_CONTROLS if name in asked and name not in there]
+        added = [name for name in REFERENCE_POLICIES if name in asked and name not in there]
         return policy_sources((*self.policies, *added)) if added else given
 
-    def controls_of(self, source: PolicySource) -> tuple[str, ...]:
-        """Return the controls under which a policy is played, besides the plain score.
+    def ablations_of(self, source: PolicySource) -> tuple[str, ...]:
+        """Return the ablations under which a policy is played, besides the plain score.
 
         Oracle and random policy read no prompts, and a policy server finds its objects by itself.
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
-        asked = {*self.controls, *(CONTROLS if "all" in self.controls else ())}
+        asked = {*self.ablations, *(ABLATIONS if "all" in self.ablations else ())}
         usable = self.boxes is not None and source.kind != "remote"
-        names = (name for name in (*CONTROLS, IN_CONTEXT) if name in asked)
+        names = (name for name in (*ABLATIONS, IN_CONTEXT) if name in asked)
         return tuple(name for name in names if name != DETECTED_BOXES or usable)
 
     def record(self) -> dict[str, object]:
@@ -169,7 +169,7 @@ class EvaluationConfig:
             **self.setup.record(),
             **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
             **({"precision": self.precision} if self.precision else {}),
-            **({"controls": list(self.controls)} if self.controls else {}),
+            **({"ablations": list(self.ablations)} if self.ablations else {}),
             **({"boxes": self.boxes} if self.boxes else {}),
         }
 
@@ -187,7 +187,7 @@ class Batch:
         episodes: How many.
         setup: As in `EvaluationConfig`.
         device: As in `EvaluationConfig`.
-        control: What is taken from the policy; empty for nothing.
+        ablation: What is taken from the policy; empty for nothing.
         precision: As in `EvaluationConfig`; empty for the policy's own.
         boxes: What makes the detector; empty for boxes of the segmentation.
     """
@@ -200,7 +200,7 @@ class Batch:
     episodes: int
     setup: EnvConfig = DEFAULT_SETUP
     device: str = DEFAULT_DEVICE
-    control: str = ""
+    ablation: str = ""
     precision: str = ""
     boxes: str = ""
 
@@ -265,17 +265,19 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
 
 
 def plan(config: EvaluationConfig) -> list[Batch]:
-    """Divide an evaluation into batches: by policy, control, level and task, then by `config.batch` seeds.
+    """Divide an evaluation into batches: by policy, ablation, level and task, then by `config.batch` seeds.
 
     Raises:
-        ConfigError: A control fits none of the policies.
+        ConfigError: An ablation fits none of the policies.
     """
-    played = [(source, control) for source in config.sources for control in ("", *config.controls_of(source))]
-    asked = [name for name in config.controls if name in (*CONTROLS, IN_CONTEXT)]
-    if useless := [name for name in asked if name not in {control for _, control in played}]:
+    played = [
+        (source, ablation) for source in config.sources for ablation in ("", *config.ablations_of(source))
+    ]
+    asked = [name for name in config.ablations if name in (*ABLATIONS, IN_CONTEXT)]
+    if useless := [name for name in asked if name not in {ablation for _, ablation in played}]:
         raise ConfigError(
-            f"control {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "
-            "that reads prompts, or leave the control out."
+            f"ablation {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "
+            "that reads prompts, or leave the ablation out."
         )
     return [
         Batch(
@@ -287,11 +289,11 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             episodes=min(config.batch, config.episodes - offset),
             setup=config.setup,
             device=config.device,
-            control=control,
+            ablation=ablation,
             precision=config.precision or "",
-            boxes=(config.boxes or "") if control == DETECTED_BOXES else "",
+            boxes=(config.boxes or "") if ablation == DETECTED_BOXES else "",
         )
-        for source, control in played
+        for source, ablation in played
         for task, level in cells(config)
         for offset in range(0, config.episodes, config.batch)
     ]
@@ -300,12 +302,12 @@ def plan(config: EvaluationConfig) -> list[Batch]:
 def rows_of(
     batches: Sequence[Batch], outcomes: Mapping[Batch, tuple[EpisodeOutcome, ...]]
 ) -> tuple[Row, ...]:
-    """Join the batches of each policy, control, task and level."""
+    """Join the batches of each policy, ablation, task and level."""
     joined: dict[tuple[str, str, str, str], list[EpisodeOutcome]] = {}
     for batch in batches:
-        cell = (batch.policy, batch.control, batch.task, batch.level)
+        cell = (batch.policy, batch.ablation, batch.task, batch.level)
         joined.setdefault(cell, []).extend(outcomes[batch])
     return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), control)
-        for (policy, control, task, level), played in joined.items()
+        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), ablation)
+        for (policy, ablation, task, level), played in joined.items()
     )

@@ -10,7 +10,7 @@ from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import Player
+from openvima.evaluation.rollout_policies import RolloutPolicy
 from openvima.evaluation.video import VideoWriter
 from openvima.render import channels_last
 from openvima.render.rasteriser import Rasteriser
@@ -23,7 +23,7 @@ _STILL_START_S, _STILL_END_S = 0.8, 1.4  # s; time to read the prompt, and to se
 _GOOD, _BAD = (24, 121, 78), (180, 35, 24)
 
 
-class Artist:
+class SceneRenderer:
     """Draws the moments of an episode, larger and sharper than a policy sees them, and with the arm.
 
     Args:
@@ -50,9 +50,9 @@ class Artist:
         return np.ascontiguousarray(channels_last(images["front"].rgb))
 
 
-def film_episode(
+def record_episode(
     env: TabletopEnv,
-    player: Player,
+    player: RolloutPolicy,
     seed: int,
     path: Path,
     *,
@@ -74,7 +74,7 @@ def film_episode(
     Returns:
         How the episode ended.
     """
-    artist = Artist(env, enlarge)
+    artist = SceneRenderer(env, enlarge)
     env.reset(seed=seed)
     strip = draw_prompt_strip(env.prompt, width=256 * enlarge) if with_prompt else None
     last = Frame(env.scene, HOME)

@@ -91,7 +91,7 @@ def _is_same(policy: str, one: Results, other: Results) -> bool:
 
 def _outcomes(policy: str, results: Results) -> dict[tuple[str, str, str, int], tuple[bool, int]]:
     return {
-        (row.task, row.level, row.control, outcome.seed): (outcome.success, outcome.steps)
+        (row.task, row.level, row.ablation, outcome.seed): (outcome.success, outcome.steps)
         for row in results.rows
         if row.policy == policy
         for outcome in row.outcomes
@@ -99,20 +99,20 @@ def _outcomes(policy: str, results: Results) -> dict[tuple[str, str, str, int], 
 
 
 def _rows(evaluations: Mapping[str, Results], names: Mapping[str, Mapping[str, str]]) -> tuple[Row, ...]:
-    """All rows under their new names, in the order policy, control, level, task."""
+    """All rows under their new names, in the order policy, ablation, level, task."""
     joined: dict[tuple[str, str, str, str], Row] = {}
     for label, results in evaluations.items():
         for row in results.rows:
             row = replace(row, policy=names[label][row.policy])
-            key = (row.policy, row.control, row.level, row.task)
+            key = (row.policy, row.ablation, row.level, row.task)
             joined[key] = _joined(joined[key], row) if key in joined else row
     policies = list(dict.fromkeys(row.policy for row in joined.values()))
-    controls = list(dict.fromkeys(row.control for row in joined.values()))
+    ablations = list(dict.fromkeys(row.ablation for row in joined.values()))
     tasks = list(dict.fromkeys(row.task for row in joined.values()))
 
     def place(row: Row) -> tuple[int, ...]:
         level = LEVELS.index(row.level) if row.level in LEVELS else len(LEVELS)
-        return policies.index(row.policy), controls.index(row.control), level, tasks.index(row.task)
+        return policies.index(row.policy), ablations.index(row.ablation), level, tasks.index(row.task)
 
     return tuple(sorted(joined.values(), key=place))
 

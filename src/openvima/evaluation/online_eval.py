@@ -5,15 +5,15 @@ from pathlib import Path
 
 from openvima.env.config import DEFAULT_SETUP, EnvConfig
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PolicyPlayer
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies.base import load_policy
 
-TRIAL_LEVEL = "L1"
+ONLINE_EVAL_LEVEL = "L1"
 _DOMAIN = "user"  # evaluation episodes stay unseen until the policy is finished
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class OnlineEval:
     """Plays the same few episodes of some tasks with every checkpoint that it is given.
 
     Args:
@@ -36,6 +36,6 @@ class Trial:
 
     def _rate(self, task: str, policy: object) -> float:
         seeds = range(self.episodes)
-        envs = [self.setup.make(task, TRIAL_LEVEL, domain=_DOMAIN) for _ in seeds]
-        outcomes = play(envs, seeds, PolicyPlayer(policy))
+        envs = [self.setup.make(task, ONLINE_EVAL_LEVEL, domain=_DOMAIN) for _ in seeds]
+        outcomes = play(envs, seeds, PromptedRolloutPolicy(policy))
         return sum(outcome.success for outcome in outcomes) / len(outcomes)

@@ -8,18 +8,18 @@ from PIL import Image, ImageDraw
 from openvima.atomic_io import atomic_write_file
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation.clips import png
-from openvima.evaluation.film import Artist
+from openvima.evaluation.film import SceneRenderer
 from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import OraclePlayer, Player
+from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
 
 _GAP = 12  # pixels between the parts
 _MUTED = (91, 100, 114)
 
 
-def save_episode_picture(
-    env: TabletopEnv, path: Path, *, seed: int, player: Player | None = None, enlarge: int = 2
+def save_episode_image(
+    env: TabletopEnv, path: Path, *, seed: int, player: RolloutPolicy | None = None, enlarge: int = 2
 ) -> EpisodeOutcome:
     """Play one episode and draw it: the prompt above, the table before and after side by side.
 
@@ -33,10 +33,10 @@ def save_episode_picture(
     Returns:
         How the episode ended.
     """
-    artist = Artist(env, enlarge)
+    artist = SceneRenderer(env, enlarge)
     env.reset(seed=seed)
     start = artist.draw(env.scene, joints=None)
-    (outcome,) = play([env], [seed], player or OraclePlayer())
+    (outcome,) = play([env], [seed], player or OracleRolloutPolicy())
     end = artist.draw(env.scene, joints=None)
     ended = "after: solved" if outcome.success else "after: not solved"
     scenes = _beside(_titled(start, "before"), _titled(end, ended))

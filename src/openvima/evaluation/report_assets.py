@@ -28,7 +28,7 @@ _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
-class FilmJob:
+class RecordingJob:
     """One episode to film: a batch of one, under the name that its policy bears in the results."""
 
     batch: Batch
@@ -67,7 +67,7 @@ def finish(config: EvaluationConfig, results: Results, note: Callable[[str], Non
     """
     from openvima.evaluation.report import write_report
 
-    jobs = film_jobs(config, results)
+    jobs = recording_jobs(config, results)
     clips = _filmed(jobs, config, note)
     return write_report(
         results,
@@ -79,7 +79,7 @@ def finish(config: EvaluationConfig, results: Results, note: Callable[[str], Non
 
 
 def _filmed(
-    jobs: Sequence[FilmJob], config: EvaluationConfig, note: Callable[[str], None] | None
+    jobs: Sequence[RecordingJob], config: EvaluationConfig, note: Callable[[str], None] | None
 ) -> list[Clip]:
     """Film the episodes that were not filmed before."""
     clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
@@ -95,7 +95,7 @@ def _filmed(
     return found
 
 
-def chosen_episodes(config: EvaluationConfig) -> list[tuple[str, str, int]]:
+def requested_episodes(config: EvaluationConfig) -> list[tuple[str, str, int]]:
     """Read the episodes that `config.film` names: task, level, seed.
 
     Raises:
@@ -119,14 +119,14 @@ def chosen_episodes(config: EvaluationConfig) -> list[tuple[str, str, int]]:
     return chosen
 
 
-def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
+def recording_jobs(config: EvaluationConfig, results: Results) -> list[RecordingJob]:
     """Choose which episodes to film, without looking at them.
 
     Of each task at the first level that holds it: the first `config.videos` solved episodes of every trained
     policy and of the oracle, and as many unsolved ones of trained policies. Where there are neither trained
     policies nor the oracle, of all policies. And the episodes that were chosen by hand, of every policy.
     """
-    sources, by_hand = config.sources, chosen_episodes(config)
+    sources, by_hand = config.sources, requested_episodes(config)
     worth = [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources
     jobs = []
     for source in worth:
@@ -144,23 +144,23 @@ def film_jobs(config: EvaluationConfig, results: Results) -> list[FilmJob]:
     return list(dict.fromkeys(jobs))
 
 
-def film(job: FilmJob, count: Callable[[int], None]) -> Clip:
+def film(job: RecordingJob, count: Callable[[int], None]) -> Clip:
     """Film one episode; runs in a worker process."""
     from PIL import Image
 
-    from openvima.evaluation.film import Artist, film_episode
+    from openvima.evaluation.film import SceneRenderer, record_episode
     from openvima.evaluation.prompt_strip import thumbnail
-    from openvima.evaluation.rollout_policies import load_player, one_thread
+    from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 
     batch = job.batch
     env = batch.setup.make(batch.task, batch.level, domain="eval", realtime=True)
     env.reset(seed=batch.first_seed)
-    poster = png(Image.fromarray(Artist(env, enlarge=2).draw(env.scene)))
+    poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
     with tempfile.TemporaryDirectory() as folder, one_thread(batch):
         path = Path(folder, "film.mp4")
-        player = load_player(batch, job.fingerprint)
-        outcome = film_episode(env, player, batch.first_seed, path, with_prompt=False)
+        player = load_rollout_policy(batch, job.fingerprint)
+        outcome = record_episode(env, player, batch.first_seed, path, with_prompt=False)
         video = path.read_bytes()
     count(1)
     return Clip(
@@ -188,7 +188,7 @@ def command_of(config: EvaluationConfig) -> str:
         f"--seed {config.seed}",
         *config.setup.words(),
         *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
-        *([f"--controls {','.join(config.controls)}"] if config.controls else []),
+        *([f"--ablations {','.join(config.ablations)}"] if config.ablations else []),
         *([f"--boxes {shlex.quote(config.boxes)}"] if config.boxes else []),
         *([] if config.device == DEFAULT_DEVICE else [f"--device {config.device}"]),
         *([f"--precision {config.precision}"] if config.precision else []),
@@ -215,7 +215,9 @@ def _seeds_to_film(row: Row, number: int, *, unsolved: bool) -> list[int]:
     return solved + failed
 
 
-def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> FilmJob:
+def _job(
+    config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int
+) -> RecordingJob:
     batch = Batch(
         row.policy,
         source.source,
@@ -227,4 +229,4 @@ def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: 
         device=config.device,
         precision=config.precision or "",
     )
-    return FilmJob(batch, str(results.policies.get(source.name)))
+    return RecordingJob(batch, str(results.policies.get(source.name)))

@@ -26,7 +26,7 @@ class EpisodeOutcome:
         steps: Actions taken.
         reason: Empty on success, else one sentence.
         kind: Empty on success, else the reason without names and numbers, for counting.
-        redraws: Unlucky draws that were thrown away before a start was found.
+        resamples: Unlucky draws that were thrown away before a start was found.
         oracle_max_steps: Steps within which the oracle must be done; None: as the row says.
         near_ties: Decisions in which two classes scored so alike that rounding may choose between them.
     """
@@ -36,7 +36,7 @@ class EpisodeOutcome:
     steps: int
     reason: str = ""
     kind: str = ""
-    redraws: int = 0
+    resamples: int = 0
     oracle_max_steps: int | None = None
     near_ties: int = 0
 
@@ -51,7 +51,7 @@ class Row:
         level: "train", "L1", "L2", "L3" or "L4".
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
-        control: What was taken from the policy, see `openvima.evaluation.ablations`; empty for the plain
+        ablation: What was taken from the policy, see `openvima.evaluation.ablations`; empty for the plain
             score.
     """
 
@@ -60,7 +60,7 @@ class Row:
     level: str
     oracle_max_steps: int
     outcomes: tuple[EpisodeOutcome, ...]
-    control: str = ""
+    ablation: str = ""
 
     @property
     def episodes(self) -> int:
@@ -78,7 +78,7 @@ class Row:
         return self.successes / self.episodes
 
     @property
-    def successes_strict(self) -> int:
+    def successes_oracle_horizon(self) -> int:
         """Number of episodes solved in no more steps than the oracle may take."""
         return sum(
             outcome.success and outcome.steps <= (outcome.oracle_max_steps or self.oracle_max_steps)
@@ -96,9 +96,9 @@ class Row:
         return sum(outcome.steps for outcome in self.outcomes) / max(1, self.episodes)
 
     @property
-    def redraws(self) -> int:
+    def resamples(self) -> int:
         """Number of unlucky draws that were thrown away, over all episodes."""
-        return sum(outcome.redraws for outcome in self.outcomes)
+        return sum(outcome.resamples for outcome in self.outcomes)
 
     @property
     def near_ties(self) -> list[int]:
@@ -121,7 +121,7 @@ class LevelMean:
     mean: float
     interval: Interval
     tasks: tuple[str, ...]
-    control: str = ""
+    ablation: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,28 +153,28 @@ class Results:
         """Tasks that occur, at one level or at all."""
         return _in_order(row.task for row in self.rows if level in (None, row.level))
 
-    def row(self, policy: str, task: str, level: str, control: str = "") -> Row | None:
-        """The row of that policy, task and level, under a control or plain, if there is one."""
-        wanted = (policy, task, level, control)
+    def row(self, policy: str, task: str, level: str, ablation: str = "") -> Row | None:
+        """The row of that policy, task and level, under an ablation or plain, if there is one."""
+        wanted = (policy, task, level, ablation)
         return next(
-            (row for row in self.rows if (row.policy, row.task, row.level, row.control) == wanted), None
+            (row for row in self.rows if (row.policy, row.task, row.level, row.ablation) == wanted), None
         )
 
     def level_means(self) -> list[LevelMean]:
-        """Mean over the tasks of each level, for each policy, plain and under each control."""
+        """Mean over the tasks of each level, for each policy, plain and under each ablation."""
         cells: dict[tuple[str, str, str], list[Row]] = {}
         for row in self.rows:
-            cells.setdefault((row.policy, row.control, row.level), []).append(row)
+            cells.setdefault((row.policy, row.ablation, row.level), []).append(row)
         means = []
-        for (policy, control, level), rows in cells.items():
+        for (policy, ablation, level), rows in cells.items():
             mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
             tasks = tuple(row.task for row in rows)
-            means.append(LevelMean(policy, level, mean, interval, tasks, control))
+            means.append(LevelMean(policy, level, mean, interval, tasks, ablation))
         return means
 
     def means(self) -> dict[tuple[str, str, str], LevelMean]:
-        """The same means by policy, control and level; the control is empty for the plain score."""
-        return {(mean.policy, mean.control, mean.level): mean for mean in self.level_means()}
+        """The same means by policy, ablation and level; the ablation is empty for the plain score."""
+        return {(mean.policy, mean.ablation, mean.level): mean for mean in self.level_means()}
 
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
@@ -234,17 +234,17 @@ def _row_record(row: Row) -> dict[str, object]:
         "policy": row.policy,
         "task": row.task,
         "level": row.level,
-        "control": row.control,
+        "ablation": row.ablation,
         "successes": row.successes,
         "episodes": row.episodes,
         "rate": _rounded(row.rate),
         "interval": [_rounded(end) for end in row.interval],
-        "successes_strict": row.successes_strict,
+        "successes_oracle_horizon": row.successes_oracle_horizon,
         "oracle_max_steps": row.oracle_max_steps,
         "mean_steps": _rounded(row.mean_steps),
         "seeds": [row.outcomes[0].seed, row.outcomes[-1].seed],
         "failures": row.failures,
-        "redraws": row.redraws,
+        "resamples": row.resamples,
         "near_ties": row.near_ties,
         "outcomes": [asdict(outcome) for outcome in row.outcomes],
     }
@@ -258,7 +258,7 @@ def _row_from_record(record: Mapping[str, Any]) -> Row:
         record["level"],
         record["oracle_max_steps"],
         outcomes,
-        record.get("control", ""),
+        record.get("ablation", ""),
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError, PolicyError
 from openvima.evaluation.results import EpisodeOutcome, failure_kind
-from openvima.evaluation.rollout_policies import Decision, Player
+from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
 WRONG_PICKED = "only wrong objects were picked up within the step limit"
@@ -15,7 +15,7 @@ BAD_ACTION = "invalid action"
 NO_ORACLE_ACTION = "the oracle has no action"
 
 
-class _Seat:
+class _EpisodeSlot:
     """One environment of a batch, with what is known of its episode."""
 
     def __init__(self, env: TabletopEnv, seed: int) -> None:
@@ -71,7 +71,7 @@ class _Seat:
             self.steps,
             reason,
             kind,
-            redraws=episode.num_redraws,
+            resamples=episode.num_redraws,
             oracle_max_steps=episode.oracle_max_steps,
             near_ties=self.near_ties,
         )
@@ -80,7 +80,7 @@ class _Seat:
 def play(
     envs: Sequence[TabletopEnv],
     seeds: Sequence[int],
-    player: Player,
+    player: RolloutPolicy,
     *,
     after_step: Callable[[TabletopEnv], None] | None = None,
 ) -> list[EpisodeOutcome]:
@@ -98,17 +98,17 @@ def play(
     Raises:
         PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
     """
-    seats = [_Seat(env, seed) for env, seed in zip(envs, seeds, strict=True)]
+    slots = [_EpisodeSlot(env, seed) for env, seed in zip(envs, seeds, strict=True)]
     player.begin(envs)
-    while any(seat.outcome is None for seat in seats):
-        decisions = player.decide([seat.observation for seat in seats])
-        if len(decisions) != len(seats):
-            raise PolicyError(f"the policy gave {len(decisions)} actions for {len(seats)} observations.")
-        near_ties = player.near_ties() or [False] * len(seats)
-        for seat, decision, is_near_tie in zip(seats, decisions, near_ties, strict=True):
-            if seat.outcome is None:
-                seat.near_ties += is_near_tie
-                seat.step(decision)
+    while any(slot.outcome is None for slot in slots):
+        decisions = player.decide([slot.observation for slot in slots])
+        if len(decisions) != len(slots):
+            raise PolicyError(f"the policy gave {len(decisions)} actions for {len(slots)} observations.")
+        near_ties = player.near_ties() or [False] * len(slots)
+        for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
+            if slot.outcome is None:
+                slot.near_ties += is_near_tie
+                slot.step(decision)
                 if after_step is not None:
-                    after_step(seat.env)
-    return [seat.outcome for seat in seats if seat.outcome is not None]
+                    after_step(slot.env)
+    return [slot.outcome for slot in slots if slot.outcome is not None]

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from openvima.detector.hooks import plugged_extractor
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
-from openvima.evaluation.ablations import Sight, sight
+from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.scene import Action
@@ -19,7 +19,7 @@ Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Decision = Mapping[str, Any] | Action | OracleError | None
 
 
-class Player(Protocol):
+class RolloutPolicy(Protocol):
     """Decides for several environments at once."""
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
@@ -38,7 +38,7 @@ class Player(Protocol):
         ...
 
 
-class OraclePlayer:
+class OracleRolloutPolicy:
     """The scripted oracle, which knows the scene."""
 
     def __init__(self) -> None:
@@ -58,27 +58,27 @@ class OraclePlayer:
         return ()
 
 
-class PolicyPlayer:
+class PromptedRolloutPolicy:
     """A policy, which sees prompts and observations only.
 
     Args:
         policy: Follows the `Policy` protocol of `openvima.policies`.
-        control: What is taken from it, one of `openvima.evaluation.ablations`; empty for nothing.
+        ablation: What is taken from it, one of `openvima.evaluation.ablations`; empty for nothing.
     """
 
-    def __init__(self, policy: Any, control: str = "") -> None:  # Any: third parties need no base class
+    def __init__(self, policy: Any, ablation: str = "") -> None:  # Any: third parties need no base class
         self._policy = policy
-        self._control = control
-        self._sights: list[Sight] = []
+        self._ablation = ablation
+        self._inputs: list[AblatedInput] = []
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Tell the policy the prompts."""
-        self._sights = [sight(env, self._control) for env in envs]
-        self._policy.reset([seen.prompt for seen in self._sights])
+        self._inputs = [ablate(env, self._ablation) for env in envs]
+        self._policy.reset([seen.prompt for seen in self._inputs])
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Let the policy act."""
-        pairs = zip(self._sights, observations, strict=True)
+        pairs = zip(self._inputs, observations, strict=True)
         return self._policy.act([None if image is None else seen.observation(image) for seen, image in pairs])
 
     def near_ties(self) -> Sequence[bool]:
@@ -86,7 +86,7 @@ class PolicyPlayer:
         return getattr(self._policy, "near_ties", ())
 
 
-def load_player(batch: Batch, fingerprint: str = "") -> Player:
+def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
     """Make the player of a batch of episodes.
 
     Args:
@@ -101,9 +101,9 @@ def load_player(batch: Batch, fingerprint: str = "") -> Player:
         ServerError: No policy server answers at the address.
     """
     if batch.source == ORACLE:
-        return OraclePlayer()
+        return OracleRolloutPolicy()
     policy = _load_policy(batch.source, fingerprint, batch.device, batch.precision, batch.boxes)
-    return PolicyPlayer(policy, batch.control)
+    return PromptedRolloutPolicy(policy, batch.ablation)
 
 
 @contextmanager
@@ -124,7 +124,7 @@ def one_thread(batch: Batch) -> Iterator[None]:
 @lru_cache(maxsize=1)
 def _load_policy(
     source: str, fingerprint: str, device: str, precision: str, boxes: str
-) -> Any:  # Any: see `PolicyPlayer`
+) -> Any:  # Any: see `PromptedRolloutPolicy`
     from openvima.policies import load_policy
 
     if is_remote(source):

@@ -14,9 +14,9 @@ from openvima.detector.hooks import extractor_maker
 from openvima.errors import ConfigError
 from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
-from openvima.evaluation.report_assets import chosen_episodes, finish, require_extra
+from openvima.evaluation.report_assets import finish, requested_episodes, require_extra
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
-from openvima.evaluation.rollout_policies import load_player, one_thread
+from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
 from openvima.multiprocess import in_processes
 
@@ -60,7 +60,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
     if config.boxes is not None:
         extractor_maker(config.boxes)  # a mistake there is named before anything is played
     batches = plan(config)
-    chosen_episodes(config)
+    requested_episodes(config)
     policies = {source.name: source.record() for source in config.sources}
     found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
     path = config.out / FILE_NAME
@@ -117,7 +117,7 @@ def _play_all(
         outcomes[job.batch] = played
         done += job.batch.episodes
         if report is not None:
-            words = (job.batch.policy, job.batch.control, job.batch.task, job.batch.level)
+            words = (job.batch.policy, job.batch.ablation, job.batch.task, job.batch.level)
             report(done, total, " ".join(filter(None, words)))
     return outcomes
 
@@ -141,7 +141,7 @@ def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, 
 
     batch = job.batch
     with one_thread(batch):
-        player = load_player(batch, job.fingerprint)
+        player = load_rollout_policy(batch, job.fingerprint)
         envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         outcomes = tuple(play(envs, batch.seeds, player))
     count(len(outcomes))

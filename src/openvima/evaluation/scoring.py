@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PolicyPlayer, load_player
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
 
@@ -17,7 +17,7 @@ def score(
     levels: tuple[str, ...] = ("L1", "L2", "L3", "L4"),
     episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
-    controls: tuple[str, ...] = (),
+    ablations: tuple[str, ...] = (),
 ) -> Results:
     """Play the episodes of `openvima evaluate` with policies that exist as objects only.
 
@@ -27,7 +27,7 @@ def score(
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
-        controls: What to play besides; as in `EvaluationConfig`, except for "detected_boxes".
+        ablations: What to play besides; as in `EvaluationConfig`, except for "detected_boxes".
 
     Returns:
         Success rates and the outcome of every episode.
@@ -49,7 +49,7 @@ def score(
         levels=levels,
         episodes=episodes,
         seed=seed,
-        controls=controls,
+        ablations=ablations,
         report=False,
     )
     batches = plan(config)
@@ -57,7 +57,7 @@ def score(
     for batch in batches:
         envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
-        player = load_player(batch) if given is None else PolicyPlayer(given, batch.control)
+        player = load_rollout_policy(batch) if given is None else PromptedRolloutPolicy(given, batch.ablation)
         outcomes[batch] = tuple(play(envs, batch.seeds, player))
     kinds = {
         source.name: {"kind": "object"} if source.name in policies else source.record()

@@ -11,11 +11,11 @@ from PIL import Image, ImageDraw
 from openvima.atomic_io import atomic_write_file
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.env.config import DEFAULT_SETUP
-from openvima.evaluation.film import Artist
-from openvima.evaluation.picture import save_episode_picture
+from openvima.evaluation.film import SceneRenderer
+from openvima.evaluation.picture import save_episode_image
 from openvima.evaluation.prompt_strip import INK, draw_prompt_strip, font
 from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import OraclePlayer
+from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.tasks import TaskSpec, list_tasks, task_spec
 
 SHEET_NAME = "contact_sheet.png"
@@ -60,7 +60,7 @@ def save_task_gallery(
     for number, spec in enumerate(specs):
         env = setup.make(spec.name, spec.levels[0], domain="user")
         solved = _first_solved(env, seed)
-        save_episode_picture(env, folder / f"{spec.name}.png", seed=solved)
+        save_episode_image(env, folder / f"{spec.name}.png", seed=solved)
         panels.append(_panel(env, spec.name, solved))
         if report is not None:
             report(number + 1, len(specs), spec.name)
@@ -71,7 +71,7 @@ def save_task_gallery(
 
 def _first_solved(env: TabletopEnv, seed: int) -> int:
     for candidate in range(seed, seed + _TRIES):
-        (outcome,) = play([env], [candidate], OraclePlayer())
+        (outcome,) = play([env], [candidate], OracleRolloutPolicy())
         if outcome.success:
             return candidate
     return seed  # shown as it is: not solved
@@ -79,8 +79,8 @@ def _first_solved(env: TabletopEnv, seed: int) -> int:
 
 def _panel(env: TabletopEnv, title: str, seed: int) -> Image.Image:
     """Title, prompt and the table after the episode."""
-    play([env], [seed], OraclePlayer())
-    scene = Artist(env, enlarge=2).draw(env.scene, joints=None)
+    play([env], [seed], OracleRolloutPolicy())
+    scene = SceneRenderer(env, enlarge=2).draw(env.scene, joints=None)
     strip = draw_prompt_strip(env.prompt, width=scene.shape[1], image_height=56, font_size=16)
     head = Image.new("RGB", (scene.shape[1], _TITLE_HEIGHT), (255, 255, 255))
     place = (10, _TITLE_HEIGHT // 2)

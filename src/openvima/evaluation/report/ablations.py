@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-from openvima.evaluation.comparison import CONTROL_MARK, Comparison, can_be_compared, compare_pairs
+from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, can_be_compared, compare_pairs
 from openvima.evaluation.report.markup import folded, policy_head, section
 from openvima.evaluation.report.tables import mean_cell, rate_cell
 from openvima.evaluation.report.text import (
     LEVEL_NAMES,
-    control_meaning,
-    control_name,
+    ablation_description,
+    ablation_name,
     points,
     points_span,
     prose,
@@ -19,19 +19,19 @@ from openvima.evaluation.results import LevelMean, Results
 _BOUNDS = ("oracle", "random")  # kinds of policies between which a score lies
 
 
-def control_section(results: Results) -> str:
-    """Scores under controls beside the plain ones; nothing where no controls were played."""
-    policies = [policy for policy in results.policy_names() if _controls(results, policy)]
+def ablation_section(results: Results) -> str:
+    """Scores under ablations beside the plain ones; nothing where no ablations were played."""
+    policies = [policy for policy in results.policy_names() if _ablations(results, policy)]
     if not policies:
         return ""
-    controls = dict.fromkeys(control for policy in policies for control in _controls(results, policy))
+    ablations = dict.fromkeys(ablation for policy in policies for ablation in _ablations(results, policy))
     meanings = "".join(
-        f"<dt>{prose(control_name(control))}</dt><dd>{prose(control_meaning(control))}</dd>"
-        for control in controls
+        f"<dt>{prose(ablation_name(ablation))}</dt><dd>{prose(ablation_description(ablation))}</dd>"
+        for ablation in ablations
     )
     means = results.means()
     return section(
-        "controls",
+        "ablations",
         "What the score is made of",
         "The same policy on the same episodes with something taken from it. What it still solves does not "
         "need that. Below each score stand its interval and the change in points; ≈ marks what is inside the "
@@ -41,36 +41,40 @@ def control_section(results: Results) -> str:
     )
 
 
-def _controls(results: Results, policy: str) -> list[str]:
-    return list(dict.fromkeys(row.control for row in results.rows if row.policy == policy and row.control))
+def _ablations(results: Results, policy: str) -> list[str]:
+    return list(dict.fromkeys(row.ablation for row in results.rows if row.policy == policy and row.ablation))
 
 
 def _policy(results: Results, means: Mapping[tuple[str, str, str], LevelMean], policy: str) -> str:
-    controls = _controls(results, policy)
-    comparisons = _against_plain(results, policy, controls)
+    ablations = _ablations(results, policy)
+    comparisons = _against_plain(results, policy, ablations)
     bounds = [
         name
         for name in results.policy_names()
         if name != policy and results.policies.get(name, {}).get("kind") in _BOUNDS
     ]
     colours = series_colours(results)
-    columns = [(policy, ""), *((policy, control) for control in controls), *((name, "") for name in bounds)]
+    columns = [
+        (policy, ""),
+        *((policy, ablation) for ablation in ablations),
+        *((name, "") for name in bounds),
+    ]
     head = "".join(
-        f'<th scope="col">{prose(control_name(control))}</th>'
-        if control
+        f'<th scope="col">{prose(ablation_name(ablation))}</th>'
+        if ablation
         else policy_head(name, colours[name])
-        for name, control in columns
+        for name, ablation in columns
     )
     head = f'<thead><tr><th scope="col">level</th>{head}</tr></thead>'
     rows, details = "", ""
     for level in results.levels():
         cells = "".join(
             _with_drop(
-                mean_cell(means.get((name, control, level)), len(results.tasks(level))),
-                comparisons.get(control),
+                mean_cell(means.get((name, ablation, level)), len(results.tasks(level))),
+                comparisons.get(ablation),
                 level,
             )
-            for name, control in columns
+            for name, ablation in columns
         )
         rows += (
             f'<tr><th scope="row">{prose(level)}<small>{prose(LEVEL_NAMES.get(level, ""))}</small></th>'
@@ -88,15 +92,15 @@ def _policy(results: Results, means: Mapping[tuple[str, str, str], LevelMean], p
     )
 
 
-def _against_plain(results: Results, policy: str, controls: list[str]) -> dict[str, Comparison]:
-    """Each control against the plain score, where both were played on some of the same episodes."""
-    names = {control: f"{policy}{CONTROL_MARK}{control}" for control in controls}
+def _against_plain(results: Results, policy: str, ablations: list[str]) -> dict[str, Comparison]:
+    """Each ablation against the plain score, where both were played on some of the same episodes."""
+    names = {ablation: f"{policy}{ABLATION_SEPARATOR}{ablation}" for ablation in ablations}
     pairs = {c: (name, policy) for c, name in names.items() if can_be_compared(results, name, policy)}
     return dict(zip(pairs, compare_pairs(results, list(pairs.values())), strict=True))
 
 
 def _with_drop(cell: str, comparison: Comparison | None, level: str) -> str:
-    """Add to a cell by how much the control changes the score."""
+    """Add to a cell by how much the ablation changes the score."""
     if comparison is None:
         return cell
     for difference in comparison.levels:
@@ -110,7 +114,7 @@ def _with_drop(cell: str, comparison: Comparison | None, level: str) -> str:
 def _task_rows(results: Results, level: str, columns: list[tuple[str, str]]) -> str:
     return "".join(
         f'<tr><th scope="row">{prose(task)}<small>{prose(level)}</small></th>'
-        + "".join(rate_cell(results.row(name, task, level, control)) for name, control in columns)
+        + "".join(rate_cell(results.row(name, task, level, ablation)) for name, ablation in columns)
         + "</tr>"
         for task in results.tasks(level)
     )

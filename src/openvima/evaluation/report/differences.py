@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.report.markup import breakable, folded, section
-from openvima.evaluation.report.text import counted, per_cent, points, points_span, probability, prose
+from openvima.evaluation.report.text import counted, percent, points, points_span, probability, prose
 
 _METHOD = (
     "Both policies played the same seeds, so each episode is compared with itself. Differences are in "
@@ -74,8 +74,8 @@ def _row(comparison: Comparison, difference: Difference) -> str:
         f'<td class="num"><b>{points(difference.difference)}</b>'
         f"<small>{points_span(difference.interval)}</small></td>"
         f"<td>{interval_bar(difference)}{_mark(comparison, difference)}</td>"
-        f'<td class="num">{per_cent(difference.rate_a, 1)}</td>'
-        f'<td class="num">{per_cent(difference.rate_b, 1)}</td>'
+        f'<td class="num">{percent(difference.rate_a, 1)}</td>'
+        f'<td class="num">{percent(difference.rate_b, 1)}</td>'
         f'<td class="num">{difference.only_a} : {difference.only_b}</td>'
         f'<td class="num">{probability(difference.p_value)}'
         f"<small>({probability(difference.p_mid)})</small></td>"

@@ -10,7 +10,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.clips import Clip
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.report import sections
-from openvima.evaluation.report.ablations import control_section
+from openvima.evaluation.report.ablations import ablation_section
 from openvima.evaluation.report.curves import read_run_charts
 from openvima.evaluation.report.differences import comparison_section
 from openvima.evaluation.report.published_comparison import published_section
@@ -70,7 +70,7 @@ def write_report(
         failure_table(results),
         sections.level_charts(results),
         comparison_section(comparisons),
-        control_section(results),
+        ablation_section(results),
         published_section(results),
         sections.training_charts(read_run_charts(records) if records else []),
         sections.level_meanings(results),
@@ -93,7 +93,7 @@ def default_command(results: Results) -> str:
             if config.get(name, usual) != usual
         ],
         *(["--compat"] if config.get("compat") else []),
-        *([f"--controls {','.join(config['controls'])}"] if config.get("controls") else []),
+        *([f"--ablations {','.join(config['ablations'])}"] if config.get("ablations") else []),
         "--out DIR",
     ]
     return " ".join(words)

@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from openvima.evaluation.comparison import CONTROL_MARK, Comparison, Difference
+from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.report.published import leading_models, published_tasks
-from openvima.evaluation.report.text import control_name, counted
+from openvima.evaluation.report.text import ablation_name, counted
 from openvima.evaluation.results import LevelMean, Results
 
-_Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, control and level
+_Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
 _NOISE_MARK = "≈"
 _LATEX_TEXT = {
     "\\": r"\textbackslash{}",
@@ -33,7 +33,7 @@ _LATEX_TEXT = {
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A number with its interval, as fractions; shown in per cent.
+    """A number with its interval, as fractions; written as percentages.
 
     Args:
         value: The number.
@@ -75,15 +75,15 @@ class Table:
 
 
 def paper_tables(results: Results, comparisons: Sequence[Comparison] = ()) -> list[Table]:
-    """Choose what a paper would print: level means, tasks by level of each policy, controls, differences."""
+    """Choose what a paper would print: level means, tasks by level of each policy, ablations, differences."""
     means = results.means()
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
-    with_controls = [
-        _control_table(results, means, policy)
+    with_ablations = [
+        _ablation_table(results, means, policy)
         for policy in results.policy_names()
-        if any(row.policy == policy and row.control for row in results.rows)
+        if any(row.policy == policy and row.ablation for row in results.rows)
     ]
-    return [_mean_table(results, means), *by_policy, *with_controls, *map(_difference_table, comparisons)]
+    return [_mean_table(results, means), *by_policy, *with_ablations, *map(_difference_table, comparisons)]
 
 
 def markdown(tables: Sequence[Table]) -> str:
@@ -118,7 +118,7 @@ def _mean_table(results: Results, means: _Means) -> Table:
     ]
     sizes = ", ".join(f"{len(results.tasks(level))} at {level}" for level in levels)
     caption = (
-        f"Success rates in per cent, means over the tasks of each level ({sizes}), with 95 % intervals. "
+        f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
         f"{_made_of(results)}"
     )
     if any(published_tasks(level) for level in levels):
@@ -142,27 +142,28 @@ def _task_table(results: Results, means: _Means, policy: str) -> Table:
         lines.append(Line(task, tuple(Estimate(row.rate, row.interval) if row else "–" for row in rows)))
     cells = tuple(_mean_cell(means.get((policy, "", level)), 0) for level in levels)
     lines.append(Line("mean", cells, starts_group=True))
-    caption = f"Success rates of {policy} in per cent, with 95 % intervals. {_made_of(results, policy)}"
+    caption = f"Success rates of {policy} (%), with 95 % intervals. {_made_of(results, policy)}"
     return Table(f"tasks-{policy}", caption, ("task", *levels), tuple(lines))
 
 
-def _control_table(results: Results, means: _Means, policy: str) -> Table:
+def _ablation_table(results: Results, means: _Means, policy: str) -> Table:
     levels = results.levels()
-    controls = dict.fromkeys(row.control for row in results.rows if row.policy == policy)
+    ablations = dict.fromkeys(row.ablation for row in results.rows if row.policy == policy)
     lines = [
         Line(
-            control_name(control) if control else "none",
+            ablation_name(ablation) if ablation else "none",
             tuple(
-                _mean_cell(means.get((policy, control, level)), len(results.tasks(level))) for level in levels
+                _mean_cell(means.get((policy, ablation, level)), len(results.tasks(level)))
+                for level in levels
             ),
         )
-        for control in controls
+        for ablation in ablations
     ]
     caption = (
-        f"Success rates of {policy} in per cent under controls, means over the tasks of each level, with "
+        f"Success rates of {policy} (%) with input ablations, means over the tasks of each level, with "
         "95 % intervals."
     )
-    return Table(f"controls-{policy}", caption, ("control", *levels), tuple(lines))
+    return Table(f"input-ablations-{policy}", caption, ("ablation", *levels), tuple(lines))
 
 
 def _difference_table(comparison: Comparison) -> Table:
@@ -171,7 +172,7 @@ def _difference_table(comparison: Comparison) -> Table:
         _difference_line(difference, starts_group=difference is first)
         for difference in (*comparison.tasks, *comparison.means)
     ]
-    a, b = (name.replace(CONTROL_MARK, ", ") for name in (comparison.a, comparison.b))
+    a, b = (name.replace(ABLATION_SEPARATOR, ", ") for name in (comparison.a, comparison.b))
     caption = (
         f"Success rate of {a} minus that of {b} on the same episodes, in percentage points, with 95 % "
         "intervals; episodes solved by one of them only; exact McNemar test, p as it is and after Holm for "
@@ -195,7 +196,7 @@ def _difference_line(difference: Difference, *, starts_group: bool) -> Line:
 
 
 def _plain(results: Results, policy: str) -> list:
-    return [row for row in results.rows if (row.policy, row.control) == (policy, "")]
+    return [row for row in results.rows if (row.policy, row.ablation) == (policy, "")]
 
 
 def _mean_cell(mean: LevelMean | None, num_tasks: int) -> Estimate | str:
@@ -208,7 +209,7 @@ def _mean_cell(mean: LevelMean | None, num_tasks: int) -> Estimate | str:
 
 def _made_of(results: Results, policy: str | None = None) -> str:
     """Say how many episodes a number is made of."""
-    rows = [row for row in results.rows if not row.control and policy in (None, row.policy)]
+    rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
     episodes = sorted({row.episodes for row in rows})
     return f"{episodes[0]:,} to " * (len(episodes) > 1) + f"{counted(episodes[-1], 'episode')} a task."
 

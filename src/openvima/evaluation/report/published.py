@@ -26,7 +26,7 @@ class PublishedModel:
         model: Its name there.
         size: Parameters of its controller, such as "200M".
         data_share: Share of the demonstrations that it was trained on.
-        levels: Success rate at each level, in per cent.
+        levels: Success rate at each level (%).
         printed: Whether the authors printed the numbers; else they are read off figures.
         rough: Levels whose number is read off to half a point only.
     """
@@ -65,7 +65,7 @@ def leading_models() -> list[PublishedModel]:
 
 
 def published_tasks(level: str) -> Mapping[str, float]:
-    """Success by task of VIMA 200M at a level, in per cent; the tasks are all that the level holds."""
+    """Success rates by task (%) of VIMA 200M at a level, for all tasks of that level."""
     for record in _content()["tasks"]:
         if (record["model"], record["size"], record["level"]) == (*BESIDE, level):
             return record["tasks"]

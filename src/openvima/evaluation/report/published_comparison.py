@@ -25,7 +25,7 @@ def published_section(results: Results) -> str:
     return section(
         "published",
         "Beside published numbers",
-        "Means over the tasks of each level, in per cent. " + _coverage(results, levels),
+        "Means over the tasks of each level (%). " + _coverage(results, levels),
         f'<div class="card scroll"><table class="rates">{_head(levels)}<tbody>{_own_rows(results, levels)}'
         f'</tbody><tbody class="elsewhere">{_rows(leading, levels)}</tbody></table></div>'
         f'<p class="note">{prose(RELIABILITY)}</p>'
@@ -60,7 +60,7 @@ def _head(levels: Sequence[str]) -> str:
 
 def _own_rows(results: Results, levels: Sequence[str]) -> str:
     colours = series_colours(results)
-    means = {(mean.policy, mean.level): mean for mean in results.level_means() if not mean.control}
+    means = {(mean.policy, mean.level): mean for mean in results.level_means() if not mean.ablation}
     return "".join(
         f'<tr><th scope="row" style="--series:var({colours[policy]})">{DOT}{prose(policy)}'
         "<small>this evaluation</small></th>"

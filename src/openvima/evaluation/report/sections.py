@@ -14,7 +14,7 @@ from openvima.evaluation.report.text import (
     findings,
     headline,
     listed,
-    per_cent,
+    percent,
     prose,
     role,
     series_colours,
@@ -47,7 +47,7 @@ def heading(results: Results, notes: Sequence[str] = ()) -> str:
 def policy_cards(results: Results) -> str:
     """Level means of each policy, as bars."""
     colours = series_colours(results)
-    means = [mean for mean in results.level_means() if not mean.control]
+    means = [mean for mean in results.level_means() if not mean.ablation]
     cards = []
     for policy in results.policy_names():
         meters = "".join(_meter(mean) for mean in means if mean.policy == policy)
@@ -152,7 +152,7 @@ def reproduction(results: Results, command: str) -> str:
         f'<div class="card"><pre><code>{prose(command)}</code></pre>'
         '<p class="note">The outcome of every single episode is in the results.json of the evaluation. '
         "Objects are cut out along the simulator’s own outlines, as in most published scores; a detector "
-        "finds them only where the control “detected boxes” says so.</p>"
+        "finds them only where the ablation “detected boxes” says so.</p>"
         f'<ul class="versions">{versions}{weights}</ul></div>',
     )
 
@@ -163,11 +163,11 @@ def summary_line(results: Results) -> str:
 
 
 def _meter(mean: LevelMean) -> str:
-    text = f"{mean.level}: {per_cent(mean.mean)}, 95 % interval {span(mean.interval)}"
+    text = f"{mean.level}: {percent(mean.mean)}, 95 % interval {span(mean.interval)}"
     return (
         f'<div class="meter" title="{prose(text)}"><span>{prose(mean.level)}</span>'
         f'<span class="track"><i style="width:{100 * mean.mean:.1f}%"></i></span>'
-        f"<b>{per_cent(mean.mean)}</b></div>"
+        f"<b>{percent(mean.mean)}</b></div>"
     )
 
 

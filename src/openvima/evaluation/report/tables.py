@@ -9,7 +9,7 @@ from openvima.evaluation.report.text import (
     LEVEL_NAMES,
     counted,
     exact,
-    per_cent,
+    percent,
     prose,
     series_colours,
     span,
@@ -39,8 +39,7 @@ def rate_table(results: Results) -> str:
     return section(
         "results",
         "Results by task",
-        "Solved episodes in per cent; below, the 95 % interval in per cent, and counts. Means weigh all "
-        "tasks of a level alike.",
+        "Solved episodes (%), with 95 % intervals (%) and counts. Means weight all tasks of a level alike.",
         '<div class="card scroll"><table class="rates"><thead><tr><th scope="col">task</th>'
         f"{head}</tr></thead>{bodies}</table></div>{note}",
     )
@@ -50,7 +49,7 @@ def failure_table(results: Results) -> str:
     """Why episodes were not solved, by policy."""
     lines, colours = [], series_colours(results)
     for policy in results.policy_names():
-        rows = [row for row in results.rows if row.policy == policy and not row.control]
+        rows = [row for row in results.rows if row.policy == policy and not row.ablation]
         lines += _failure_lines(policy, colours[policy], rows)
     return section(
         "failures",
@@ -78,7 +77,7 @@ def mean_cell(mean: LevelMean | None, num_tasks: int) -> str:
         return "<td>–</td>"
     fewer = f" · {len(mean.tasks)} of {num_tasks} tasks" if len(mean.tasks) < num_tasks else ""
     return (
-        f'<td class="rate" style="--share:{mean.mean:.3f}"><b>{per_cent(mean.mean, 1)}</b>'
+        f'<td class="rate" style="--share:{mean.mean:.3f}"><b>{percent(mean.mean, 1)}</b>'
         f"<small>{span(mean.interval)}{fewer}</small></td>"
     )
 
@@ -110,13 +109,13 @@ def _strict_row(results: Results, level: str, is_published: bool) -> list[str]:
     """Means under the oracle's own step limit, where they differ from those under the usual one."""
     cells, differs = [], False
     for policy in results.policy_names():
-        rows = [r for r in results.rows if (r.policy, r.level, r.control) == (policy, level, "")]
+        rows = [r for r in results.rows if (r.policy, r.level, r.ablation) == (policy, level, "")]
         if not rows:
             cells.append("<td>–</td>")
             continue
-        mean, interval = mean_of_rates([(row.successes_strict, row.episodes) for row in rows])
-        differs = differs or any(row.successes_strict < row.successes for row in rows)
-        cells.append(f"<td>{per_cent(mean, 1)}<small>{span(interval)}</small></td>")
+        mean, interval = mean_of_rates([(row.successes_oracle_horizon, row.episodes) for row in rows])
+        differs = differs or any(row.successes_oracle_horizon < row.successes for row in rows)
+        cells.append(f"<td>{percent(mean, 1)}<small>{span(interval)}</small></td>")
     if not differs:
         return []
     head = '<th scope="row">mean within the oracle’s steps<small>instead of two more</small></th>'
@@ -142,7 +141,7 @@ def _failure_lines(policy: str, colour: str, rows: list[Row]) -> list[str]:
     ranked = sorted(causes.items(), key=lambda item: (-item[1], item[0]))
     lines = [
         f'<tr><td class="name">{name if index == 0 else ""}</td><td class="cause">{prose(kind)}</td>'
-        f'<td class="num">{count}</td><td class="num">{per_cent(count / total, 1)}</td>'
+        f'<td class="num">{count}</td><td class="num">{percent(count / total, 1)}</td>'
         f'<td class="long">{prose(_by_task(tasks[kind]))}</td></tr>'
         for index, (kind, count) in enumerate(ranked[:_MOST_CAUSES])
     ]
@@ -151,7 +150,7 @@ def _failure_lines(policy: str, colour: str, rows: list[Row]) -> list[str]:
         count = sum(number for _, number in rare)
         lines.append(
             f'<tr><td></td><td class="cause">{counted(len(rare), "rarer cause")}</td>'
-            f'<td class="num">{count}</td><td class="num">{per_cent(count / total, 1)}</td><td></td></tr>'
+            f'<td class="num">{count}</td><td class="num">{percent(count / total, 1)}</td><td></td></tr>'
         )
     return lines
 

@@ -25,7 +25,7 @@ _ROLES = {
     "run": "Trained policy: sees only the prompt and two camera images.",
     "remote": "Policy behind a server: sees only the prompt and two camera images.",
 }
-_CONTROL_MEANINGS = {
+_ABLATION_DESCRIPTIONS = {
     "no_prompt": "The prompt is a full stop in every episode. What is still solved, the table gives away.",
     "other_prompt_images": "The prompt has its own words, with images of another episode of the task.",
     "scrambled_words": "The prompt has its own images; each word is some word of the vocabulary.",
@@ -38,14 +38,14 @@ _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
 
 
-def control_name(control: str) -> str:
-    """Name of a control as words."""
-    return control.replace("_", " ")
+def ablation_name(ablation: str) -> str:
+    """Name of an ablation as words."""
+    return ablation.replace("_", " ")
 
 
-def control_meaning(control: str) -> str:
-    """One sentence on what a control takes from the policy."""
-    return _CONTROL_MEANINGS.get(control, "See the documentation of the evaluation.")
+def ablation_description(ablation: str) -> str:
+    """One sentence on what an ablation takes from the policy."""
+    return _ABLATION_DESCRIPTIONS.get(ablation, "See the documentation of the evaluation.")
 
 
 def role(results: Results, policy: str) -> str:
@@ -67,11 +67,11 @@ def series_colours(results: Results) -> dict[str, str]:
     return colours
 
 
-def per_cent(fraction: float, decimals: int = 0) -> str:
+def percent(fraction: float, decimals: int = 0) -> str:
     """Write a rate in per cent.
 
     Example:
-        >>> per_cent(0.8666), per_cent(0.8666, 1)
+        >>> percent(0.8666), percent(0.8666, 1)
         ('87 %', '86.7 %')
     """
     return f"{100 * fraction:.{decimals}f} %"
@@ -79,7 +79,7 @@ def per_cent(fraction: float, decimals: int = 0) -> str:
 
 def exact(fraction: float) -> str:
     """Whole per cent where the rate is, as with 50 or 100 episodes, else one decimal."""
-    return per_cent(fraction, 0 if round(1000 * fraction) % 10 == 0 else 1)
+    return percent(fraction, 0 if round(1000 * fraction) % 10 == 0 else 1)
 
 
 def points(difference: float, decimals: int = 1) -> str:
@@ -138,19 +138,19 @@ def listed(names: list[str]) -> str:
 def headline(results: Results) -> str:
     """The finding in one line: what the trained policy, or else the first one, reaches on its first level."""
     played = results.level_means()
-    means = [mean for mean in played if not mean.control] or played
+    means = [mean for mean in played if not mean.ablation] or played
     trained = [m for m in means if results.policies.get(m.policy, {}).get("kind") in ("run", "remote")]
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
-    return f"{first.policy} solves {per_cent(first.mean)} of {first.level} episodes ({tasks})"
+    return f"{first.policy} solves {percent(first.mean)} of {first.level} episodes ({tasks})"
 
 
 def findings(results: Results) -> str:
     """All level means as one sentence a policy."""
-    means = [mean for mean in results.level_means() if not mean.control]
+    means = [mean for mean in results.level_means() if not mean.ablation]
     sentences = []
     for policy in results.policy_names():
-        rates = [f"{per_cent(mean.mean)} on {mean.level}" for mean in means if mean.policy == policy]
+        rates = [f"{percent(mean.mean)} on {mean.level}" for mean in means if mean.policy == policy]
         sentences.append(f"{policy}: {', '.join(rates)}")
     return "; ".join(sentences) + "."
 
