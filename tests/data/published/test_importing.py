@@ -66,7 +66,7 @@ def test_an_import_tells_its_origin_and_what_was_broken(source: Path, imported: 
     assert json.loads((imported / "broken.json").read_text()) == [
         {
             "member": "same_profile/000007",
-            "reason": "obs.pkl: it ends before its last instruction (an interrupted copy?).",
+            "reason": "obs.pkl: it is truncated or no pickle of data (pickle exhausted before seeing STOP).",
         }
     ]
 
@@ -182,6 +182,8 @@ def test_the_command_line_imports_and_names_what_was_left_out(
     shown = capsys.readouterr()
     assert shown.out == f"{tmp_path / 'out'}\n"
     assert "1 left out" in shown.err
-    assert "same_profile/000007: obs.pkl: it ends before" in shown.err.replace("\n", " ")
+    assert "same_profile/000007: obs.pkl: it is truncated or no pickle of data" in shown.err.replace(
+        "\n", " "
+    )
     assert main(["data", "import", str(tmp_path / "no.zip"), str(tmp_path / "out")]) == 2
     assert "there is no file or folder" in capsys.readouterr().err.replace("\n", " ")

@@ -1,31 +1,37 @@
-"""Reading pickles without running them.
+"""Unpickling published files without running their code.
 
-A pickle is a program for a machine that may call any function of any module. The machine here has only the
-instructions that build data; where a file would call something, it notes name, arguments and state in a
-`Record`. Names that the published files do not need are refused. What arrays and numbers mean is read from
-their records afterwards, so no code of another library sees a byte before it was checked.
+A pickle is a program that may call any function. `read_pickle` first checks the opcodes, then runs them with
+a `pickle.Unpickler` that knows a closed list of classes. Each is replaced by an inert stand-in that holds
+arguments and state; other names are refused. Arrays and numbers are decoded from their stand-ins afterwards.
 """
 
+import io
+import pickle
+import pickletools
 import re
-import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
 from openvima.errors import MemberError
 
-MAX_OPERATIONS = 100_000  # the largest known file has about 3,000
-_LONGEST_NAME = 200
+MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000
+_MAX_TUPLE_SIZE = 1_000  # values in a tuple and in the tuples inside it
+_MAX_TEXT = 200  # characters of a name or reason that a message quotes
+# What `pickle` raises when it is given damaged bytes.
+_ODD_ERRORS = (
+    *(pickle.UnpicklingError, LookupError, TypeError, ValueError, AttributeError, EOFError),
+    *(ArithmeticError, MemoryError),
+)
 _DTYPE = re.compile(r"[<>|=]?[buif][1248]")
 
 _NUMPY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _ENCYCLOPEDIA = tuple(f"{package}.tasks.components.encyclopedia" for package in ("vimasim", "vima_bench"))
 ARRAYS = frozenset(f"{module}._reconstruct" for module in _NUMPY)
 SCALARS = frozenset(f"{module}.scalar" for module in _NUMPY)
-# Classes of which files hold instances.
-CLASSES = frozenset(
+# Classes whose instances published files contain.
+_CLASSES = frozenset(
     [
         *ARRAYS,
         *SCALARS,
@@ -41,8 +47,8 @@ CLASSES = frozenset(
         *(f"omegaconf.nodes.{kind}Node" for kind in ("Any", "String", "Integer", "Boolean")),
     ]
 )
-# What is only ever named.
-NAMES = frozenset(
+# Classes and functions that published files only refer to.
+_NAMES = frozenset(
     [
         "numpy.ndarray",
         *("builtins.dict", "builtins.list", "builtins.int"),
@@ -54,55 +60,136 @@ NAMES = frozenset(
         ),
     ]
 )
+_OPCODES = frozenset(
+    (
+        *("PROTO", "FRAME", "STOP", "MARK", "NONE", "NEWTRUE", "NEWFALSE", "BININT1", "BININT2", "BININT"),
+        *("LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
+        *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "EMPTY_TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "TUPLE"),
+        *("EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS"),
+        *("BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET", "LONG_BINGET"),
+        *("GLOBAL", "STACK_GLOBAL", "REDUCE", "NEWOBJ", "BUILD"),
+    )
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Global:
-    """A class or function that a pickle names, by its dotted name; nothing was imported."""
+    """A class or function that a pickle only refers to, by its dotted name; nothing is imported."""
 
     name: str
 
+    def __call__(self, *args: object) -> NoReturn:
+        """Refuse to be called."""
+        raise MemberError(f"it calls {self.name}, which no published file does; nothing was run.")
 
-@dataclass(slots=True, eq=False)
+    def __setstate__(self, state: object) -> NoReturn:
+        """Refuse to be changed."""
+        raise MemberError(f"it changes {self.name}, which no published file does; nothing was run.")
+
+
 class Record:
-    """What would have been an instance of a class: how to make it, but not made.
+    """Stand-in for an instance of a class; it holds what the pickle says and does nothing.
 
     Args:
-        name: Dotted name of the class.
-        args: What it would have been called with.
-        state: What it would have been given afterwards.
+        args: Arguments of the constructor.
     """
 
-    name: str
-    args: tuple
-    state: object = None
+    __slots__ = ("args", "state")
+    name: ClassVar[str]  # dotted name of the class
+
+    def __new__(cls, *args: object) -> "Record":
+        """Hold the arguments; pickles also make instances without `__init__`."""
+        record = super().__new__(cls)
+        record.args, record.state = args, None
+        return record
+
+    def __setstate__(self, state: object) -> None:
+        """Hold the state."""
+        self.state = state
+
+    def __setitem__(self, key: object, value: object) -> None:
+        """Ignore the items of a mapping, which nothing reads."""
+
+
+STAND_INS: dict[str, type[Record]] = {
+    name: type(name.rpartition(".")[2], (Record,), {"__slots__": (), "name": name}) for name in _CLASSES
+}
 
 
 def read_pickle(content: bytes) -> Any:  # Any: whatever the file holds
-    """Return what a pickle holds: plain values, lists, tuples, dictionaries, `Global` and `Record`.
+    """Return the data in a pickle: plain values, lists, tuples, dictionaries, `Global` and `Record`.
 
     Args:
         content: The file.
 
     Raises:
-        MemberError: It is damaged, too long, or needs more than data.
+        MemberError: It is damaged, too large, or more than data.
     """
-    machine = _Machine(content)
     try:
-        return machine.run()
+        _check_opcodes(content)
+        return _Unpickler(io.BytesIO(content)).load()
     except MemberError:
         raise
-    except (IndexError, KeyError, TypeError, ValueError, AttributeError, struct.error):
-        raise MemberError(
-            f"it is no pickle of data, or ends too early (byte {machine.position:,} of {len(content):,})."
-        ) from None
+    except _ODD_ERRORS as error:
+        reason = str(error)[:_MAX_TEXT] or type(error).__name__
+        raise MemberError(f"it is truncated or no pickle of data ({reason}).") from None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Finds stand-ins only."""
+
+    def find_class(self, module: str, name: str) -> type[Record] | Global:
+        """Return the stand-in of a class, or the name of what is never called."""
+        dotted = f"{module}.{name}"
+        if dotted in STAND_INS:
+            return STAND_INS[dotted]
+        if dotted in _NAMES:
+            return Global(dotted)
+        raise MemberError(f"it names {dotted[:_MAX_TEXT]}, which no published file needs; nothing was run.")
+
+
+def _check_opcodes(content: bytes) -> None:
+    """Refuse opcodes that published files do not have, and what would cost much time or memory.
+
+    A tuple whose items repeat one tuple, and so on, takes exponential time to hash. Sizes of tuples are
+    therefore followed through stack and memo.
+    """
+    sizes: list[int] = []  # of the values on the stack; 1 for all that is no tuple
+    marks: list[int] = []
+    memo: dict[int, int] = {}
+    for number, (opcode, argument, _) in enumerate(pickletools.genops(content)):
+        name, consumed = opcode.name, len(opcode.stack_before)
+        if number >= MAX_OPERATIONS:
+            raise MemberError(f"it has more than {MAX_OPERATIONS:,} opcodes; published files are shorter.")
+        if name not in _OPCODES:
+            raise MemberError(f"it has the opcode {name}, which no published file needs; nothing was run.")
+        if name == "MARK":
+            marks.append(len(sizes))
+            continue
+        if name in ("MEMOIZE", "BINPUT", "LONG_BINPUT"):
+            index = len(memo) if argument is None else argument
+            if index > MAX_OPERATIONS:  # `pickle` would allocate as many entries
+                raise MemberError(f"it has the memo index {index:,}; published files have smaller ones.")
+            memo[index] = sizes[-1]
+            continue
+        if pickletools.markobject in opcode.stack_before:  # which, with "stackslice", stands for the values
+            consumed += len(sizes) - marks.pop() - 2
+        rest = len(sizes) - consumed
+        if rest < (marks[-1] if marks else 0):
+            raise pickle.UnpicklingError("stack underflow")
+        size = 1 + sum(sizes[rest:]) if "TUPLE" in name else 1
+        if name in ("BINGET", "LONG_BINGET"):
+            size = memo[argument or 0]
+        if size > _MAX_TUPLE_SIZE:
+            raise MemberError(f"it has a tuple of more than {_MAX_TUPLE_SIZE:,} values, with nested ones.")
+        sizes[rest:] = [size] * len(opcode.stack_after)
 
 
 def as_array(value: object) -> np.ndarray:
-    """Decode the record of an array; the result is read-only.
+    """Decode the stand-in of an array; the result is read-only.
 
     Raises:
-        MemberError: It is none, it holds anything but numbers, or its size does not fit its shape.
+        MemberError: It is none, holds anything but numbers, or its size does not fit its shape.
     """
     if not isinstance(value, Record) or value.name not in ARRAYS or not isinstance(value.state, tuple):
         raise MemberError(f"it has {kind_of(value)} where an array should be.")
@@ -116,10 +203,10 @@ def as_array(value: object) -> np.ndarray:
 
 
 def as_plain(value: object) -> object:
-    """Return the number that a record of a NumPy scalar holds, and any other value as it is.
+    """Return the number in the stand-in of a NumPy scalar, and any other value as it is.
 
     Raises:
-        MemberError: The record is damaged.
+        MemberError: The number is damaged.
     """
     if not isinstance(value, Record) or value.name not in SCALARS:
         return value
@@ -133,7 +220,7 @@ def as_plain(value: object) -> object:
 
 
 def kind_of(value: object) -> str:
-    """Describe a value in a word or two; nested ones are not looked into, they may be endless."""
+    """Describe a value in a word or two, without visiting nested values, which may be endless."""
     if value is None or isinstance(value, bool | int | float):
         return repr(value)
     if isinstance(value, str):
@@ -142,7 +229,7 @@ def kind_of(value: object) -> str:
 
 
 def _frombuffer(content: object, dtype: object) -> np.ndarray:
-    """Bytes as numbers; the size of the result is that of the bytes, whatever a file claims."""
+    """View bytes as numbers; the result has the size of the bytes, whatever a file claims."""
     if not isinstance(dtype, Record) or dtype.name != "numpy.dtype" or not isinstance(content, bytes):
         raise TypeError
     spec = dtype.args[0] if dtype.args else None
@@ -151,182 +238,3 @@ def _frombuffer(content: object, dtype: object) -> np.ndarray:
     order = dtype.state[1] if isinstance(dtype.state, tuple) and len(dtype.state) > 1 else "|"
     numbers = np.dtype(spec)
     return np.frombuffer(content, numbers.newbyteorder(">") if order == ">" else numbers)
-
-
-class _Machine:
-    """Reads one pickle; see `pickletools` for the instructions."""
-
-    def __init__(self, content: bytes) -> None:
-        self.content = content
-        self.position = 0
-        self.stack: list[Any] = []  # Any: whatever the file holds
-        self.marks: list[int] = []
-        self.memo: dict[int, object] = {}
-
-    def run(self) -> object:
-        """Follow the instructions up to the last one."""
-        for _ in range(MAX_OPERATIONS):
-            code = self.content[self.position : self.position + 1]
-            self.position += 1
-            if code == b".":
-                return self.stack.pop()
-            instruction = _INSTRUCTIONS.get(code)
-            if instruction is None:
-                raise MemberError(_refusal(code))
-            instruction(self)
-        raise MemberError(f"it has more than {MAX_OPERATIONS:,} instructions; published files are shorter.")
-
-    def take(self, num_bytes: int) -> bytes:
-        """The next bytes."""
-        taken = self.content[self.position : self.position + num_bytes]
-        if len(taken) < num_bytes:
-            raise IndexError
-        self.position += num_bytes
-        return taken
-
-    def number(self, layout: str) -> Any:  # Any: int or float
-        """The next number."""
-        return struct.unpack(layout, self.take(struct.calcsize(layout)))[0]
-
-    def line(self) -> str:
-        """The next line of text."""
-        end = self.content.index(b"\n", self.position, self.position + _LONGEST_NAME)
-        return self.take(end + 1 - self.position)[:-1].decode()
-
-    def push(self, value: object) -> None:
-        self.stack.append(value)
-
-    def since_mark(self) -> list[Any]:  # Any: whatever the file holds
-        """Take everything above the last mark."""
-        mark = self.marks.pop()
-        taken = self.stack[mark:]
-        del self.stack[mark:]
-        return taken
-
-    def push_last(self, count: int) -> None:
-        """Join the last values to a tuple."""
-        if len(self.stack) < count:
-            raise IndexError
-        self.stack[-count:] = [tuple(self.stack[-count:])]
-
-    def extend(self, values: list[Any]) -> None:
-        """Append to the list below."""
-        if isinstance(self.stack[-1], Record):
-            raise MemberError(f"it fills {self.stack[-1].name}, which is not needed to read it.")
-        self.stack[-1].extend(values)
-
-    def update(self, pairs: list[Any]) -> None:
-        """Write into the dictionary below."""
-        target, keys = self.stack[-1], pairs[::2]
-        for key in keys:
-            # Hashes of nested tuples can take forever.
-            if not isinstance(key, str | int | float | bytes | None):
-                raise MemberError(f"it has {kind_of(key)} as a key; only texts and numbers are read.")
-        if isinstance(target, dict):
-            target.update(zip(keys, pairs[1::2], strict=True))
-        elif not isinstance(target, Record):
-            raise TypeError
-
-    def name(self, module: str, name: str) -> None:
-        """Note the name of a class or function."""
-        dotted = f"{module}.{name}"
-        if dotted not in CLASSES and dotted not in NAMES:
-            raise MemberError(
-                f"it names {dotted[:_LONGEST_NAME]}, which no published file needs; nothing was run."
-            )
-        self.push(Global(dotted))
-
-    def record(self, args: object) -> None:
-        """Note an instance of the class below."""
-        made = self.stack.pop()
-        if not isinstance(made, Global) or made.name not in CLASSES or not isinstance(args, tuple):
-            raise MemberError(f"it calls {kind_of(made)}, which no published file does; nothing was run.")
-        self.push(Record(made.name, args))
-
-    def state(self, state: object) -> None:
-        """Note the state of the instance below."""
-        target = self.stack[-1]
-        if not isinstance(target, Record):
-            raise MemberError(f"it changes {kind_of(target)}, which no published file does; nothing was run.")
-        target.state = state
-
-    def name_of_stack(self) -> None:
-        name, module = self.stack.pop(), self.stack.pop()
-        if not isinstance(name, str) or not isinstance(module, str):
-            raise TypeError
-        self.name(module, name)
-
-    def instance(self) -> None:
-        """The old form of naming and calling in one."""
-        args = tuple(self.since_mark())
-        self.name(self.line(), self.line())
-        self.record(args)
-
-
-_Instruction = Callable[[_Machine], object]
-
-
-def _refusal(code: bytes) -> str:
-    """What to say about an instruction that the machine does not have."""
-    import pickletools
-
-    if not code:
-        return "it ends before its last instruction (an interrupted copy?)."
-    known = {opcode.code.encode("latin-1"): opcode.name for opcode in pickletools.opcodes}
-    shown = known.get(code, f"0x{code.hex()}")
-    return f"it has the instruction {shown}, which no published file needs; nothing was run."
-
-
-def _text(machine: _Machine, layout: str) -> None:
-    machine.push(machine.take(machine.number(layout)).decode("utf-8", "surrogatepass"))
-
-
-# Memo numbers are keys of a dictionary, so a huge one costs nothing.
-_INSTRUCTIONS: dict[bytes, _Instruction] = {
-    # Where the file begins, and lengths that only help those who read in pieces.
-    b"\x80": lambda m: m.take(1),
-    b"\x95": lambda m: m.take(8),
-    # Values.
-    b"N": lambda m: m.push(None),
-    b"\x88": lambda m: m.push(True),
-    b"\x89": lambda m: m.push(False),
-    b"K": lambda m: m.push(m.number("<B")),
-    b"M": lambda m: m.push(m.number("<H")),
-    b"J": lambda m: m.push(m.number("<i")),
-    b"\x8a": lambda m: m.push(int.from_bytes(m.take(m.number("<B")), "little", signed=True)),
-    b"G": lambda m: m.push(m.number(">d")),
-    b"\x8c": lambda m: _text(m, "<B"),
-    b"X": lambda m: _text(m, "<I"),
-    b"\x8d": lambda m: _text(m, "<Q"),
-    b"C": lambda m: m.push(m.take(m.number("<B"))),
-    b"B": lambda m: m.push(m.take(m.number("<I"))),
-    b"\x8e": lambda m: m.push(m.take(m.number("<Q"))),
-    # Containers.
-    b"(": lambda m: m.marks.append(len(m.stack)),
-    b"1": lambda m: m.since_mark(),
-    b"0": lambda m: m.stack.pop(),
-    b")": lambda m: m.push(()),
-    b"\x85": lambda m: m.push_last(1),
-    b"\x86": lambda m: m.push_last(2),
-    b"\x87": lambda m: m.push_last(3),
-    b"t": lambda m: m.push(tuple(m.since_mark())),
-    b"]": lambda m: m.push([]),
-    b"a": lambda m: m.extend([m.stack.pop()]),
-    b"e": lambda m: m.extend(m.since_mark()),
-    b"}": lambda m: m.push({}),
-    b"s": lambda m: m.update([m.stack.pop(-2), m.stack.pop()]),
-    b"u": lambda m: m.update(m.since_mark()),
-    # What was noted before.
-    b"q": lambda m: m.memo.__setitem__(m.number("<B"), m.stack[-1]),
-    b"r": lambda m: m.memo.__setitem__(m.number("<I"), m.stack[-1]),
-    b"\x94": lambda m: m.memo.__setitem__(len(m.memo), m.stack[-1]),
-    b"h": lambda m: m.push(m.memo[m.number("<B")]),
-    b"j": lambda m: m.push(m.memo[m.number("<I")]),
-    # Names and instances: noted, never imported or called.
-    b"c": lambda m: m.name(m.line(), m.line()),
-    b"\x93": lambda m: m.name_of_stack(),
-    b"i": lambda m: m.instance(),
-    b"R": lambda m: m.record(m.stack.pop()),
-    b"\x81": lambda m: m.record(m.stack.pop()),
-    b"b": lambda m: m.state(m.stack.pop()),
-}
