@@ -126,7 +126,7 @@ class Decision:
         if share:
             stack = ImageStack(self._policy.reader.image_size)
             numbers = [stack.add(images) for images in self._images]
-            return self._network.encode_images(torch.from_numpy(stack.stacked())), numbers
+            return self._network.encode_images(torch.from_numpy(stack.images())), numbers
         images = np.concatenate([_flat(images) for images in self._images])
         ends = np.cumsum([images.shape[0] * images.shape[1] for images in self._images])
         numbers = np.split(np.arange(len(images)), ends[:-1])

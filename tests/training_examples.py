@@ -22,7 +22,7 @@ def source_of(demos: Iterable[Demonstration], reader: Reader) -> ExampleSource:
     """The same as if they had come out of a token cache."""
     episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
     counts = np.array([len(episode.images) for episode in episodes])
-    lengths = np.array([[len(episode.steps), len(episode.objects)] for episode in episodes])
+    lengths = np.array([[episode.num_steps, len(episode.objects)] for episode in episodes])
     return ExampleSource(episodes, np.arange(len(episodes)), np.cumsum(counts) - counts, lengths)
 
 

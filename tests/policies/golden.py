@@ -255,7 +255,7 @@ def _stack(network: PolicyNetwork) -> ImageStack:
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:
-    return network.encode_images(torch.from_numpy(stack.stacked()))
+    return network.encode_images(torch.from_numpy(stack.images()))
 
 
 def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:

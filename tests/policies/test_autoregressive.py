@@ -145,7 +145,7 @@ def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[d
         numbers = stack.add(asked.objects.crops)
         steps = [reader.read_step(observation) for observation in observations]
         crops = [stack.add(step.objects.crops) for step in steps]
-        features = network.encode_images(torch.from_numpy(stack.stacked()))
+        features = network.encode_images(torch.from_numpy(stack.images()))
         memory = network.encode_prompts(batch_prompts([asked], [numbers]), features)
         for t in range(len(steps)):
             history = batch_histories([steps[: t + 1]], [crops[: t + 1]])

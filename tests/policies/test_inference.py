@@ -107,7 +107,7 @@ def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
             episode = reader.begin_episode()
             histories.append([episode.read_step(seen_by(row, t, pool)) for t in range(step + 1)])
             history_numbers.append([stack.add(each.objects.crops) for each in histories[-1]])
-        features = network.encode_images(torch.from_numpy(stack.stacked()))
+        features = network.encode_images(torch.from_numpy(stack.images()))
         memory = network.encode_prompts(batch_prompts(inputs, numbers), features)
         taken = np.zeros((len(rows), step + 1, ACTION_WIDTH))
         for place, row in enumerate(rows):

@@ -15,7 +15,7 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts, on_table  # noqa: E402
+from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
@@ -225,20 +225,11 @@ def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tel
     assert told[0][0].max() == len(frames.images) - 1
 
 
-def test_one_object_in_the_middle_stands_alone_and_all_else_is_the_table():
-    middle, aside = [128, 63, 20, 20], [100, 63, 20, 20]
-    numbers = np.array([0, 1, 2, 2, 3])
-    boxes = np.array([[middle] * 5, [middle, aside, middle, middle, [0, 0, 0, 0]]])
-    masks = np.array([[True] * 5, [True] * 4 + [False]])
-    assert on_table(numbers, boxes, masks).tolist() == [False, True, True, True, True]
-    assert on_table(numbers[:0], boxes[:, :0], masks[:, :0]).shape == (0,)
-
-
 def test_motions_show_the_table(demos):
     reader = Reader("objects")
     examples, _ = examples_of(demos[:1], reader)
     motion = as_motion(preprocess(demos[0], "objects"))
-    batch = Collator(reader)([replace(examples[0], tokens=motion)])
+    batch = Collator(reader)([replace(examples[0], episode=motion)])
     assert batch.prompts.in_scene_S.all()
     assert batch.prompts.image_index_S.max() == demos[0].num_steps
 

@@ -27,7 +27,6 @@ READERS = {
 def as_when_acting(demos, reader: Reader):
     """Prompts and histories as a policy reads them step by step, and their images."""
     stack = ImageStack(reader.image_size)
-    stack.add(np.zeros((3, *reader.image_size), np.uint8))
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)
@@ -41,7 +40,7 @@ def as_when_acting(demos, reader: Reader):
         histories.append([episode.read_step(demo.observation(t)) for t in range(demo.num_steps)])
     prompt_batch = batch_prompts(prompts, [add(prompt.objects) for prompt in prompts])
     numbers = [[add(step.objects) for step in history] for history in histories]
-    return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.stacked())
+    return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.images())
 
 
 @pytest.mark.parametrize("layout", READERS)
@@ -74,14 +73,14 @@ def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
 def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
     examples, images = stack_images([preprocess(demo, "objects") for demo in demos], READERS["objects"])
-    spurious = Collator(READERS["objects"])(examples).spurious
+    spurious = Collator(READERS["objects"])(examples).false_positives
     for b, demo in enumerate(demos):
         for t in range(demo.num_steps):
             for v, view in enumerate(("front", "top")):
                 x, y, height, width = spurious.boxes[b, t, v]
                 extent = (x - width // 2, x - width // 2 + width, y - height // 2, y - height // 2 + height)
                 crop, box = crop_box(demo.rgb[view][t], extent)
-                assert np.array_equal(crop, images[spurious.crops[b, t, v]])
+                assert np.array_equal(crop, images[spurious.crop_index[b, t, v]])
                 assert np.array_equal(box, spurious.boxes[b, t, v])
 
 
@@ -98,6 +97,7 @@ def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps)
 
 def test_an_episode_in_which_nothing_is_seen_is_named(demonstrations_of_several_steps):
     tokens = preprocess(demonstrations_of_several_steps[-1], "objects")
-    blind = replace(tokens, objects=tokens.objects[:0], steps=np.zeros_like(tokens.steps))
+    none = np.zeros_like(tokens.objects_per_step)
+    blind = replace(tokens, objects=tokens.objects.select(slice(0)), objects_per_step=none)
     with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
         Collator(READERS["objects"])([Example(blind)])

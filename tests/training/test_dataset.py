@@ -44,7 +44,7 @@ def test_slots_point_at_the_objects_that_were_picked(data, examples):
 
 
 def names_of(source: ExampleSource) -> set[tuple[str, int]]:
-    return {(example.tokens.task, example.tokens.seed) for example in source}
+    return {(example.episode.task, example.episode.seed) for example in source}
 
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
@@ -78,10 +78,10 @@ def test_an_example_of_a_source_knows_its_images_among_all(data):
     images = np.concatenate([episode.images for episode in cache])
     for source in (training, kept):
         for example in source:
-            count = len(example.tokens.images)
-            assert np.array_equal(images[example.base : example.base + count], example.tokens.images)
-            assert cache[example.row].seed == example.tokens.seed
-    assert training.num_steps(np.arange(len(training))) == sum(e.tokens.num_steps for e in training)
+            count = len(example.episode.images)
+            assert np.array_equal(images[example.base : example.base + count], example.episode.images)
+            assert cache[example.row].seed == example.episode.seed
+    assert training.num_steps(np.arange(len(training))) == sum(e.episode.num_steps for e in training)
 
 
 def test_a_word_that_nobody_knows_is_found_before_training(data):
@@ -97,7 +97,7 @@ def test_a_word_that_nobody_knows_is_found_before_training(data):
 def test_groups_hold_all_examples_of_like_length(examples):
     groups = by_length(examples)
     assert sum(len(group) for group in groups) == 24
-    assert {e.tokens.num_steps for e in groups[0]} == {1}
+    assert {e.episode.num_steps for e in groups[0]} == {1}
 
 
 def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
@@ -111,7 +111,7 @@ def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
     parts = Parts(collate, seed=3, largest=5)(numbered, 7)
     assert sorted(row for rows, _ in parts for row in rows) == list(range(24))
     assert max(len(rows) for rows, _ in parts) <= 5
-    assert sum(steps for _, steps in parts) == sum(e.tokens.num_steps for e in examples)
+    assert sum(steps for _, steps in parts) == sum(e.episode.num_steps for e in examples)
     whole, drawn = dict(drawn), {}
     Parts(collate, seed=3, largest=2)(numbered[10:], 7)
     assert all(whole[row] == value for row, value in drawn.items())  # whoever shares the batch
@@ -126,10 +126,10 @@ def test_augmentation_of_an_example_does_not_depend_on_its_company(layout, demon
     together = augmented(collate(examples), layout, probability=0.5, rngs=rngs)
     for b, example in enumerate(examples):
         alone = augmented(collate([example]), layout, probability=0.5, rngs=rngs_of(examples)[b : b + 1])
-        for t in range(example.tokens.num_steps):
+        for t in range(example.episode.num_steps):
             for v in range(2):
                 assert shown(together.history, b, t, v) == shown(alone.history, 0, t, v)
-        pick = together.targets.pick_BT[b, : example.tokens.num_steps]
+        pick = together.targets.pick_BT[b, : example.episode.num_steps]
         assert torch.equal(pick, alone.targets.pick_BT[0])
 
 
@@ -186,7 +186,10 @@ def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_t
         old, new = shown(before, b, t, v), shown(after, b, t, v)
         assert [slot for slot in new if slot in old] == old
         added = [slot for slot in new if slot not in old]
-        false = (int(batch.spurious.crops[b, t, v]), *batch.spurious.boxes[b, t, v].tolist())
+        false = (
+            int(batch.false_positives.crop_index[b, t, v]),
+            *batch.false_positives.boxes[b, t, v].tolist(),
+        )
         assert added in ([], [false])
         assert not added or before.steps_BT[b, t]
         places += [(new.index(slot), len(old)) for slot in added]

@@ -64,7 +64,7 @@ def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
     expected_prompts = batch_prompts(read, [add(prompt.objects) for prompt in read])
     numbers = [[add(step.objects) for step in history] for history in histories]
     expected_history = batch_histories(histories, numbers)
-    images = torch.from_numpy(stack.stacked())
+    images = torch.from_numpy(stack.images())
     for ours, theirs in ((batch.prompts, expected_prompts), (batch.history, expected_history)):
         for field in fields(ours):
             got, asked = getattr(ours, field.name), getattr(theirs, field.name)
@@ -178,9 +178,9 @@ def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
             example = source.example(row)
             assert example.row == row
             np.testing.assert_array_equal(
-                images[example.base : example.base + len(example.tokens.images)], example.tokens.images
+                images[example.base : example.base + len(example.episode.images)], example.episode.images
             )
-    assert [e.tokens.seed for e in detected] == [e.tokens.seed for e in true]
+    assert [e.episode.seed for e in detected] == [e.episode.seed for e in true]
 
 
 def weights_of(run: Path) -> dict:
@@ -216,7 +216,7 @@ def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(sett
     short = {**settings, "pretraining_steps": 0, "steps": 2, "tokens": tmp_path / "tokens"}
     detected = train(TrainingConfig(**{**short, "boxes": HOOK, "detected_share": 1.0}))
     (folder,) = (tmp_path / "tokens").iterdir()
-    assert folder.name == f"objects-v2-{plugged_boxes(HOOK).name}"
+    assert folder.name == f"objects-v3-{plugged_boxes(HOOK).name}"
     plain = train(TrainingConfig(**{**short, "out": tmp_path / "plain"}))
     assert len(list((tmp_path / "tokens").iterdir())) == 2
     none = train(TrainingConfig(**{**short, "out": tmp_path / "none", "boxes": HOOK, "detected_share": 0.0}))

@@ -12,7 +12,7 @@ from safetensors.torch import load_file  # noqa: E402
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.data import Demonstration  # noqa: E402
-from openvima.data.object_cache.episode import BOXES, ID, NUMBERS, preprocess  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import observe, whole_frames  # noqa: E402
@@ -41,17 +41,17 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
 ) -> None:
     for demo in demonstrations_of_several_steps:
         motion = as_motion(preprocess(demo, kind))
-        assert motion.text == motion_text(demo.num_steps + 1)
-        assert len(motion.prompt_counts) == demo.num_steps + 1
-        ends = np.cumsum(motion.prompt_counts)[:-1]
-        for rows, seen in zip(np.split(motion.prompt, ends), whole_motion(demo), strict=True):
+        prompt = motion.prompt
+        assert prompt.text == motion_text(demo.num_steps + 1)
+        assert prompt.is_scene.tolist() == [True] * (demo.num_steps + 1)
+        tables = prompt.objects.split(prompt.objects_per_image)
+        for table, seen in zip(tables, whole_motion(demo), strict=True):
             expected = whole_frames(seen["rgb"]) if kind == "frames" else observe(seen, left_to_right=False)
-            assert rows[:, ID].tolist() == expected.ids.tolist()
-            np.testing.assert_array_equal(rows[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1), expected.boxes)
-            shown = rows[:, NUMBERS].T > 0
-            np.testing.assert_array_equal(shown, expected.masks)
+            assert table.ids.tolist() == expected.ids.tolist()
+            np.testing.assert_array_equal(table.boxes.swapaxes(0, 1), expected.boxes)
+            np.testing.assert_array_equal(table.masks.T, expected.masks)
             np.testing.assert_array_equal(
-                motion.images[rows[:, NUMBERS].T[shown] - 1], expected.crops[expected.masks]
+                motion.images[table.crop_index.T[expected.masks] - 1], expected.crops[expected.masks]
             )
         actions = [np.concatenate(list(action.to_arrays().values())) for action in demo.actions]
         np.testing.assert_array_equal(motion.actions, np.float32(actions))
@@ -60,7 +60,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
 def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
     tokens = preprocess(demonstrations_of_several_steps[0], "objects")
     motion = as_motion(tokens)
-    for name in ("images", "objects", "steps", "actions"):
+    for name in ("images", "objects", "objects_per_step", "actions"):
         assert getattr(motion, name) is getattr(tokens, name)
 
 
@@ -77,7 +77,7 @@ def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
     theirs = batch_prompts(read, [stack.add(prompt.objects.crops) for prompt in read])
     for field in ("word_ids_BL", "object_index_BL", "mask_BL", "boxes_VS4", "masks_VS"):
         assert torch.equal(getattr(ours.prompts, field), getattr(theirs, field)), field
-    seen = torch.from_numpy(stack.stacked())[theirs.crop_index_VS]
+    seen = torch.from_numpy(stack.images())[theirs.crop_index_VS]
     assert torch.equal(ours.images[ours.prompts.crop_index_VS], seen)
 
 
@@ -109,7 +109,10 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
         assert task not in motions
     elsewhere = [
         replace(
-            tokens, actions=tokens.actions[::-1] + 0.1, objects=tokens.objects * 0 + 1, final=tokens.final[:0]
+            tokens,
+            actions=tokens.actions[::-1] + 0.1,
+            objects=tokens.objects.select(np.zeros(len(tokens.objects), np.int64)),
+            final=tokens.final.select(slice(0)),
         )
         for tokens in episodes
     ]

@@ -8,7 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data.object_cache.episode import COUNT, ID, PICK, PLACE, image_names, preprocess  # noqa: E402
+from object_rows import rows_of  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -41,8 +42,9 @@ def episodes():
 
 
 def _images(episode) -> dict[str, list]:
-    parts = np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1])
-    return {name: rows.tolist() for name, rows in zip(image_names(episode.text), parts, strict=True)}
+    prompt = episode.prompt
+    parts = zip(prompt.image_names, prompt.objects.split(prompt.objects_per_image), strict=True)
+    return {name: rows_of(table).tolist() for name, table in parts}
 
 
 @pytest.mark.parametrize("task", NAMED)
@@ -56,9 +58,9 @@ def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task,
         with_others += bool(others)
         for ((_, *numbers_and_boxes),) in others:
             numbers = numbers_and_boxes[:2]
-            row = next(row for row in episode.objects.tolist() if row[1:3] == numbers)
-            assert row[0] not in episode.steps[0, [PICK, PLACE]]
-        *definitions, rest = named.text.split(". ", named.text.count("This is a "))
+            row = next(row for row in rows_of(episode.objects).tolist() if row[1:3] == numbers)
+            assert row[0] not in (episode.pick_ids[0], episode.place_ids[0])
+        *definitions, rest = named.prompt.text.split(". ", named.prompt.text.count("This is a "))
         meaning = {}
         for sentence in definitions:
             noun, image = sentence.removeprefix("This is a ").split(" ")
@@ -71,8 +73,8 @@ def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task,
         for noun, image in meant.items():
             assert image not in rest
             rest = rest.replace(f"the {noun}", image).replace(noun, image)
-        assert rest.replace("the {", "{") == episode.text.replace("the {", "{")
-    assert bool(with_others) == (task != "rotate" or episode.steps[0, COUNT] > 1)
+        assert rest.replace("the {", "{") == episode.prompt.text.replace("the {", "{")
+    assert bool(with_others) == (task != "rotate" or episode.objects_per_step[0] > 1)
 
 
 @pytest.mark.parametrize("task", KEPT)
@@ -96,10 +98,10 @@ def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholde
         rng = np.random.default_rng(seed)
         before = as_named(episodes[task], rng)
         after = in_any_order(before, rng)
-        sentences, images = before.text.split(". "), _images(before)
+        sentences, images = before.prompt.text.split(". "), _images(before)
         assert all(images[name] == rows for name, rows in _images(after).items())
-        assert after.prompt_counts.sum() == len(after.prompt)
-        found = after.text.removesuffix(".").split(". ")
+        assert after.prompt.objects_per_image.sum() == len(after.prompt.objects)
+        found = after.prompt.text.removesuffix(".").split(". ")
         of_before = [sentence.removesuffix(".") for sentence in sentences]
         assert set(found) <= set(of_before)
         left_out = set(of_before) - set(found)
@@ -120,7 +122,7 @@ def test_prompts_that_explain_nothing_stay_in_order(task, episodes):
 def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        text = in_any_order(as_named(episodes["pick_in_order_then_restore"], rng), rng).text
+        text = in_any_order(as_named(episodes["pick_in_order_then_restore"], rng), rng).prompt.text
         assert ". Finally restore it into its original container." in text
         assert text.index("Put ") < text.index("Finally")
 
@@ -128,31 +130,33 @@ def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
 @pytest.mark.parametrize("task", ["visual_manipulation", "pick_in_order_then_restore"])
 def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
     motion = as_motion(episodes[task])
-    used = set(motion.steps[:, [PICK, PLACE]].flat)
-    bystanders = set(motion.objects[:, ID].tolist()) - used
+    used = {*motion.pick_ids.tolist(), *motion.place_ids.tolist()}
+    bystanders = set(motion.objects.ids.tolist()) - used
     assert bystanders
     unseen, unpictured = set(), set()
     for seed in range(20):
         less = without_bystanders(motion, 0.5, np.random.default_rng(seed))
-        assert less.steps[:, COUNT].sum() == len(less.objects)
-        assert less.prompt_counts.sum() == len(less.prompt)
-        assert np.array_equal(less.steps[:, [PICK, PLACE]], motion.steps[:, [PICK, PLACE]])
+        assert less.objects_per_step.sum() == len(less.objects)
+        assert less.prompt.objects_per_image.sum() == len(less.prompt.objects)
+        assert np.array_equal(less.pick_ids, motion.pick_ids)
+        assert np.array_equal(less.place_ids, motion.place_ids)
         out = {
-            ids: set(rows[:, ID].tolist())
-            for ids, rows in (("view", less.objects), ("pictures", less.prompt))
+            name: set(table.ids.tolist())
+            for name, table in (("view", less.objects), ("pictures", less.prompt.objects))
         }
         gone = [bystanders - out["view"], bystanders - out["pictures"]]
         assert used <= out["view"] and used <= out["pictures"]
         assert not gone[0] & gone[1]
-        for frame, rows in enumerate(np.split(less.prompt, np.cumsum(less.prompt_counts)[:-1])):
-            before = np.split(motion.prompt, np.cumsum(motion.prompt_counts)[:-1])[frame]
-            kept = before[~np.isin(before[:, ID], list(gone[1]))]
-            assert np.array_equal(rows, kept)
+        images = (each.prompt.objects.split(each.prompt.objects_per_image) for each in (less, motion))
+        for after, before in zip(*images, strict=True):
+            kept = before.select(~np.isin(before.ids, list(gone[1])))
+            assert np.array_equal(rows_of(after), rows_of(kept))
         unseen |= gone[0]
         unpictured |= gone[1]
     assert unseen == unpictured == bystanders
     same = without_bystanders(motion, 0.0, np.random.default_rng(0))
-    assert np.array_equal(same.objects, motion.objects) and np.array_equal(same.prompt, motion.prompt)
+    for ours, theirs in ((same.objects, motion.objects), (same.prompt.objects, motion.prompt.objects)):
+        assert np.array_equal(rows_of(ours), rows_of(theirs))
 
 
 @pytest.mark.parametrize(

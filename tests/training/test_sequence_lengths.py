@@ -35,7 +35,10 @@ def num_places(tokens, reader) -> int:
 def test_widths_are_those_of_the_episodes(case) -> None:
     cache, _, _ = case
     expected = [
-        (max(tokens.prompt_counts, default=0), max(*tokens.steps[:, 0], len(tokens.final)))
+        (
+            max(tokens.prompt.objects_per_image, default=0),
+            max(*tokens.objects_per_step, len(tokens.final)),
+        )
         for tokens in cache
     ]
     np.testing.assert_array_equal(cache.widths(), expected)

@@ -7,16 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data.object_cache.episode import (  # noqa: E402
-    BOXES,
-    COUNT,
-    ID,
-    NUMBERS,
-    PICK,
-    PLACE,
-    SPURIOUS_NUMBERS,
-    preprocess,
-)
+from object_rows import rows_of  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -44,16 +36,15 @@ def stacked(episodes):
     return stack_images(episodes, Reader("objects"))
 
 
-def _steps(episode) -> list[np.ndarray]:
-    return np.split(episode.objects, np.cumsum(episode.steps[:, COUNT])[:-1])
+def _rows(table):
+    """Each object as a table of its own."""
+    return table.split(np.ones(len(table), np.int64))
 
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
+def _overlap(one, other) -> bool:
     for v in range(2):
-        (x, y, height, width), (x2, y2, height2, width2) = (
-            row[BOXES].reshape(2, 4)[v] for row in (one, other)
-        )
-        seen = one[NUMBERS][v] > 0 and other[NUMBERS][v] > 0
+        (x, y, height, width), (x2, y2, height2, width2) = (row.boxes[0, v] for row in (one, other))
+        seen = one.masks[0, v] and other.masks[0, v]
         if seen and 2 * abs(x - x2) < width + width2 and 2 * abs(y - y2) < height + height2:
             return True
     return False
@@ -66,30 +57,34 @@ def test_strangers_lie_beside_what_was_there_at_all_steps_and_nothing_else_chang
         for seed, other in enumerate(examples):
             if other is example:
                 continue
-            more = with_strangers(example, other, np.random.default_rng(seed)).tokens
-            before, source = example.tokens, other.tokens
-            first = source.objects[: source.steps[0, COUNT]]
+            more = with_strangers(example, other, np.random.default_rng(seed)).episode
+            before, source = example.episode, other.episode
+            first = source.objects.split(source.objects_per_step)[0]
             strangers = None
-            for ours, theirs in zip(_steps(before), _steps(more), strict=True):
-                assert np.array_equal(theirs[: len(ours), ID], ours[:, ID])
-                assert np.array_equal(theirs[: len(ours), BOXES], ours[:, BOXES])
-                came = theirs[len(ours) :]
-                assert strangers is None or np.array_equal(came, strangers)
+            steps = (each.objects.split(each.objects_per_step) for each in (before, more))
+            for ours, theirs in zip(*steps, strict=True):
+                assert np.array_equal(theirs.ids[: len(ours)], ours.ids)
+                assert np.array_equal(theirs.boxes[: len(ours)], ours.boxes)
+                came = theirs.select(slice(len(ours), None))
+                assert strangers is None or np.array_equal(rows_of(came), rows_of(strangers))
                 strangers = came
-                assert not set(came[:, ID]) & set(before.objects[:, ID])
-                assert not any(_overlap(a, b) for a in came for b in ours)
+                assert not set(came.ids) & set(before.objects.ids)
+                assert not any(_overlap(a, b) for a in _rows(came) for b in _rows(ours))
             assert strangers is not None and len(strangers) <= MOST_STRANGERS
             added += len(strangers)
-            for row in strangers:
-                (origin,) = (k for k in first if np.array_equal(k[NUMBERS] + other.base, row[NUMBERS]))
-                assert np.array_equal(origin[BOXES], row[BOXES])
-                for number, whole in zip(origin[NUMBERS], row[NUMBERS], strict=True):
+            for row in _rows(strangers):
+                (origin,) = (
+                    k for k in _rows(first) if np.array_equal(k.crop_index + other.base, row.crop_index)
+                )
+                assert np.array_equal(origin.boxes, row.boxes)
+                for number, whole in zip(origin.crop_index[0], row.crop_index[0], strict=True):
                     assert np.array_equal(source.images[number - 1], stack[whole].numpy())
-            assert np.array_equal(more.steps[:, [PICK, PLACE]], before.steps[:, [PICK, PLACE]])
+            assert np.array_equal(more.pick_ids, before.pick_ids)
+            assert np.array_equal(more.place_ids, before.place_ids)
             assert np.array_equal(more.actions, before.actions)
-            assert more.text == before.text
-            for name, columns in (("prompt", NUMBERS), ("final", NUMBERS), ("steps", SPURIOUS_NUMBERS)):
-                own, counted = getattr(before, name)[:, columns], getattr(more, name)[:, columns]
+            assert more.prompt.text == before.prompt.text
+            for part in (lambda e: e.prompt.objects, lambda e: e.final, lambda e: e.false_positives):
+                own, counted = part(before).crop_index, part(more).crop_index
                 assert np.array_equal(np.where(own > 0, own + example.base, 0), counted)
     assert added > 10
 
@@ -108,7 +103,9 @@ def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes
         return (batch.history.num_slots_BT * batch.history.steps_BT).sum(dim=1)
 
     order = np.argsort([episode.num_steps for episode in episodes], kind="stable")
-    plain = torch.tensor([episodes[row].steps[:, COUNT].sum() + 2 * episodes[row].num_steps for row in order])
+    plain = torch.tensor(
+        [episodes[row].objects_per_step.sum() + 2 * episodes[row].num_steps for row in order]
+    )
     assert torch.equal(counts(0.0), plain)
     more = counts(1.0) - plain
     receiving = torch.tensor([receives_strangers(episodes[row]) for row in order])
@@ -125,9 +122,9 @@ def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, 
     for b, example in enumerate(borrowing):
         numbers = batch.history.crop_index_BTVN[b, 0]
         shown = {images[n].numpy().tobytes() for n in numbers.flatten().tolist() if n}
-        expected = with_strangers(example, example.other, rngs_of(borrowing)[b]).tokens
-        rows = expected.objects[: expected.steps[0, COUNT]]
-        assert shown == {stack[n].numpy().tobytes() for n in rows[:, NUMBERS].flatten() if n}
+        expected = with_strangers(example, example.other, rngs_of(borrowing)[b]).episode
+        first = expected.objects.split(expected.objects_per_step)[0]
+        assert shown == {stack[n].numpy().tobytes() for n in first.crop_index.flatten() if n}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Images by number, each stored once."""
+"""Images by index, each stored once."""
 
 import hashlib
 
@@ -6,9 +6,9 @@ import numpy as np
 
 
 class ImageStack:
-    """Collects images in the order in which they come; each is known by its number.
+    """Collects images; equal ones share an index, and index 0 is a blank image for what is hidden.
 
-    Equal images share a number. Many are equal: what lies still looks the same at the next step.
+    Many images are equal: an object that does not move has the same crop at the next step.
 
     Args:
         image_size: Height and width of every image.
@@ -16,22 +16,26 @@ class ImageStack:
 
     def __init__(self, image_size: tuple[int, int]) -> None:
         self._shape = (3, *image_size)
-        self._images: list[np.ndarray] = []
-        self._numbers: dict[bytes, int] = {}  # by digest, which is shorter than the image
+        self._images = [np.zeros(self._shape, np.uint8)]
+        self._index: dict[bytes, int] = {b"": 0}  # by digest, which is shorter than the image
 
     def add(self, images: np.ndarray) -> np.ndarray:
-        """Append images of shape (..., 3, height, width) and return their numbers, shape (...), int64."""
+        """Append images of shape (..., 3, height, width) and return their indices, shape (...), int64."""
         shape = images.shape[:-3]
-        numbers = [self._number(image) for image in images.reshape(-1, *self._shape)]
-        return np.array(numbers, np.int64).reshape(shape)
+        index = [self._add(image) for image in images.reshape(-1, *self._shape)]
+        return np.array(index, np.int64).reshape(shape)
 
-    def stacked(self) -> np.ndarray:
-        """Return all images, shape (K, 3, height, width), uint8."""
-        return np.array(self._images, np.uint8).reshape(-1, *self._shape)
+    def images(self) -> np.ndarray:
+        """Return all images, the blank one first, shape (K, 3, height, width), uint8."""
+        return np.stack(self._images)
 
-    def _number(self, image: np.ndarray) -> int:
+    def digests(self) -> list[bytes]:
+        """Return what identifies the content of each image, in the order of `images`."""
+        return list(self._index)
+
+    def _add(self, image: np.ndarray) -> int:
         digest = hashlib.blake2b(image.tobytes(), digest_size=16).digest()
-        number = self._numbers.setdefault(digest, len(self._images))
-        if number == len(self._images):
+        index = self._index.setdefault(digest, len(self._images))
+        if index == len(self._images):
             self._images.append(image.copy())
-        return number
+        return index

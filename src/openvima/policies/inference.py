@@ -140,7 +140,7 @@ class NetworkPolicy(Policy):
         inputs = [self.reader.read_prompt(prompt) for prompt in prompts]
         stack = ImageStack(self.reader.image_size)
         numbers = [stack.add(prompt.objects.crops) for prompt in inputs]
-        features, _ = self._encode(stack.stacked(), {})
+        features, _ = self._encode(stack.images(), {})
         memory = self.network.encode_prompts(batch_prompts(inputs, numbers).to(self.device), features)
         seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
         self._episodes = _Episodes(
@@ -242,7 +242,7 @@ class NetworkPolicy(Policy):
         steps = [reader.read_step(seen) for reader, seen in zip(readers, observations, strict=True)]
         stack = ImageStack(self.reader.image_size)
         numbers = [[stack.add(step.objects.crops)] for step in steps]
-        features_KF, features = self._encode(stack.stacked(), episodes.features)
+        features_KF, features = self._encode(stack.images(), episodes.features)
         history = batch_histories([[step] for step in steps], numbers).to(self.device)
         has_previous_B1 = torch.full_like(history.steps_BT, episodes.actions_BC is not None)
         previous_BC = episodes.actions_BC

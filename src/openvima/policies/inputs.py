@@ -19,7 +19,6 @@ from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
     GROUND_TRUTH,
     PUBLISHED_ORDER,
-    TOP,
     ObjectExtractor,
     ObjectViews,
     end_effector_of,
@@ -34,8 +33,6 @@ from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 
 WORD = -1  # entry of a place that holds a word
-MIDDLE = (128, 63)  # column and row of the top view, where prompts show an object that is alone
-_NEAR_MIDDLE = 3  # pixels; the boxes of single objects lie at most 2 from it, those of a detector a bit more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +48,7 @@ class PromptInput:
         mask: Which places count, shape (L,), bool; not those of objects hidden in their view.
         objects: All objects of all images, one row an appearance in the text.
         numbers: Which image shows each of them, counted from 0 in reading order, shape (S,), int64.
+        in_scene: Whether that is an image of the table, shape (S,), bool.
     """
 
     words: np.ndarray
@@ -59,6 +57,7 @@ class PromptInput:
     mask: np.ndarray
     objects: ObjectViews
     numbers: np.ndarray
+    in_scene: np.ndarray
 
 
 class _Tensors:
@@ -86,7 +85,7 @@ class PromptBatch(_Tensors):
         masks_VS: Whether the object is visible in the view.
         positions_S2: Table points under the boxes, metres.
         image_index_S: Which image of its prompt shows the object, counted from 0 in reading order.
-        in_scene_S: Whether that is a picture of the table, where the object has a place, see `on_table`.
+        in_scene_S: Whether that is a picture of the table, where the object has a place.
     """
 
     word_ids_BL: torch.Tensor
@@ -209,7 +208,9 @@ class Reader:
         places.append((self.tokenizer.end_id, WORD, 0, True))
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
-        return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers)
+        kinds = [piece.kind == "scene" for piece in sequence if isinstance(piece, PromptImage)]
+        in_scene = np.array(kinds, np.bool_)[numbers]
+        return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers, in_scene)
 
     def begin_episode(self) -> "EpisodeReader":
         """Return the reader of one episode's observations."""
@@ -323,7 +324,6 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
         mask[row, :size] = prompt.mask
         first += len(prompt.objects)
     objects = [prompt.objects for prompt in prompts]
-    lying = [on_table(prompt.numbers, prompt.objects.boxes, prompt.objects.masks) for prompt in prompts]
     return PromptBatch(
         torch.from_numpy(words),
         torch.from_numpy(images),
@@ -333,29 +333,8 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
         torch.from_numpy(np.concatenate([each.masks for each in objects], axis=1)),
         torch.from_numpy(np.concatenate([each.positions() for each in objects])),
         torch.from_numpy(np.concatenate([prompt.numbers for prompt in prompts])),
-        torch.from_numpy(np.concatenate(lying)),
+        torch.from_numpy(np.concatenate([prompt.in_scene for prompt in prompts])),
     )
-
-
-def on_table(numbers: np.ndarray, boxes: np.ndarray, masks: np.ndarray) -> np.ndarray:
-    """Tell the objects of a prompt that its images show on the table from those shown alone on white.
-
-    Stored demonstrations do not say of which kind an image is, but what stands alone on white stands in the
-    middle, to the pixel. A picture of the table shows several objects, or one that lies elsewhere: of the
-    examples for `twist`, which lie anywhere, one in a hundred may lie so near the middle.
-
-    Args:
-        numbers: Which image shows each object, shape (S,), int64.
-        boxes: Boxes in pixels, shape (2, S, 4).
-        masks: Whether the object is visible in the view, shape (2, S).
-
-    Returns:
-        Shape (S,), bool.
-    """
-    from_middle = np.abs(boxes[TOP][:, :2] - MIDDLE)
-    is_aside = (from_middle.max(axis=1, initial=0) > _NEAR_MIDDLE) | ~masks[TOP]
-    is_one_of_several = np.bincount(numbers, minlength=1)[numbers] > 1
-    return is_aside | is_one_of_several
 
 
 def batch_histories(

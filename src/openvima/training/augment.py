@@ -66,12 +66,12 @@ def _drawn(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.
 
 def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:
     """Append a slot for each view; slot N + v shows the false detection of view v, or nothing."""
-    history, spurious = batch.history, batch.spurious
+    history, false_positives = batch.history, batch.false_positives
     visible_BTVN = torch.diag_embed(shows_BTV)  # view v, slot v
-    crop_index_BTVN = torch.diag_embed(torch.from_numpy(spurious.crops)) * visible_BTVN
-    boxes_BTV4 = torch.from_numpy(spurious.boxes)
+    crop_index_BTVN = torch.diag_embed(torch.from_numpy(false_positives.crop_index)) * visible_BTVN
+    boxes_BTV4 = torch.from_numpy(false_positives.boxes)
     boxes_BTVN4 = boxes_BTV4[:, :, :, None] * visible_BTVN[..., None]
-    points_BTN2 = torch.from_numpy(spurious.points)
+    points_BTN2 = torch.from_numpy(false_positives.points)
     return replace(
         history,
         crop_index_BTVN=torch.cat([history.crop_index_BTVN, crop_index_BTVN], dim=3),

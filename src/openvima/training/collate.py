@@ -12,26 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from openvima.data.object_cache.episode import (
-    BOXES,
-    COUNT,
-    GRASPS,
-    ID,
-    NUMBERS,
-    PICK,
-    PLACE,
-    SPURIOUS_BOXES,
-    SPURIOUS_NUMBERS,
-    PreprocessedEpisode,
-    pieces_of,
-)
+from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.errors import DatasetError
 from openvima.perception.objects import FRONT, TOP
+from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, offset_index, split_prompt
 from openvima.policies.heads.base import ActionTargets
-from openvima.policies.inputs import WORD, HistoryBatch, PromptBatch, Reader, on_table
+from openvima.policies.inputs import WORD, HistoryBatch, PromptBatch, Reader
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import CAMERAS, VIEWS, unproject
-from openvima.training.dataset import Batch, Example, Spurious
+from openvima.training.dataset import Batch, Example, FalsePositiveBatch
 
 MAX_KNOWN = 2**16  # prompts that a collator remembers
 
@@ -54,43 +43,43 @@ class Collator:
             DatasetError: A demonstration has a step at which no object is in view.
             PromptError: A prompt has a word that the vocabulary lacks.
         """
-        episodes = [example.tokens for example in examples]
+        episodes = [example.episode for example in examples]
         bases = np.array([example.base for example in examples], np.int64)
         steps = _Steps.of(episodes)
         history, slots = self._history(episodes, steps, bases)
         actions = steps.padded(np.concatenate([episode.actions for episode in episodes]))
         pick, place = (torch.from_numpy(steps.padded(column, fill=-1)) for column in slots)
         targets = ActionTargets(torch.from_numpy(actions), pick, place, history.steps_BT)
-        return Batch(self._prompts(episodes, bases), history, targets, self._spurious(steps, bases))
+        return Batch(
+            self._prompts(episodes, bases), history, targets, self._false_positives(episodes, steps, bases)
+        )
 
     def _history(
         self, episodes: Sequence[PreprocessedEpisode], steps: "_Steps", bases: np.ndarray
     ) -> tuple[HistoryBatch, np.ndarray]:
         """Return what was seen, and the slots of the objects to pick and to place at, shape (2, steps)."""
-        rows = np.concatenate([episode.objects for episode in episodes]).astype(np.int64)
-        counts = steps.rows[:, COUNT]
+        objects = ObjectTable.concatenate([episode.objects for episode in episodes])
+        counts = steps.objects_per_step
         step = np.repeat(np.arange(len(counts)), counts)  # of each object
-        slot = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        slot = np.arange(len(objects)) - np.repeat(np.cumsum(counts) - counts, counts)
         num_slots = self._num_slots(episodes, steps, counts)
-        views = _ordered(rows, step) if self.reader.layout == "views" else (rows, rows)
-        numbers = np.stack([view[:, NUMBERS][:, v] for v, view in enumerate(views)], axis=1)
-        boxes = np.stack([view[:, BOXES].reshape(-1, 2, 4)[:, v] for v, view in enumerate(views)], axis=1)
-        grasps = np.stack([view[:, GRASPS].reshape(-1, 2, 2)[:, v] for v, view in enumerate(views)], axis=1)
-        shown = numbers > 0
+        if self.reader.layout == "views":
+            objects = _visible_first(objects, step)
+        visible = objects.masks
         shape = (*steps.shape, len(VIEWS), max(1, int(num_slots.max(initial=0))))
         b, t = steps.b[step], steps.t[step]
         numbers_BTVN = np.zeros(shape, np.int64)
         boxes_BTVN4 = np.zeros((*shape, 4), np.int64)
         masks_BTVN = np.zeros(shape, np.bool_)
-        numbers_BTVN[b, t, :, slot] = np.where(shown, numbers + bases[b][:, None], 0)
-        boxes_BTVN4[b, t, :, slot] = boxes
-        masks_BTVN[b, t, :, slot] = shown
+        numbers_BTVN[b, t, :, slot] = offset_index(objects.crop_index, bases[b][:, None])
+        boxes_BTVN4[b, t, :, slot] = objects.boxes
+        masks_BTVN[b, t, :, slot] = visible
         is_slot = np.arange(shape[3]) < num_slots[..., None]
         # A slot without an object has its box in the corner; so it is when a policy acts.
         empty = np.where(is_slot[..., None], unproject(np.zeros(2), CAMERAS["front"]), 0.0)
         positions_BTN2, grasps_BTN2 = empty, empty.copy()
-        positions_BTN2[b, t, slot] = _on_table(boxes[..., :2], shown[:, TOP])
-        grasps_BTN2[b, t, slot] = _on_table(grasps, shown[:, TOP])
+        positions_BTN2[b, t, slot] = _on_table(objects.boxes[..., :2], visible[:, TOP])
+        grasps_BTN2[b, t, slot] = _on_table(objects.grasps, visible[:, TOP])
         end_effector_BT = np.where(steps.exists, [[episode.end_effector] for episode in episodes], 0)
         arrays = (numbers_BTVN, boxes_BTVN4, masks_BTVN, num_slots, positions_BTN2, grasps_BTN2)
         history = HistoryBatch(
@@ -98,8 +87,8 @@ class Collator:
         )
         slots = np.full((2, len(counts)), -1)
         if self.reader.layout == "objects":  # elsewhere slots of two views need not show one object
-            for row, column in enumerate((PICK, PLACE)):
-                asked = rows[:, ID] == steps.rows[step, column]
+            for row, ids in enumerate((steps.pick_ids, steps.place_ids)):
+                asked = objects.ids == ids[step]
                 slots[row, step[asked]] = slot[asked]
         return history, slots
 
@@ -119,19 +108,21 @@ class Collator:
             )
         return num_slots
 
-    def _spurious(self, steps: "_Steps", bases: np.ndarray) -> Spurious:
-        numbers = steps.rows[:, SPURIOUS_NUMBERS]
-        boxes = steps.rows[:, SPURIOUS_BOXES].reshape(-1, len(VIEWS), 4)
+    def _false_positives(
+        self, episodes: Sequence[PreprocessedEpisode], steps: "_Steps", bases: np.ndarray
+    ) -> FalsePositiveBatch:
+        crop_index = np.concatenate([episode.false_positives.crop_index for episode in episodes])
+        boxes = np.concatenate([episode.false_positives.boxes for episode in episodes]).astype(np.int64)
         if self.reader.layout == "frames":
             points = np.zeros((len(boxes), len(VIEWS), 2))
         else:
             points = np.stack([unproject(boxes[:, v, :2], CAMERAS[view]) for v, view in enumerate(VIEWS)], 1)
-        numbers = np.where(numbers > 0, numbers + bases[steps.b][:, None], 0)
-        return Spurious(steps.padded(numbers), steps.padded(boxes), steps.padded(points))
+        crop_index = offset_index(crop_index, bases[steps.b][:, None])
+        return FalsePositiveBatch(steps.padded(crop_index), steps.padded(boxes), steps.padded(points))
 
     def _prompts(self, episodes: Sequence[PreprocessedEpisode], bases: np.ndarray) -> PromptBatch:
-        prompts = [self._prompt(episode) for episode in episodes]
-        total = sum(len(prompt.rows) for prompt in prompts)
+        prompts = [self._prompt(episode.prompt) for episode in episodes]
+        total = sum(len(prompt.objects) for prompt in prompts)
         length = max(len(prompt.places.words) for prompt in prompts)
         word_ids_BL = np.full((len(prompts), length), PADDING_ID, np.int64)
         object_index_BL = np.full((len(prompts), length), WORD, np.int64)
@@ -143,49 +134,44 @@ class Collator:
             numbered = places.entries + (first + places.parts * total)
             object_index_BL[b, :size] = np.where(places.is_word, WORD, numbered)
             mask_BL[b, :size] = True if prompt.mask is None else prompt.mask
-            first += len(prompt.rows)
-        rows = np.concatenate([prompt.rows for prompt in prompts]).astype(np.int64)
-        base = np.repeat(bases, [len(prompt.rows) for prompt in prompts])[:, None]
-        shown = rows[:, NUMBERS] > 0
-        numbers_VS = np.ascontiguousarray(np.where(shown, rows[:, NUMBERS] + base, 0).T)
-        boxes_VS4 = np.ascontiguousarray(rows[:, BOXES].reshape(-1, len(VIEWS), 4).swapaxes(0, 1))
-        shown_VS = np.ascontiguousarray(shown.T)
-        starts = np.cumsum([0, *(len(prompt.rows) for prompt in prompts)])
-        lying = [
-            on_table(prompt.places.images, boxes_VS4[:, start:end], shown_VS[:, start:end])
-            for prompt, start, end in zip(prompts, starts[:-1], starts[1:], strict=True)
-        ]
+            first += len(prompt.objects)
+        objects = ObjectTable.concatenate([prompt.objects for prompt in prompts])
+        base = np.repeat(bases, [len(prompt.objects) for prompt in prompts])[:, None]
+        visible = objects.masks
         arrays = (
             word_ids_BL,
             object_index_BL,
             mask_BL,
-            numbers_VS,
-            boxes_VS4,
-            shown_VS,
-            _on_table(boxes_VS4[..., :2].swapaxes(0, 1), shown[:, TOP]),
+            np.ascontiguousarray(offset_index(objects.crop_index, base).T),
+            np.ascontiguousarray(objects.boxes.swapaxes(0, 1).astype(np.int64)),
+            np.ascontiguousarray(visible.T),
+            _on_table(objects.boxes[..., :2], visible[:, TOP]),
             np.concatenate([prompt.places.images for prompt in prompts]),
-            np.concatenate(lying),
+            np.concatenate([prompt.is_scene[prompt.places.images] for prompt in prompts]),
         )
         return PromptBatch(*(torch.from_numpy(array) for array in arrays))
 
-    def _prompt(self, episode: PreprocessedEpisode) -> "_Prompt":
+    def _prompt(self, prompt: PreprocessedPrompt) -> "_Prompt":
         """Lay out one prompt: words, and one token or several for each object of an image."""
-        counts = tuple(episode.prompt_counts.tolist())
+        counts = tuple(prompt.objects_per_image.tolist())
+        in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
+        is_scene = prompt.is_scene[in_text]
         if self.reader.layout != "views":
-            places = self._places(episode.text, counts, ())
-            rows = episode.prompt if places.order is None else episode.prompt[places.order]
-            return _Prompt(places, rows, None)
-        starts = np.cumsum([0, *counts])
-        numbers = [piece for piece in pieces_of(episode.text) if isinstance(piece, int)]
-        images = [episode.prompt[starts[number] : starts[number + 1]] for number in numbers]
-        shown = [image[:, NUMBERS] > 0 for image in images]
-        slots = tuple(max((int(image[:, v].sum()) for image in shown), default=0) for v in (FRONT, TOP))
-        places = self._places(episode.text, counts, slots)
-        rows = np.concatenate([_compacted(image, max(slots)) for image in images] or [episode.prompt[:0]])
-        counts_as_place, shown = places.is_word.copy(), rows[:, NUMBERS] > 0
+            places = self._places(prompt.text, counts, ())
+            objects = prompt.objects if places.order is None else prompt.objects.select(places.order)
+            return _Prompt(places, objects, is_scene, None)
+        tables = prompt.objects.split(prompt.objects_per_image)
+        images = [tables[number] for number in in_text]
+        slots = tuple(
+            np.array([image.masks.sum(axis=0) for image in images]).reshape(-1, 2).max(0, initial=0).tolist()
+        )
+        places = self._places(prompt.text, counts, slots)
+        padded = [_compact(image, max(slots)) for image in images]
+        objects = ObjectTable.concatenate(padded) if padded else prompt.objects.select(slice(0))
+        mask, visible = places.is_word.copy(), objects.masks
         is_image = ~places.is_word  # there may be none: a detector need not find anything
-        counts_as_place[is_image] = shown[places.entries[is_image], places.parts[is_image]]
-        return _Prompt(places, rows, counts_as_place)
+        mask[is_image] = visible[places.entries[is_image], places.parts[is_image]]
+        return _Prompt(places, objects, is_scene, mask)
 
     def _places(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Places":
         """Lay out a text whose images show so many objects; few texts differ, so they are remembered."""
@@ -201,7 +187,7 @@ class Collator:
         places: list[tuple[int, int, int]] = []  # word, entry, part
         starts, order, count = np.cumsum([0, *counts]), [], 0
         sizes: list[int] = []  # rows of each image
-        for piece in pieces_of(text):
+        for piece in split_prompt(text):
             if isinstance(piece, str):
                 places += [(word, WORD, 0) for word in tokenizer.encode(piece)]
                 continue
@@ -239,10 +225,11 @@ class _Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Prompt:
-    """One prompt: its places, one row an object, and which places count (None: all)."""
+    """One prompt: its places, its objects, which images are scenes, and which places count (None: all)."""
 
     places: _Places
-    rows: np.ndarray
+    objects: ObjectTable
+    is_scene: np.ndarray
     mask: np.ndarray | None
 
 
@@ -250,7 +237,9 @@ class _Prompt:
 class _Steps:
     """All steps of a batch, one after the other, and where they stand in a padded array."""
 
-    rows: np.ndarray  # (steps, columns of a step), int64
+    objects_per_step: np.ndarray  # (steps,), int64
+    pick_ids: np.ndarray
+    place_ids: np.ndarray
     b: np.ndarray
     t: np.ndarray
     exists: np.ndarray  # (B, T)
@@ -265,7 +254,10 @@ class _Steps:
         b = np.repeat(np.arange(len(episodes)), lengths)
         t = np.arange(len(b)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
         exists = np.arange(lengths.max(initial=0)) < lengths[:, None]
-        return _Steps(np.concatenate([episode.steps for episode in episodes]).astype(np.int64), b, t, exists)
+        objects_per_step = np.concatenate([episode.objects_per_step for episode in episodes])
+        pick_ids = np.concatenate([episode.pick_ids for episode in episodes])
+        place_ids = np.concatenate([episode.place_ids for episode in episodes])
+        return _Steps(objects_per_step.astype(np.int64), pick_ids, place_ids, b, t, exists)
 
     def padded(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
         """Spread one row a step over an array of shape (B, T, …)."""
@@ -274,21 +266,34 @@ class _Steps:
         return result
 
 
-def _ordered(rows: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort the objects of each step as each view shows them: visible ones first, then by id."""
-    front, top = (rows[np.lexsort((rows[:, ID], rows[:, NUMBERS][:, v] == 0, step))] for v in (FRONT, TOP))
-    return front, top
+def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
+    """Sort the objects of each step in each view by itself: visible ones first, then by id."""
+    masks = objects.masks
+    order = np.stack([np.lexsort((objects.ids, ~masks[:, v], step)) for v in (FRONT, TOP)], axis=1)
+    return _reorder_views(objects, order)
 
 
-def _compacted(image: np.ndarray, count: int) -> np.ndarray:
-    """The objects of a prompt image, in each view the visible ones first, in so many slots."""
-    result = np.zeros((count, image.shape[1]), image.dtype)
-    for v in (FRONT, TOP):
-        shown = image[image[:, NUMBERS][:, v] > 0]
-        box = slice(BOXES.start + 4 * v, BOXES.start + 4 * (v + 1))
-        result[: len(shown), NUMBERS.start + v] = shown[:, NUMBERS.start + v]
-        result[: len(shown), box] = shown[:, box]
-    return result
+def _compact(image: ObjectTable, count: int) -> ObjectTable:
+    """Move the visible objects of an image to the front of each view, in so many slots."""
+    order = np.argsort(~image.masks, axis=0, kind="stable")[:count]
+    image = _reorder_views(image, order)
+    extra = count - len(image)
+
+    def pad(column: np.ndarray) -> np.ndarray:
+        return np.pad(column, [(0, extra)] + [(0, 0)] * (column.ndim - 1))
+
+    return ObjectTable(pad(image.ids), pad(image.crop_index), pad(image.boxes), pad(image.grasps))
+
+
+def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
+    """Reorder each view by itself, order (N, 2); a row need not be one object afterwards."""
+    views = np.arange(len(VIEWS))
+    return ObjectTable(
+        objects.ids[: len(order)],
+        objects.crop_index[order, views],
+        objects.boxes[order, views],
+        objects.grasps[order, views],
+    )
 
 
 def _on_table(pixels: np.ndarray, from_top: np.ndarray) -> np.ndarray:

@@ -9,24 +9,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from openvima.data.object_cache.episode import IMAGE_SIZES, InputKind, PreprocessedEpisode
+from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.perception.preprocessing import IMAGE_SIZES, InputKind
 from openvima.policies.heads.base import ActionTargets
 from openvima.policies.inputs import HistoryBatch, PromptBatch, Reader
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spurious:
-    """False detections: for each step one rectangle of each view that shows no object in particular.
-
-    Policies that see whole frames have no detections, true or false; all is 0 for them.
+class FalsePositiveBatch:
+    """The false detections of a batch, see `FalsePositives`, padded.
 
     Args:
-        crops: Numbers of the crops, shape (B, T, 2).
+        crop_index: Indices of the crops, shape (B, T, 2).
         boxes: Boxes in pixels, shape (B, T, 2, 4).
         points: Table points under their centres, shape (B, T, 2, 2), metres.
     """
 
-    crops: np.ndarray
+    crop_index: np.ndarray
     boxes: np.ndarray
     points: np.ndarray
 
@@ -36,13 +35,13 @@ class Example:
     """One demonstration whose images are part of a stack.
 
     Args:
-        tokens: The demonstration.
-        base: Images of the stack before its own: its image n is number `base + n` there, and 0 stays 0.
+        episode: The demonstration.
+        base: Images of the stack before its own: its image n has index `base + n` there, and 0 stays 0.
         row: Its number among all demonstrations.
         other: Another one, from which objects may be borrowed.
     """
 
-    tokens: PreprocessedEpisode
+    episode: PreprocessedEpisode
     base: int = 0
     row: int = 0
     other: "Example | None" = None
@@ -56,7 +55,7 @@ class Batch:
         prompts: What the robot was told.
         history: What it saw.
         targets: What it did.
-        spurious: A false detection for each step and view.
+        false_positives: A false detection for each step and view.
         images: What the numbers of images count through, shape (K, 3, height, width), uint8; None where that
             is a stack of all demonstrations.
     """
@@ -64,7 +63,7 @@ class Batch:
     prompts: PromptBatch
     history: HistoryBatch
     targets: ActionTargets
-    spurious: Spurious
+    false_positives: FalsePositiveBatch
     images: torch.Tensor | None = None
 
     def to(self, device: torch.device | str) -> "Batch":

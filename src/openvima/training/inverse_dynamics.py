@@ -14,7 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import COUNT, ID, NUMBERS, PROMPT_WIDTH, PreprocessedEpisode
+from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 
 MOTION_TEXT = "Follow this motion: {frames}."
@@ -31,16 +32,18 @@ def as_motion(episode: PreprocessedEpisode) -> PreprocessedEpisode:
             their ids, as the scenes in the prompts of tasks have it. One that no view shows, as it stands
             for a moment in which a detector found nothing, is left out.
     """
-    rows = np.concatenate([episode.objects[:, :PROMPT_WIDTH], episode.final])
-    frame = np.repeat(np.arange(episode.num_steps + 1), [*episode.steps[:, COUNT], len(episode.final)])
-    shown = rows[:, NUMBERS].any(axis=1)
-    rows, frame = rows[shown], frame[shown]
-    return replace(
-        episode,
-        text=motion_text(episode.num_steps + 1),
-        prompt_counts=np.bincount(frame, minlength=episode.num_steps + 1).astype(np.int32),
-        prompt=rows[np.lexsort((rows[:, ID], frame))],
+    objects = ObjectTable.concatenate([episode.objects, episode.final])
+    num_frames = episode.num_steps + 1
+    frame = np.repeat(np.arange(num_frames), [*episode.objects_per_step, len(episode.final)])
+    order = np.lexsort((objects.ids, frame))
+    order = order[np.asarray(objects.masks.any(axis=1))[order]]
+    prompt = PreprocessedPrompt(
+        text=motion_text(num_frames),
+        objects=objects.select(order),
+        objects_per_image=np.bincount(frame[order], minlength=num_frames).astype(np.int16),
+        is_scene=np.ones(num_frames, np.bool_),
     )
+    return replace(episode, prompt=prompt)
 
 
 def motion_prompt(observations: Sequence[Mapping], objects: Sequence[ObjectRecord]) -> RenderedPrompt:

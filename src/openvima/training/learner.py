@@ -11,8 +11,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from openvima.data.object_cache.episode import InputKind
 from openvima.errors import CheckpointError, ConfigError
+from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.inputs import Reader
@@ -217,7 +217,7 @@ def read_tensors(file: Path) -> dict[str, torch.Tensor]:
 def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example], torch.Tensor]:
     """Put the images of demonstrations into one stack, and of those from which they borrow objects."""
     others = [example.other for example in examples if example.other is not None]
-    stacked, stack = stack_images([example.tokens for example in (*examples, *others)], reader)
+    stacked, stack = stack_images([example.episode for example in (*examples, *others)], reader)
     own, behind = stacked[: len(examples)], iter(stacked[len(examples) :])
     return [
         replace(ours, other=None if example.other is None else next(behind))

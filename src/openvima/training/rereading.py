@@ -9,17 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import (
-    BOXES,
-    COUNT,
-    ID,
-    NUMBERS,
-    PICK,
-    PLACE,
-    PreprocessedEpisode,
-    image_names,
-)
-from openvima.policies.inputs import on_table
+from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt, image_names
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 
 MOST_NAMES = 2
@@ -27,6 +18,7 @@ DEFINITION = "This is a {noun} {image}."
 _SENTENCE_END = re.compile(r"(?<=\.) ")
 _IS_COMPARISON = re.compile(r"\} is \w+ than \{")
 _INVENTED = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
+_Image = tuple[ObjectTable, bool]  # its objects, and whether it is a scene
 _DETERMINED = ("the", "same", "any", "all")  # words after which a noun needs no article
 
 
@@ -37,27 +29,25 @@ def as_named(episode: PreprocessedEpisode, rng: np.random.Generator) -> Preproce
     have to be read. Nothing is drawn or copied but rows of numbers. A prompt that has invented words of its
     own, as those of `novel_noun` and `novel_adj`, stays as it is, and so does one that shows no object alone.
     """
-    names = image_names(episode.text)
-    alone = _alone(episode)
-    named = [name for name, is_alone in zip(names, alone, strict=True) if is_alone]
-    if not named or _INVENTED.search(episode.text):
+    images = _images(episode.prompt)
+    named = [name for name, (objects, is_scene) in images.items() if len(objects) == 1 and not is_scene]
+    if not named or _INVENTED.search(episode.prompt.text):
         return episode
     count = int(rng.integers(1, min(MOST_NAMES, len(named)) + 1))
     chosen = [named[int(number)] for number in rng.permutation(len(named))[:count]]
     nouns = [NOUNS[int(number)] for number in rng.permutation(len(NOUNS))]
-    text = episode.text
+    text = episode.prompt.text
     for name, noun in zip(chosen, nouns, strict=False):
         text = re.sub(rf"(\w+) \{{{name}\}}", lambda found, noun=noun: _noun_phrase(found[1], noun), text)
-    parts = _parts(episode)
     if rng.random() < 0.5:
-        others = _others_in_view(episode, parts[chosen[0]], rng)[: len(NOUNS) - count]
-        parts |= {f"other_{number}": rows for number, rows in enumerate(others)}
+        others = _others_in_view(episode, images[chosen[0]][0], rng)[: len(NOUNS) - count]
+        images |= {f"other_{number}": (objects, False) for number, objects in enumerate(others)}
         chosen += [f"other_{number}" for number in range(len(others))]
     defined = [
         DEFINITION.format(noun=noun, image=f"{{{name}}}") for name, noun in zip(chosen, nouns, strict=False)
     ]
     text = " ".join([*(defined[int(number)] for number in rng.permutation(len(defined))), text])
-    return _with_text(episode, text, parts)
+    return _with_prompt(episode, text, images)
 
 
 def in_any_order(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
@@ -68,7 +58,7 @@ def in_any_order(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prep
     words around it and does not follow from its place. Other prompts stay as they are.
     """
     explaining, comparisons, instruction = [], [], []
-    for sentence in _SENTENCE_END.split(episode.text):
+    for sentence in _SENTENCE_END.split(episode.prompt.text):
         if _IS_COMPARISON.search(sentence):
             comparisons.append(sentence)
         elif sentence.startswith(DEFINITION.partition("{")[0]):
@@ -82,47 +72,47 @@ def in_any_order(episode: PreprocessedEpisode, rng: np.random.Generator) -> Prep
         return episode
     blocks = [*explaining, " ".join(instruction)]
     text = " ".join(blocks[int(number)] for number in rng.permutation(len(blocks)))
-    return _with_text(episode, text, _parts(episode))
+    return _with_prompt(episode, text, _images(episode.prompt))
 
 
-def _parts(episode: PreprocessedEpisode) -> dict[str, np.ndarray]:
-    """Rows of the objects of each prompt image, by its name."""
-    rows = np.split(episode.prompt, np.cumsum(episode.prompt_counts)[:-1])
-    return dict(zip(image_names(episode.text), rows, strict=True))
+def _images(prompt: PreprocessedPrompt) -> dict[str, _Image]:
+    """The objects of each prompt image, and whether it is a scene, by its name."""
+    tables = prompt.objects.split(prompt.objects_per_image)
+    return dict(zip(prompt.image_names, zip(tables, prompt.is_scene.tolist(), strict=True), strict=True))
 
 
-def _with_text(
-    episode: PreprocessedEpisode, text: str, parts: Mapping[str, np.ndarray]
+def _with_prompt(
+    episode: PreprocessedEpisode, text: str, images: Mapping[str, _Image]
 ) -> PreprocessedEpisode:
     """The demonstration with another prompt, which shows some of these images."""
-    in_order = [parts[name] for name in image_names(text)]
-    return replace(
-        episode,
+    tables, is_scene = zip(*(images[name] for name in image_names(text)), strict=True)
+    prompt = PreprocessedPrompt(
         text=text,
-        prompt_counts=np.array([len(part) for part in in_order], episode.prompt_counts.dtype),
-        prompt=np.concatenate(in_order),
+        objects=ObjectTable.concatenate(tables),
+        objects_per_image=np.array([len(table) for table in tables], np.int16),
+        is_scene=np.array(is_scene, np.bool_),
     )
+    return replace(episode, prompt=prompt)
 
 
 def _others_in_view(
-    episode: PreprocessedEpisode, alone: np.ndarray, rng: np.random.Generator
-) -> list[np.ndarray]:
+    episode: PreprocessedEpisode, alone: ObjectTable, rng: np.random.Generator
+) -> list[ObjectTable]:
     """Rows for pictures of objects that the first step does nothing with, in any order.
 
     They show the crops of the scene, in the middle of the picture as single objects stand there.
 
     Args:
         episode: The demonstration.
-        alone: The row of a picture of a single object, shape (1, 11).
+        alone: The row of a picture of a single object.
         rng: Draws the order.
     """
-    first = episode.objects[: episode.steps[0, COUNT]]
-    first = first[~np.isin(first[:, ID], episode.steps[0, [PICK, PLACE]])]
-    rows = np.repeat(alone, len(first), axis=0)
-    rows[:, NUMBERS] = first[:, NUMBERS]
+    first = episode.objects.select(slice(0, int(episode.objects_per_step[0])))
+    first = first.select(~np.isin(first.ids, [episode.pick_ids[0], episode.place_ids[0]]))
+    rows = alone.select(np.zeros(len(first), np.int64))
     # A hidden object has no box.
-    rows[:, BOXES] *= np.repeat(first[:, NUMBERS] > 0, 4, axis=1)
-    return [rows[[int(number)]] for number in rng.permutation(len(rows))]
+    rows = replace(rows, crop_index=first.crop_index, boxes=rows.boxes * first.masks[..., None])
+    return [rows.select(np.array([number])) for number in rng.permutation(len(rows))]
 
 
 def without_bystanders(
@@ -135,36 +125,27 @@ def without_bystanders(
         share: How probable either is for each of them.
         rng: Draws them.
     """
-    used = {int(number) for number in motion.steps[:, [PICK, PLACE]].flat}
-    ids = np.array(sorted({int(number) for number in motion.objects[:, ID]} - used), np.int64)
+    ids = np.setdiff1d(motion.objects.ids, [motion.pick_ids, motion.place_ids])
     is_unseen, is_unpictured = rng.random((2, len(ids))) < share
-    seen = ~np.isin(motion.objects[:, ID], ids[is_unseen])
-    pictured = ~np.isin(motion.prompt[:, ID], ids[is_unpictured & ~is_unseen])
-    steps = motion.steps.copy()
-    steps[:, COUNT] = _counted(motion.steps[:, COUNT], seen)
+    prompt = motion.prompt
+    seen = ~np.isin(motion.objects.ids, ids[is_unseen])
+    pictured = ~np.isin(prompt.objects.ids, ids[is_unpictured & ~is_unseen])
     return replace(
         motion,
-        steps=steps,
-        objects=motion.objects[seen],
-        prompt_counts=_counted(motion.prompt_counts, pictured).astype(motion.prompt_counts.dtype),
-        prompt=motion.prompt[pictured],
+        objects=motion.objects.select(seen),
+        objects_per_step=_counted(motion.objects_per_step, seen),
+        prompt=replace(
+            prompt,
+            objects=prompt.objects.select(pictured),
+            objects_per_image=_counted(prompt.objects_per_image, pictured),
+        ),
     )
 
 
 def _counted(counts: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """How many of the rows of each group are kept."""
     group = np.repeat(np.arange(len(counts)), counts)
-    return np.bincount(group[kept], minlength=len(counts))
-
-
-def _alone(episode: PreprocessedEpisode) -> np.ndarray:
-    """Which images of the prompt show one object alone, shape (I,), bool."""
-    image = np.repeat(np.arange(len(episode.prompt_counts)), episode.prompt_counts)
-    boxes = episode.prompt[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1)
-    lies = on_table(image, boxes, episode.prompt[:, NUMBERS].T > 0)
-    alone = episode.prompt_counts == 1
-    alone[image[lies]] = False
-    return alone
+    return np.bincount(group[kept], minlength=len(counts)).astype(counts.dtype)
 
 
 def _noun_phrase(before: str, noun: str) -> str:

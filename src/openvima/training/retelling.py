@@ -55,4 +55,4 @@ AS_TOLD = Retelling()
 def _reread(
     example: Example, change: Callable[..., PreprocessedEpisode], *given: Any
 ) -> Example:  # Any: its own
-    return replace(example, tokens=change(example.tokens, *given))
+    return replace(example, episode=change(example.episode, *given))

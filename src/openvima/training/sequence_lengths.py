@@ -4,8 +4,9 @@ import numpy as np
 import torch
 
 from openvima.data.object_cache.cache import ObjectCache
-from openvima.data.object_cache.episode import PreprocessedEpisode, pieces_of
+from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.errors import DatasetError, PolicyError
+from openvima.perception.preprocessing import split_prompt
 from openvima.policies.heads.base import ACTION_WIDTH
 from openvima.policies.inputs import Reader
 from openvima.policies.network import PolicyNetwork
@@ -49,7 +50,7 @@ def _at_most(cache: ObjectCache, reader: Reader, is_motion: bool) -> tuple[np.nd
     """Bounds on the places of each prompt, and of prompt and history together, shape (N,)."""
     steps, (shown, seen) = cache.lengths()[:, 0], cache.widths().T
     texts = [motion_text(1)] if is_motion else cache.texts()
-    pieces = [pieces_of(text) for text in texts]
+    pieces = [split_prompt(text) for text in texts]
     words = max(sum(len(reader.tokenizer.encode(p)) for p in text if isinstance(p, str)) for text in pieces)
     if is_motion:
         images = (steps + 1) * _tokens_of(seen, reader)

@@ -8,8 +8,8 @@ import numpy as np
 
 from openvima.data.batching import BatchOrder
 from openvima.data.object_cache.cache import ObjectCache
-from openvima.data.object_cache.episode import pieces_of
 from openvima.errors import ConfigError, DatasetError
+from openvima.perception.preprocessing import split_prompt
 from openvima.policies.inputs import Reader
 from openvima.training.dataset import Example
 from openvima.training.hash_split import lots_of
@@ -78,7 +78,7 @@ class Parts:
         for part in self._divided(examples):
             rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
             shown = [self._shown(example, rng) for example, rng in zip(part, rngs, strict=True)]
-            parts.append((self.collate(shown, rngs), sum(e.tokens.num_steps for e in part)))
+            parts.append((self.collate(shown, rngs), sum(e.episode.num_steps for e in part)))
         return parts
 
     def _shown(self, example: Example, rng: np.random.Generator) -> Example:
@@ -86,13 +86,13 @@ class Parts:
         if self.detected is not None and rng.random() < self.detected_share:
             example = self.detected.example(example.row)
         source = self.strangers
-        if source is None or not receives_strangers(example.tokens) or rng.random() >= self.stranger_share:
+        if source is None or not receives_strangers(example.episode) or rng.random() >= self.stranger_share:
             return example
         return replace(example, other=source[int(rng.integers(len(source)))])
 
     def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
         if self.count is not None:
-            ordered = sorted(examples, key=lambda example: example.tokens.num_steps)
+            ordered = sorted(examples, key=lambda example: example.episode.num_steps)
             ends = [len(ordered) * part // self.count for part in range(self.count + 1)]
             return [ordered[start:end] for start, end in pairwise(ends)]
         size = self.largest
@@ -152,7 +152,7 @@ def check_words(cache: ObjectCache, reader: Reader) -> None:
         PromptError: A prompt has a word that the vocabulary lacks.
     """
     for text in cache.texts():
-        for piece in pieces_of(text):
+        for piece in split_prompt(text):
             if isinstance(piece, str):
                 reader.tokenizer.encode(piece)
 
@@ -186,5 +186,5 @@ def by_length(examples: Sequence[Example]) -> list[list[Example]]:
     """Sort examples into those of one step, of two or three, and longer ones, so that little is padded."""
     groups: dict[int, list[Example]] = {}
     for example in examples:
-        groups.setdefault(min(2, example.tokens.num_steps // 2), []).append(example)
+        groups.setdefault(min(2, example.episode.num_steps // 2), []).append(example)
     return [groups[key] for key in sorted(groups)]

@@ -179,7 +179,7 @@ class Cloning:
                 continue
             for group in by_length(examples):
                 loss, metrics = self._call(collate(group, None), self._validated)
-                share = sum(e.tokens.num_steps for e in group) / total
+                share = sum(e.episode.num_steps for e in group) / total
                 _add(sums, {"loss": loss, **metrics}, share * mine * self._parallel.num_ranks)
         sums = self._parallel.mean(sums)
         score = sums[self._learner.score]

@@ -4,15 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from openvima.data.object_cache.episode import (
-    BOXES,
-    COUNT,
-    ID,
-    NUMBERS,
-    SPURIOUS_NUMBERS,
-    PreprocessedEpisode,
-)
+from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.perception.iou import box_overlaps
+from openvima.perception.preprocessing import ObjectTable
 from openvima.training.dataset import Example
 
 MOST_STRANGERS = 3
@@ -40,38 +34,22 @@ def with_strangers(example: Example, other: Example, rng: np.random.Generator) -
     Returns:
         The demonstration with numbers of images that count through the whole stack.
     """
-    episode, source = _absolute(example), _absolute(other)
+    episode = example.episode.with_image_offset(example.base)
     count = int(rng.integers(1, MOST_STRANGERS + 1))
-    there = source.objects[: source.steps[0, COUNT]]
-    there = there[rng.permutation(len(there))]
-    there = there[(there[:, NUMBERS] > 0).all(axis=1)]
-    taken = box_overlaps(*_places(there), *_places(episode.objects)) > 0
-    there = there[~taken.any(axis=1)][:count].copy()
-    there[:, ID] = episode.objects[:, ID].max(initial=-1) + 1 + np.arange(len(there))
-    parts = np.split(episode.objects, np.cumsum(episode.steps[:, COUNT])[:-1])
-    steps = episode.steps.copy()
-    steps[:, COUNT] += len(there)
-    objects = np.concatenate([rows for part in parts for rows in (part, there)])
-    return replace(example, tokens=replace(episode, steps=steps, objects=objects), base=0)
-
-
-def _places(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes of objects, (2, N, 4), and which views show them, (2, N)."""
-    return rows[:, BOXES].reshape(-1, 2, 4).swapaxes(0, 1), rows[:, NUMBERS].T > 0
-
-
-def _absolute(example: Example) -> PreprocessedEpisode:
-    """The demonstration with its images numbered as in the stack, in 64 bits."""
-    episode = example.tokens
-    prompt, objects, final = (
-        table.astype(np.int64) for table in (episode.prompt, episode.objects, episode.final)
+    there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))
+    there = there.with_image_offset(other.base).select(rng.permutation(len(there)))
+    there = there.select(np.asarray(there.masks.all(axis=1)))
+    taken = box_overlaps(*_boxes_by_view(there), *_boxes_by_view(episode.objects)) > 0
+    there = there.select(np.flatnonzero(~taken.any(axis=1))[:count])
+    there = replace(there, ids=episode.objects.ids.max(initial=-1) + 1 + np.arange(len(there)))
+    steps = episode.objects.split(episode.objects_per_step)
+    objects = ObjectTable.concatenate([table for step in steps for table in (step, there)])
+    objects_per_step = episode.objects_per_step + len(there)
+    return replace(
+        example, episode=replace(episode, objects=objects, objects_per_step=objects_per_step), base=0
     )
-    steps = episode.steps.astype(np.int64)
-    for table, columns in (
-        (prompt, NUMBERS),
-        (objects, NUMBERS),
-        (final, NUMBERS),
-        (steps, SPURIOUS_NUMBERS),
-    ):
-        table[:, columns] += np.where(table[:, columns] > 0, example.base, 0)
-    return replace(episode, prompt=prompt, objects=objects, final=final, steps=steps)
+
+
+def _boxes_by_view(objects: ObjectTable) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes, (2, N, 4), and visibility, (2, N)."""
+    return objects.boxes.swapaxes(0, 1), objects.masks.T

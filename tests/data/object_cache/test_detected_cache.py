@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from noisy_extractor import HOOK, Clumsy
+from object_rows import rows_of
 from openvima.cli.main import main
 from openvima.data import Dataset
 from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.object_cache.cache_file import write_cache_file
-from openvima.data.object_cache.episode import COUNT, ID, PICK, PLACE, preprocess
+from openvima.data.object_cache.episode import preprocess
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
 from openvima.perception.iou import overlaps
@@ -26,15 +27,14 @@ def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -
     num_lost = 0
     for demo in Dataset(demos):
         tokens = preprocess(demo, "objects", Clumsy())
-        assert tokens.text == demo.prompt.text
-        ends = np.cumsum(tokens.steps[:, COUNT])
-        for t, rows in enumerate(np.split(tokens.objects, ends)[:-1]):
+        assert tokens.prompt.text == demo.prompt.text
+        for t, table in enumerate(tokens.objects.split(tokens.objects_per_step)):
             found, true = Clumsy().in_observation(demo.observation(t)), observe(demo.observation(t))
-            assert rows[:, ID].tolist() == list(range(len(found)))
+            assert table.ids.tolist() == list(range(len(found)))
             shares = overlaps(found, true)
-            for column, asked in ((PICK, demo.pick_ids[t]), (PLACE, demo.place_ids[t])):
+            for slots, asked in ((tokens.pick_ids, demo.pick_ids[t]), (tokens.place_ids, demo.place_ids[t])):
                 slot, there = (
-                    tokens.steps[t, column],
+                    slots[t],
                     true.ids.tolist().index(asked) if asked in true.ids else -1,
                 )
                 if slot >= 0:
@@ -49,14 +49,17 @@ def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -
 def test_a_extractor_that_is_always_right_names_the_same_objects(demos: Path) -> None:
     for demo in Dataset(demos):
         detected, true = (preprocess(demo, "objects", extractor) for extractor in (GROUND_TRUTH, None))
-        for name in ("images", "prompt_counts", "actions"):
+        for name in ("images", "actions"):
             np.testing.assert_array_equal(getattr(detected, name), getattr(true, name))
-        np.testing.assert_array_equal(detected.objects[:, ID + 1 :], true.objects[:, ID + 1 :])
-        starts = np.cumsum(true.steps[:, COUNT]) - true.steps[:, COUNT]
-        for column in (PICK, PLACE):
-            slots, ids = detected.steps[:, column], true.steps[:, column]
+        ours, theirs = detected.prompt.objects_per_image, true.prompt.objects_per_image
+        np.testing.assert_array_equal(ours, theirs)
+        for name in ("crop_index", "boxes", "grasps"):
+            np.testing.assert_array_equal(getattr(detected.objects, name), getattr(true.objects, name))
+        starts = np.cumsum(true.objects_per_step) - true.objects_per_step
+        for name in ("pick_ids", "place_ids"):
+            slots, ids = getattr(detected, name), getattr(true, name)
             assert ((slots >= 0) == (ids >= 0)).all()
-            named = true.objects[(starts + slots)[slots >= 0], ID]
+            named = true.objects.ids[(starts + slots)[slots >= 0]]
             np.testing.assert_array_equal(named, ids[slots >= 0])
 
 
@@ -70,16 +73,17 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
     caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
     assert [cache.folder.name for cache in caches] == [
-        "objects-v2",
-        "objects-v2-clumsy-1",
-        "objects-v2-clumsy-2",
+        "objects-v3",
+        "objects-v3-clumsy-1",
+        "objects-v3-clumsy-2",
     ]
     assert made == [1, 2]  # once, for all shards
-    assert open_object_cache(dataset, boxes=two)[0].objects.tolist() == caches[2][0].objects.tolist()
+    reopened = open_object_cache(dataset, boxes=two)
+    assert rows_of(reopened[0].objects).tolist() == rows_of(caches[2][0].objects).tolist()
     assert made == [1, 2]
-    assert caches[1][0].objects.tolist() != caches[2][0].objects.tolist()
+    assert rows_of(caches[1][0].objects).tolist() != rows_of(caches[2][0].objects).tolist()
     again = pickle.loads(pickle.dumps(caches[2]))
-    assert again[3].objects.tolist() == caches[2][3].objects.tolist()
+    assert rows_of(again[3].objects).tolist() == rows_of(caches[2][3].objects).tolist()
     with pytest.raises(DatasetError, match=r"lacks tokens of 6 shards.*--boxes DETECTOR"):
         ObjectCache(dataset, boxes="clumsy-3")
 
@@ -106,13 +110,14 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 
     with pytest.raises(WorkerError, match="enough"):
         open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
-    folder = copy / "tokens" / "objects-v2-clumsy-1"
+    folder = copy / "tokens" / "objects-v3-clumsy-1"
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     assert 1 <= len(before) <= 5
     cache = open_object_cache(dataset, boxes=CLUMSY)
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
     for demo, tokens in zip(dataset, cache, strict=True):
-        assert tokens.objects.tolist() == preprocess(demo, "objects", Clumsy()).objects.tolist()
+        expected = preprocess(demo, "objects", Clumsy())
+        assert rows_of(tokens.objects).tolist() == rows_of(expected.objects).tolist()
 
 
 def test_tokens_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
@@ -141,7 +146,7 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
     write_cache_file(path, changed, "objects", cache._files[path.name].source, "clumsy-1")
     (problem,) = verify(copy).problems
     assert "not those of the demonstration" in problem.cause
-    assert problem.file.endswith("objects-v2-clumsy-1/rotate-train-00000.arrow")
+    assert problem.file.endswith("objects-v3-clumsy-1/rotate-train-00000.arrow")
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -149,6 +154,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     assert main(words) == 0
     (folder,) = (copy / "tokens").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
-    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v2-"))) == 10
+    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v3-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2
     assert "whole frames have none" in capsys.readouterr().err

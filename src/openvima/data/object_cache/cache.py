@@ -14,12 +14,13 @@ from openvima.atomic_io import remove_abandoned
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, write_cache_file
-from openvima.data.object_cache.episode import KINDS, InputKind, PreprocessedEpisode, preprocess
+from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
 from openvima.multiprocess import in_processes
 from openvima.perception.objects import ObjectExtractor
+from openvima.perception.preprocessing import KINDS, InputKind
 
 Report = Callable[[int, int, str], None]
 

@@ -1,10 +1,12 @@
-"""One file of tokens: an Arrow file without compression, whose tables are read in place.
+"""One file of the object cache: an uncompressed Arrow file whose tables are memory-mapped.
 
-Only the images are compressed, those of an episode together, so that any episode can be read by itself.
+Tables are lists of structs with fields of fixed width, so each field of all episodes is one array. Only the
+images are compressed, those of an episode together, so that any episode can be read by itself.
 """
 
 import json
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,56 +14,68 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
-from openvima.data.object_cache.episode import (
-    ACTION_PARTS,
-    COUNT,
-    IMAGE_SIZES,
-    KINDS,
-    OBJECT_WIDTH,
-    PROMPT_WIDTH,
-    STEP_WIDTH,
-    InputKind,
-    PreprocessedEpisode,
-)
+from openvima.data.object_cache.episode import ACTION_PARTS, FalsePositives, PreprocessedEpisode
 from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
+from openvima.perception.preprocessing import (
+    IMAGE_SIZES,
+    KINDS,
+    InputKind,
+    ObjectTable,
+    PreprocessedPrompt,
+)
 
-CACHE_VERSION = 2  # grows whenever the same demonstration gives other tokens
+CACHE_VERSION = 3  # grows whenever the same demonstration gives another record
 IMAGE_CODEC = "lz4_raw"  # blocks, without the frame around them
-_KEY = b"openvima.tokens"
+_KEY = b"openvima.object_cache"
 
 
-def _table(name: str, dtype: pa.DataType, width: int, meaning: str) -> pa.Field:
-    row = pa.list_(pa.field("item", dtype, nullable=False), width)
-    column = pa.list_(pa.field("item", row, nullable=False))
-    return pa.field(name, column, nullable=False, metadata={"columns": meaning})
+def _field(name: str, dtype: pa.DataType, *shape: int, meaning: str) -> pa.Field:
+    """Describe a field of fixed shape."""
+    for size in reversed(shape):
+        dtype = pa.list_(pa.field("item", dtype, nullable=False), size)
+    return pa.field(name, dtype, nullable=False, metadata={"meaning": meaning})
 
 
-_BOX = "front x, front y, front height, front width, top x, top y, top height, top width"
+def _table(name: str, *fields: pa.Field) -> pa.Field:
+    return pa.field(name, pa.list_(pa.field("item", pa.struct(fields), nullable=False)), nullable=False)
+
+
+_BOXES = "front and top view: centre x, centre y, height, width in pixels"
+_OBJECT = (
+    _field("id", pa.int16(), meaning="segmentation value, or rank in the image where it was detected"),
+    _field("crop_index", pa.int32(), 2, meaning="front and top view: index of the image, 0 where hidden"),
+    _field("boxes", pa.int16(), 2, 4, meaning=_BOXES),
+    _field("grasps", pa.int16(), 2, 2, meaning="front and top view: column and row"),
+)
 COLUMNS = pa.schema(
     [
         pa.field("task", pa.string(), nullable=False),
         pa.field("seed", pa.int64(), nullable=False),
-        pa.field("text", pa.string(), nullable=False),
         pa.field("end_effector", pa.int8(), nullable=False),
-        _table("prompt_counts", pa.int32(), 1, "objects of a prompt image"),
-        _table("prompt", pa.int16(), PROMPT_WIDTH, f"id, front image, top image, {_BOX}"),
+        pa.field("text", pa.string(), nullable=False),
+        _table("prompt_objects", *_OBJECT),
         _table(
-            "steps", pa.int16(), STEP_WIDTH, f"objects, picked id, place id, false front, false top, {_BOX}"
+            "prompt_images",
+            _field("num_objects", pa.int16(), meaning="rows of prompt_objects"),
+            _field("is_scene", pa.uint8(), meaning="1 for a scene, 0 for one object on white"),
         ),
+        _table("objects", *_OBJECT),
         _table(
-            "objects",
-            pa.int16(),
-            OBJECT_WIDTH,
-            f"id, front image, top image, {_BOX}, front grasp x, front grasp y, top grasp x, top grasp y",
+            "steps",
+            _field("num_objects", pa.int16(), meaning="rows of objects"),
+            _field("pick_id", pa.int16(), meaning="object to pick"),
+            _field("place_id", pa.int16(), meaning="object to place at"),
+            _field("false_positive_crop_index", pa.int32(), 2, meaning="front and top view"),
+            _field("false_positive_boxes", pa.int16(), 2, 4, meaning=_BOXES),
+            _field("action", pa.float32(), 12, meaning=", ".join(ACTION_PARTS)),
         ),
-        _table("final", pa.int16(), PROMPT_WIDTH, f"id, front image, top image, {_BOX}"),
-        _table("actions", pa.float32(), 12, ", ".join(ACTION_PARTS)),
+        _table("final_objects", *_OBJECT),
         pa.field("num_images", pa.int32(), nullable=False),
         pa.field("images", pa.large_binary(), nullable=False, metadata={"codec": IMAGE_CODEC}),
     ]
 )
-_TABLES = ("prompt_counts", "prompt", "steps", "objects", "final", "actions")
+_TABLES = ("prompt_objects", "prompt_images", "objects", "steps", "final_objects")
 
 
 def write_cache_file(
@@ -74,19 +88,20 @@ def write_cache_file(
         episodes: What to write.
         kind: What their images show.
         source: Content hash of the demonstrations that they were made of.
-        boxes: Name of what found the objects; empty for the segmentation.
+        boxes: Name of the extractor of the objects; empty for the segmentation.
     """
     codec = pa.Codec(IMAGE_CODEC)
     columns = {
         "task": [episode.task for episode in episodes],
         "seed": [episode.seed for episode in episodes],
-        "text": [episode.text for episode in episodes],
         "end_effector": [episode.end_effector for episode in episodes],
+        "text": [episode.prompt.text for episode in episodes],
         "num_images": [len(episode.images) for episode in episodes],
         "images": [codec.compress(np.ascontiguousarray(e.images), asbytes=True) for e in episodes],
     }
+    tables = [_tables_of(episode) for episode in episodes]
     arrays = [
-        _ragged([getattr(episode, field.name) for episode in episodes], field.type)
+        _write_table([episode[field.name] for episode in tables], field.type)
         if field.name in _TABLES
         else pa.array(columns[field.name], field.type)
         for field in COLUMNS
@@ -98,7 +113,7 @@ def write_cache_file(
 
 
 class CacheFile:
-    """Reads one file of tokens, in place.
+    """Reads one file of the object cache, memory-mapped.
 
     Args:
         path: The file.
@@ -128,7 +143,6 @@ class CacheFile:
         self._seeds = batch.column("seed").to_numpy()
         self._end_effectors = batch.column("end_effector").to_numpy()
         self._num_images = batch.column("num_images").to_numpy()
-        self._tasks, self._texts = batch.column("task"), batch.column("text")
         self._images = batch.column("images")
         self._codec = pa.Codec(IMAGE_CODEC)
         height, width = IMAGE_SIZES[self.kind]
@@ -139,19 +153,35 @@ class CacheFile:
 
     def __getitem__(self, row: int) -> PreprocessedEpisode:
         tables = self._tables
+        num_objects, is_scene = tables["prompt_images"][row]
+        objects_per_step, pick_ids, place_ids, crop_index, boxes, actions = tables["steps"][row]
         return PreprocessedEpisode(
-            task=self._tasks[row].as_py(),
+            task=self._tasks[row],
             seed=int(self._seeds[row]),
-            text=self._texts[row].as_py(),
             end_effector=int(self._end_effectors[row]),
-            prompt_counts=tables["prompt_counts"][row][:, 0],
-            prompt=tables["prompt"][row],
-            steps=tables["steps"][row],
-            objects=tables["objects"][row],
-            final=tables["final"][row],
-            actions=tables["actions"][row],
+            prompt=PreprocessedPrompt(
+                self._texts[row],
+                ObjectTable(*tables["prompt_objects"][row]),
+                num_objects,
+                is_scene.view(np.bool_),
+            ),
+            objects=ObjectTable(*tables["objects"][row]),
+            objects_per_step=objects_per_step,
+            pick_ids=pick_ids,
+            place_ids=place_ids,
+            false_positives=FalsePositives(crop_index, boxes),
+            final=ObjectTable(*tables["final_objects"][row]),
+            actions=actions,
             images=self.images(row),
         )
+
+    @cached_property
+    def _tasks(self) -> list[str]:
+        return self._batch.column("task").to_pylist()
+
+    @cached_property
+    def _texts(self) -> list[str]:
+        return self._batch.column("text").to_pylist()
 
     def images(self, row: int) -> np.ndarray:
         """Return the images of one episode, shape (K, 3, height, width), uint8."""
@@ -169,50 +199,100 @@ class CacheFile:
 
     def texts(self) -> set[str]:
         """Return the different prompts."""
-        return set(self._texts.to_pylist())
+        return set(self._texts)
 
     def lengths(self) -> np.ndarray:
-        """Return the steps of each episode and the objects in view in all of them, shape (rows, 2), int64."""
+        """Return the steps of each episode and the visible objects of all of them, shape (rows, 2), int64."""
         return np.stack([self._tables["steps"].lengths(), self._tables["objects"].lengths()], axis=1)
 
     def widths(self) -> np.ndarray:
-        """Return how many objects the fullest prompt image and the fullest view show, shape (rows, 2)."""
-        views = np.maximum(self._tables["steps"].largest(COUNT), self._tables["final"].lengths())
-        return np.stack([self._tables["prompt_counts"].largest(0), views], axis=1)
+        """Return the most objects in a prompt image and in an observation, shape (rows, 2)."""
+        in_view = np.maximum(
+            self._tables["steps"].largest("num_objects"), self._tables["final_objects"].lengths()
+        )
+        return np.stack([self._tables["prompt_images"].largest("num_objects"), in_view], axis=1)
 
 
 class _Table:
-    """A column of tables with the same width, as one array and where each table begins."""
+    """A column of tables: each field of all episodes as one array, and where each episode begins."""
 
     def __init__(self, column: pa.ListArray) -> None:
-        self._starts = column.offsets.to_numpy()
-        width = column.type.value_type.list_size
-        self._rows = column.values.flatten().to_numpy(zero_copy_only=True).reshape(-1, width)
+        self._starts: list[int] = column.offsets.to_pylist()
+        structs = column.values
+        self._fields = {
+            field.name: _to_numpy(structs.field(number)) for number, field in enumerate(structs.type)
+        }
+        self._arrays = tuple(self._fields.values())
 
-    def __getitem__(self, row: int) -> np.ndarray:
-        return self._rows[self._starts[row] : self._starts[row + 1]]
+    def __getitem__(self, row: int) -> tuple[np.ndarray, ...]:
+        """Return the fields of one episode."""
+        start, end = self._starts[row], self._starts[row + 1]
+        return tuple([array[start:end] for array in self._arrays])
 
     def lengths(self) -> np.ndarray:
         return np.diff(self._starts).astype(np.int64)
 
-    def largest(self, column: int) -> np.ndarray:
-        """Return the largest number of a column in each table, 0 in an empty one."""
+    def largest(self, name: str) -> np.ndarray:
+        """Return the largest value of a field in each table, 0 in an empty one."""
         result = np.zeros(len(self._starts) - 1, np.int64)
-        rows = self._rows[self._starts[0] : self._starts[-1], column]
-        np.maximum.at(result, np.repeat(np.arange(len(result)), self.lengths()), rows)
+        values = self._fields[name][self._starts[0] : self._starts[-1]]
+        np.maximum.at(result, np.repeat(np.arange(len(result)), self.lengths()), values)
         return result
 
 
-def _ragged(tables: Sequence[np.ndarray], dtype: Any) -> pa.ListArray:  # Any: pyarrow's types are dynamic
-    width, item = dtype.value_type.list_size, dtype.value_type.value_type
-    starts = np.cumsum([0, *(len(table) for table in tables)])
-    numpy_type = item.to_pandas_dtype()
-    flat = np.concatenate([np.zeros(0, numpy_type), *(np.ravel(table) for table in tables)])
-    rows = pa.FixedSizeListArray.from_arrays(pa.array(flat.astype(numpy_type)), type=dtype.value_type)
-    assert len(rows) * width == len(flat)
+def _tables_of(episode: PreprocessedEpisode) -> dict[str, tuple[np.ndarray, ...]]:
+    """The fields of an episode's tables, in the order of the schema."""
+    prompt, false_positives = episode.prompt, episode.false_positives
+    return {
+        "prompt_objects": _object_fields(prompt.objects),
+        "prompt_images": (prompt.objects_per_image, prompt.is_scene),
+        "objects": _object_fields(episode.objects),
+        "steps": (
+            episode.objects_per_step,
+            episode.pick_ids,
+            episode.place_ids,
+            false_positives.crop_index,
+            false_positives.boxes,
+            episode.actions,
+        ),
+        "final_objects": _object_fields(episode.final),
+    }
+
+
+def _object_fields(table: ObjectTable) -> tuple[np.ndarray, ...]:
+    return table.ids, table.crop_index, table.boxes, table.grasps
+
+
+def _write_table(
+    tables: Sequence[tuple[np.ndarray, ...]], dtype: Any
+) -> pa.ListArray:  # Any: pyarrow's types are dynamic
+    struct = dtype.value_type
+    columns = [
+        _to_arrow(np.concatenate([table[number] for table in tables]), field.type)
+        for number, field in enumerate(struct)
+    ]
+    starts = np.cumsum([0, *(len(table[0]) for table in tables)])
+    rows = pa.StructArray.from_arrays(columns, fields=list(struct))
     return pa.ListArray.from_arrays(pa.array(starts, pa.int32()), rows, type=dtype)
 
 
+def _to_arrow(values: np.ndarray, dtype: Any) -> Any:  # Any: as above
+    """Make an array of fixed-size lists, as deep as the type has it."""
+    if pa.types.is_fixed_size_list(dtype):
+        inner = _to_arrow(values.reshape(-1, *values.shape[2:]), dtype.value_type)
+        return pa.FixedSizeListArray.from_arrays(inner, type=dtype)
+    return pa.array(values.astype(dtype.to_pandas_dtype()), dtype)
+
+
+def _to_numpy(array: Any) -> np.ndarray:  # Any: as above
+    """Return an array of fixed-size lists in place, without a copy."""
+    shape = [len(array)]
+    while pa.types.is_fixed_size_list(array.type):
+        shape.append(array.type.list_size)
+        array = array.flatten()
+    return array.to_numpy(zero_copy_only=True).reshape(shape)
+
+
 def _unfit(path: Path, reason: str) -> str:
-    remedy = "Delete it; `openvima data tokens` makes it anew"
-    return f"{path} holds no tokens that can be read ({reason}). {remedy}."
+    remedy = "Delete it; `openvima data preprocess` makes it anew"
+    return f"{path} is no readable file of the object cache ({reason}). {remedy}."

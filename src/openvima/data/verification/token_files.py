@@ -4,7 +4,7 @@ What a detector found is not looked for again. Of such tokens only what depends 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from openvima.errors import OpenVimaError, ShardError
 from openvima.multiprocess import in_processes
 
 # What tokens hold whatever found the objects.
-_OF_ALL = ("task", "seed", "text", "end_effector", "actions")
+_OF_ALL = ("task", "seed", "end_effector", "actions")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,8 @@ def _differences(tokens: CacheFile, shard: Shard, count: Callable[[int], None]) 
     for row in range(len(shard)):
         try:
             names = _OF_ALL if tokens.boxes else [field.name for field in fields(PreprocessedEpisode)]
-            is_same = _is_same(tokens[row], preprocess(shard[row], tokens.kind), names)
+            ours, theirs = tokens[row], preprocess(shard[row], tokens.kind)
+            is_same = ours.prompt.text == theirs.prompt.text and _is_same(ours, theirs, names)
         except OpenVimaError as error:
             yield row, f"its tokens cannot be compared: {error}"
             continue
@@ -114,5 +115,12 @@ def _differences(tokens: CacheFile, shard: Shard, count: Callable[[int], None]) 
         count(row + 1)
 
 
-def _is_same(ours: PreprocessedEpisode, theirs: PreprocessedEpisode, names: Sequence[str]) -> bool:
-    return all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in names)
+def _is_same(ours: object, theirs: object, names: Sequence[str]) -> bool:
+    return all(_is_equal(getattr(ours, name), getattr(theirs, name)) for name in names)
+
+
+def _is_equal(ours: object, theirs: object) -> bool:
+    """Compare two values; records field by field."""
+    if is_dataclass(ours):
+        return _is_same(ours, theirs, [field.name for field in fields(ours)])
+    return np.array_equal(ours, theirs)  # type: ignore[arg-type]  # numbers, strings and arrays

@@ -1,0 +1,205 @@
+"""Prompts and observations as tables of objects: the records that object cache, training and acting share.
+
+Images (crops of objects, or whole frames at half the size) are named by their index in a stack. Index 0 is a
+blank image and stands for a hidden object, everywhere.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal, get_args
+
+import numpy as np
+
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.kernels import CROP_SIZE
+from openvima.perception.objects import (
+    GROUND_TRUTH,
+    ObjectExtractor,
+    ObjectViews,
+    part_of,
+    whole_frames,
+)
+from openvima.scene import PromptImage, RenderedPrompt
+
+InputKind = Literal["objects", "frames"]
+KINDS: tuple[InputKind, ...] = get_args(InputKind)
+IMAGE_SIZES: dict[InputKind, tuple[int, int]] = {"objects": (CROP_SIZE, CROP_SIZE), "frames": (64, 128)}
+
+_PLACEHOLDER = re.compile(r"\{(\w+)\}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectTable:
+    """Objects of one or several images, one row each. View axis: front, then top.
+
+    Args:
+        ids: Segmentation values, shape (N,), integers. With an extractor that knows none, the object's rank
+            in its image, from 0.
+        crop_index: Index of the object's image in the stack, shape (N, 2), integers; 0 where hidden.
+        boxes: Centre x, centre y, height, width in pixels, shape (N, 2, 4), integers; zero where hidden.
+        grasps: Column and row of the most interior visible pixel, shape (N, 2, 2), integers; zero where
+            hidden.
+    """
+
+    ids: np.ndarray
+    crop_index: np.ndarray
+    boxes: np.ndarray
+    grasps: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def masks(self) -> np.ndarray:
+        """Whether each object is visible in each view, shape (N, 2), bool."""
+        return np.asarray(self.crop_index > 0)
+
+    def select(self, rows: np.ndarray | slice) -> "ObjectTable":
+        """Return some rows (indices, booleans or a slice), in that order."""
+        return ObjectTable(self.ids[rows], self.crop_index[rows], self.boxes[rows], self.grasps[rows])
+
+    def split(self, counts: np.ndarray) -> list["ObjectTable"]:
+        """Divide the rows into consecutive tables of these lengths."""
+        ends = np.cumsum(counts)
+        return [
+            self.select(slice(int(end - count), int(end))) for count, end in zip(counts, ends, strict=True)
+        ]
+
+    def with_image_offset(self, offset: int) -> "ObjectTable":
+        """Return the same objects, their images `offset` further down a larger stack."""
+        return replace(self, crop_index=offset_index(self.crop_index, offset))
+
+    @staticmethod
+    def concatenate(tables: Sequence["ObjectTable"]) -> "ObjectTable":
+        """Put the rows of several tables into one."""
+        if not tables:
+            return ObjectTable.from_views(ObjectViews.concatenated([]), ImageStack((CROP_SIZE, CROP_SIZE)))
+        return ObjectTable(
+            np.concatenate([table.ids for table in tables]),
+            np.concatenate([table.crop_index for table in tables]),
+            np.concatenate([table.boxes for table in tables]),
+            np.concatenate([table.grasps for table in tables]),
+        )
+
+    @staticmethod
+    def from_views(objects: ObjectViews, stack: ImageStack) -> "ObjectTable":
+        """Put the images of the visible objects onto a stack, and name them by their index there."""
+        crop_index = np.zeros(objects.masks.shape, np.int32)
+        if objects.masks.any():
+            crop_index[objects.masks] = stack.add(objects.crops[objects.masks])
+        return ObjectTable(
+            objects.ids.astype(np.int16),
+            np.ascontiguousarray(crop_index.T),
+            np.ascontiguousarray(objects.boxes.swapaxes(0, 1).astype(np.int16)),
+            np.ascontiguousarray(objects.grasps.swapaxes(0, 1).astype(np.int16)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreprocessedPrompt:
+    """A prompt of I images.
+
+    Args:
+        text: The sentence, with `{name}` placeholders.
+        objects: Objects of the images, image after image in the order in which the text first names them.
+            With frames each image counts as one object.
+        objects_per_image: Number of objects of each image, shape (I,), int16.
+        is_scene: Whether the image shows the table (`PromptImage.kind` "scene") or one object on white
+            ("object"), shape (I,), bool.
+    """
+
+    text: str
+    objects: ObjectTable
+    objects_per_image: np.ndarray
+    is_scene: np.ndarray
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """The placeholders, in the order of the images."""
+        return image_names(self.text)
+
+
+def preprocess_prompt(
+    prompt: RenderedPrompt, kind: InputKind, extractor: ObjectExtractor | None, stack: ImageStack
+) -> PreprocessedPrompt:
+    """Extract the objects of a prompt's images.
+
+    Args:
+        prompt: The prompt.
+        kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
+        extractor: Finds the objects; None takes the segmentation.
+        stack: Where the images go.
+
+    Raises:
+        PolicyError: An image lacks a view.
+        ShapeError: An image has another shape or dtype.
+    """
+    images = [prompt.images[name] for name in image_names(prompt.text)]
+    found = [_extract_prompt_image(image, kind, extractor) for image in images]
+    return PreprocessedPrompt(
+        prompt.text,
+        ObjectTable.from_views(ObjectViews.concatenated(found), stack),
+        np.array([len(objects) for objects in found], np.int16),
+        np.array([image.kind == "scene" for image in images], np.bool_),
+    )
+
+
+def extract_observation(
+    observation: Mapping, kind: InputKind, extractor: ObjectExtractor | None = None
+) -> ObjectViews:
+    """Extract the objects of an observation, or take both frames whole as one object.
+
+    Args:
+        observation: `rgb`, `segm` where the segmentation is used, and `ee`.
+        kind: "objects" or "frames".
+        extractor: Finds the objects; None takes the segmentation, in left-to-right order.
+
+    Raises:
+        PolicyError: A part or a view is missing, or there is no such end effector.
+        ShapeError: An image has another shape or dtype.
+    """
+    if kind == "frames":
+        return whole_frames(part_of(observation, "rgb"))
+    if extractor is None:
+        return GROUND_TRUTH.in_observation(observation)
+    return _numbered(extractor.in_observation(observation))
+
+
+def offset_index(crop_index: np.ndarray, offset: int | np.ndarray) -> np.ndarray:
+    """Add an offset to indices of images, int64; 0 stays 0."""
+    return np.where(crop_index > 0, crop_index.astype(np.int64) + offset, 0)
+
+
+def image_names(text: str) -> tuple[str, ...]:
+    """Return the placeholders of a prompt in the order in which the text first names them."""
+    return tuple(dict.fromkeys(_PLACEHOLDER.findall(text)))
+
+
+@lru_cache(maxsize=2**16)
+def split_prompt(text: str) -> tuple[str | int, ...]:
+    """Split a prompt into texts and images, in reading order.
+
+    Returns:
+        Texts, and for each placeholder the number of its image in the order of `image_names`.
+    """
+    numbers = {name: number for number, name in enumerate(image_names(text))}
+    parts = _PLACEHOLDER.split(text)  # texts at even indices, names at odd ones
+    pieces = [numbers[part] if k % 2 else part.strip() for k, part in enumerate(parts)]
+    return tuple(piece for piece in pieces if piece != "")
+
+
+def _extract_prompt_image(
+    image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None
+) -> ObjectViews:
+    if kind == "frames":
+        return whole_frames(image.rgb)
+    if extractor is None:
+        return GROUND_TRUTH.in_prompt_image(image)
+    return _numbered(extractor.in_prompt_image(image))
+
+
+def _numbered(found: ObjectViews) -> ObjectViews:
+    """Number what an extractor found in its own order."""
+    return replace(found, ids=np.arange(len(found)))
