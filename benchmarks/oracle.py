@@ -44,7 +44,6 @@ def main() -> None:
         workers=options.workers,
         out=options.out,
         batch=50,
-        report=False,
     )
     results = Results.read(evaluate(config))
     found = counts(results)

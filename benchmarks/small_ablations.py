@@ -190,7 +190,6 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
         episodes=given.episodes,
         workers=1,
         out=folder / "evaluation",
-        report=False,
     )
     with progress_bar(f"evaluation of {name}") as report:
         evaluate(evaluation, report)

@@ -22,14 +22,14 @@ from openvima.env import EnvConfig
 from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.config import Batch
-from openvima.evaluation.film import SceneRenderer
-from openvima.evaluation.prompt_strip import draw_prompt_strip, font
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.scene import RenderedPrompt
 from openvima.sim.ur5 import HOME
 from openvima.tasks import task_spec
+from openvima.video.prompt_strip import draw_prompt_strip, font
+from openvima.video.recorder import SceneRenderer
 
 OUT = Path("docs/images/openvima_small.webp")
 SHOWN = (  # every level; pictures of objects and of scenes, words, turns, sequences; prompts of two lines

@@ -9,8 +9,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from openvima.evaluation.report.published import PublishedModel, leading_models, published_models
 from openvima.evaluation.results import LevelMean
+from openvima.report.published import PublishedModel, leading_models, published_models
 from small_findings import LEVELS, PUBLISHED_DEMONSTRATIONS, Findings, Training
 
 INK, FAINT, GRID, PAPER = "#1f2933", "#77818c", "#dfe3e9", "#ffffff"

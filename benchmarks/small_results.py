@@ -23,12 +23,12 @@ from typing import Any
 from openvima.atomic_io import atomic_write_file
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.comparison import Comparison
-from openvima.evaluation.report.paper import Estimate, Line, Table, markdown, paper_tables
-from openvima.evaluation.report.published import PublishedModel, leading_models, published_models
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies import preset
 from openvima.policies.parameter_counts import policy_size
+from openvima.report.paper import Estimate, Line, Table, markdown, paper_tables
+from openvima.report.published import PublishedModel, leading_models, published_models
 from sim import circumstances
 from small_figures import save_all
 from small_findings import (

@@ -18,12 +18,14 @@ ORDER = (
     "sim",
     "tasks",
     "env",
+    "video",
     "data",
     "policies",
     "detector",
     "serving",
     "training",
     "evaluation",
+    "report",
     "cli",
 )
 FORBIDDEN = {
@@ -34,6 +36,7 @@ FORBIDDEN = {
     "sim": {"torch", "openvima.tasks"},
     "tasks": {"mujoco", "torch", "openvima.sim"},
     "env": {"torch"},
+    "video": {"torch"},
     "policies": {"mujoco", "openvima.sim", "openvima.env"},
     "detector": {"mujoco", "openvima.sim", "openvima.env"},
     "serving": {"mujoco", "torch", "openvima.sim", "openvima.env"},

@@ -3,7 +3,7 @@
 import tempfile
 from pathlib import Path
 
-from openvima.evaluation.task_gallery import SHEET_NAME, save_task_gallery
+from openvima.report.task_gallery import SHEET_NAME, save_task_gallery
 
 with tempfile.TemporaryDirectory() as folder:
     save_task_gallery(Path(folder))

@@ -39,7 +39,7 @@ def test_several_evaluations_make_one_page_and_leave_theirs_alone(folders, capsy
 
 def test_tables_go_to_stdout_and_no_page_is_written(folders, capsys):
     assert main(["report", "first", "--markdown"]) == 0
-    assert capsys.readouterr().out.startswith("Success rates in per cent")
+    assert capsys.readouterr().out.startswith("Success rates (%)")
     assert main(["report", "first", "--latex", "--compare", "mine,oracle"]) == 0
     shown = capsys.readouterr()
     assert shown.out.startswith("% Needs") and shown.out.rstrip().endswith("\\end{table}")

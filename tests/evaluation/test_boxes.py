@@ -14,7 +14,6 @@ CONFIG = EvaluationConfig(
     ("visual_manipulation",),
     ("L1",),
     episodes=2,
-    report=False,
     ablations=("detected_boxes",),
     boxes="x:y",
 )

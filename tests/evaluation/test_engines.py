@@ -17,7 +17,6 @@ NETWORK = EvaluationConfig(
     episodes=4,
     seed=7,
     batch=2,
-    report=False,
     ablations=("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", "random"),
 )
 

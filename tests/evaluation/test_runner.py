@@ -10,7 +10,7 @@ from openvima.errors import AssetError, ConfigError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 
 ORACLE = EvaluationConfig(
-    ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2, report=False
+    ("oracle",), ("rotate", "sweep_without_exceeding"), ("L2",), episodes=3, seed=40, batch=2
 )
 
 
@@ -94,7 +94,7 @@ def test_finished_results_are_kept_and_others_not_overwritten(first, monkeypatch
 
 
 def test_force_overwrites_other_results(tmp_path):
-    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path, report=False)
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=1, out=tmp_path)
     evaluate(config)
     path = evaluate(replace(config, seed=5, force=True))
     assert [outcome.seed for outcome in Results.read(path).rows[0].outcomes] == [5]
@@ -102,9 +102,7 @@ def test_force_overwrites_other_results(tmp_path):
 
 def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
     calls = []
-    config = EvaluationConfig(
-        ("oracle",), ("rotate",), ("L1",), episodes=3, batch=2, out=tmp_path, report=False
-    )
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=3, batch=2, out=tmp_path)
     evaluate(config, lambda *call: calls.append(call))
     assert calls == [(0, 3, ""), (2, 3, "oracle rotate L1"), (3, 3, "oracle rotate L1")]
 

@@ -29,7 +29,7 @@ class Idle:
 
 
 def test_objects_play_the_very_episodes_that_evaluate_plays(tmp_path):
-    config = EvaluationConfig(("random",), out=tmp_path, report=False, **CELLS)
+    config = EvaluationConfig(("random",), out=tmp_path, **CELLS)
     assert score({"random": RandomPolicy()}, **CELLS).rows == Results.read(evaluate(config)).rows
 
 

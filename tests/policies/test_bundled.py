@@ -13,9 +13,8 @@ from openvima.cli import quickstart  # noqa: E402
 from openvima.cli.main import main  # noqa: E402
 from openvima.env.config import DEFAULT_SETUP  # noqa: E402
 from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError  # noqa: E402
-from openvima.evaluation import Results, report_assets  # noqa: E402
+from openvima.evaluation import Results  # noqa: E402
 from openvima.evaluation.config import Batch  # noqa: E402
-from openvima.evaluation.report_assets import find_metrics  # noqa: E402
 from openvima.evaluation.rollout import play  # noqa: E402
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy  # noqa: E402
 from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
@@ -25,6 +24,8 @@ from openvima.policies.bundled import MODEL_CARD, PACKAGED, SMALL  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
+from openvima.report import assets  # noqa: E402
+from openvima.report.assets import find_metrics  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
@@ -167,7 +168,7 @@ def test_quickstart_scores_it_beside_the_policy_that_it_trains(
     monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
     monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
     monkeypatch.setattr(quickstart, "_train", lambda *_: packaged)
-    monkeypatch.setattr(report_assets, "recording_jobs", lambda *_: [])  # other tests film
+    monkeypatch.setattr(assets, "recording_jobs", lambda *_: [])  # other tests record
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out.splitlines()
     names = ["trained", SMALL, "oracle", "untrained", "random"]

@@ -24,7 +24,7 @@ from openvima.policies.presets import preset  # noqa: E402
 from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding")
-TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2, report=False)
+TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2)
 ABOUT = {"policy": {"name": "tiny", "sha256": "ab12"}}
 
 

@@ -52,7 +52,7 @@ def main(
         raise ConfigError(f"--boxes is {boxes!r}, but {policy} looks at no boxes; name a trained policy.")
     from openvima.env import EnvConfig
     from openvima.evaluation.config import Batch
-    from openvima.evaluation.film import record_episode
+    from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
 
     setup = EnvConfig(assets, compat, difficulty)

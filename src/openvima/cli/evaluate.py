@@ -37,7 +37,7 @@ def main(
     engine: Literal["processes", "ray"] = "processes",
     address: str | None = None,
     videos: int = 1,
-    film: str = "",
+    record_video: str = "",
     report: bool = True,
     force: bool = False,
     device: str = "cpu",
@@ -75,9 +75,10 @@ def main(
         batch: Episodes that are played together; a policy decides for all of them at once.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
-        videos: Solved episodes to film, and unsolved ones, of each trained policy and task.
-        film: Episodes to film besides, of every policy, with commas in between: TASK/SEED or TASK/LEVEL/SEED.
-        report: Whether to film episodes and write report.html.
+        videos: Solved episodes to record, and failures, of each trained policy and task.
+        record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
+            TASK/LEVEL/SEED.
+        report: Whether to record videos and write report.html.
         force: Overwrite the results of another evaluation in that folder.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
@@ -88,9 +89,11 @@ def main(
         Exit status.
     """
     from openvima.env import EnvConfig
+    from openvima.errors import ConfigError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
     from openvima.evaluation.in_context import held_out_tasks
+    from openvima.report import VideoSelection, evaluate_and_report
 
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
@@ -104,19 +107,19 @@ def main(
         out=out,
         setup=EnvConfig(assets, compat, difficulty),
         batch=batch,
-        videos=videos,
-        report=report,
         force=force,
         device=device,
         precision=precision,
         ablations=_with_boxes(words_in(ablations), boxes),
         boxes=boxes,
-        film=words_in(film),
         engine=engine,
         address=address,
     )
+    selection = VideoSelection(videos, words_in(record_video))
+    if record_video and not report:
+        raise ConfigError("--record-video needs the report; drop --no-report.")
     with progress_bar("evaluation") as bar:
-        path = evaluate(config, bar)
+        path = evaluate_and_report(config, selection, bar) if report else evaluate(config, bar)
     results = Results.read(path)
     if as_json:
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))

@@ -39,8 +39,8 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.evaluation.report_assets import require_extra
     from openvima.policies.base import require_torch
+    from openvima.report.assets import require_extra
 
     _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
     require_torch("training")
@@ -70,7 +70,7 @@ def _check(**counts: int | None) -> None:
 def _first_look(path: Path, seed: int) -> None:
     """Show within seconds that the installation works: one episode solved by the oracle, as a picture."""
     from openvima.env import TabletopEnv
-    from openvima.evaluation.picture import save_episode_image
+    from openvima.evaluation.recording import save_episode_image
 
     env = TabletopEnv("visual_manipulation", level="train")
     save_episode_image(env, path, seed=seed)
@@ -95,7 +95,8 @@ def _train(data: Path, run: Path, seed: int) -> Path:
 
 
 def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> None:
-    from openvima.evaluation import EvaluationConfig, evaluate
+    from openvima.evaluation import EvaluationConfig
+    from openvima.report import evaluate_and_report
 
     config = EvaluationConfig(
         policies=(f"trained={run}", *BASELINES),
@@ -107,7 +108,7 @@ def _evaluate(run: Path, out: Path, episodes: int, seed: int, workers: int) -> N
         out=out,
     )
     with progress_bar("3/3 evaluation") as report:
-        evaluate(config, report)
+        evaluate_and_report(config, progress=report)
 
 
 def _summary(out: Path) -> None:

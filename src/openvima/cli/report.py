@@ -11,10 +11,10 @@ import tyro
 from openvima.cli.words import words_in
 
 if TYPE_CHECKING:
-    from openvima.evaluation.clips import Clip
     from openvima.evaluation.comparison import Comparison
     from openvima.evaluation.merging import Merged
     from openvima.evaluation.results import Results
+    from openvima.video.clips import Clip
 
 _HTML, _MARKDOWN, _LATEX = (".html", ".htm"), (".md", ".markdown"), (".tex",)
 
@@ -54,10 +54,10 @@ def main(
     """
     from openvima.atomic_io import atomic_write_file
     from openvima.evaluation.comparison import compare_pairs, default_pairs
-    from openvima.evaluation.report.differences import finding
-    from openvima.evaluation.report.paper import latex as as_latex
-    from openvima.evaluation.report.paper import markdown as as_markdown
-    from openvima.evaluation.report.paper import paper_tables
+    from openvima.report.differences import finding
+    from openvima.report.paper import latex as as_latex
+    from openvima.report.paper import markdown as as_markdown
+    from openvima.report.paper import paper_tables
 
     _check(results, out)
     evaluations = _read(results)
@@ -110,7 +110,7 @@ def _read(paths: Sequence[Path]) -> dict[Path, "Results"]:
 
 def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
     from openvima.evaluation.merging import merge
-    from openvima.evaluation.report.curves import run_labels
+    from openvima.report.curves import run_labels
 
     labels = run_labels([_folder(path) for path in evaluations])
     return merge(dict(zip(labels, evaluations.values(), strict=True)))
@@ -133,9 +133,9 @@ def _page(
     out: Path,
     records: Sequence[Path],
 ) -> Path:
-    from openvima.evaluation.report import write_report
-    from openvima.evaluation.report.page import default_command
-    from openvima.evaluation.report_assets import require_extra
+    from openvima.report import write_report
+    from openvima.report.assets import require_extra
+    from openvima.report.page import default_command
 
     require_extra()
     return write_report(
@@ -153,7 +153,7 @@ def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]
     """Films of all evaluations, under the names that policies have in the common report."""
     from dataclasses import replace
 
-    from openvima.evaluation.clips import load_clips
+    from openvima.video.clips import load_clips
 
     return [
         replace(clip, policy=names.get(clip.policy, clip.policy))
@@ -164,7 +164,7 @@ def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]
 
 def _default_out(evaluations: dict[Path, "Results"]) -> Path:
     """Beside the results; several have no place in common, and each may have a report of its own."""
-    from openvima.evaluation.report_assets import REPORT_NAME
+    from openvima.report.assets import REPORT_NAME
 
     return _folder(next(iter(evaluations))) / REPORT_NAME if len(evaluations) == 1 else Path(REPORT_NAME)
 

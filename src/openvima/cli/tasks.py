@@ -97,7 +97,7 @@ def _percent(record: Mapping[str, Mapping[str, int]]) -> str:
 def _write_gallery(folder: Path, assets: str) -> int:
     from openvima.cli.progress import progress_bar
     from openvima.env import EnvConfig
-    from openvima.evaluation.task_gallery import save_task_gallery
+    from openvima.report.task_gallery import save_task_gallery
 
     with progress_bar("tasks") as report:
         print(save_task_gallery(folder, setup=EnvConfig(assets), report=report))

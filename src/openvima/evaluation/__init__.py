@@ -1,4 +1,4 @@
-"""Scoring policies on the four levels, and showing what came out."""
+"""Evaluating policies on the four levels."""
 
 import importlib
 from typing import TYPE_CHECKING
@@ -7,8 +7,7 @@ if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison, compare
     from openvima.evaluation.config import EvaluationConfig
     from openvima.evaluation.merging import merge
-    from openvima.evaluation.picture import save_episode_image
-    from openvima.evaluation.report import write_report
+    from openvima.evaluation.recording import save_episode_image
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
     from openvima.evaluation.runner import evaluate
     from openvima.evaluation.scoring import score
@@ -23,10 +22,9 @@ _HOMES = {
     "compare": "comparison",
     "evaluate": "runner",
     "merge": "merging",
-    "save_episode_image": "picture",
+    "save_episode_image": "recording",
     "score": "scoring",
     "wilson_interval": "statistics",
-    "write_report": "report",
 }
 
 __all__ = [
@@ -41,11 +39,10 @@ __all__ = [
     "save_episode_image",
     "score",
     "wilson_interval",
-    "write_report",
 ]
 
 
-def __getattr__(name: str) -> object:  # films and the simulator are loaded by what needs them
+def __getattr__(name: str) -> object:  # the simulator is imported on first use
     if name in _HOMES:
         return getattr(importlib.import_module(f"openvima.evaluation.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

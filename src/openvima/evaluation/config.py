@@ -48,8 +48,6 @@ class EvaluationConfig:
         out: Folder to write to.
         setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         batch: Episodes that are played together, so that a policy decides for all of them at once.
-        videos: Filmed episodes of each policy and task, for the report.
-        report: Whether to film and to write `report.html`; needs the extra `report`.
         force: Overwrite results of another evaluation in `out`.
         device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
             float64, does the division into batches not change what they decide.
@@ -62,8 +60,6 @@ class EvaluationConfig:
         boxes: For the ablation "detected_boxes": "detector" for the one that comes with the package,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
-        film: Episodes to film of every policy besides, each as "task/seed", which means the first of the
-            levels that holds the task, or "task/level/seed".
         engine: "processes" of this machine, or "ray".
         address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
 
@@ -80,14 +76,11 @@ class EvaluationConfig:
     out: Path = Path("evaluation")
     setup: EnvConfig = DEFAULT_SETUP
     batch: int = DEFAULT_BATCH
-    videos: int = 1
-    report: bool = True
     force: bool = False
     device: str = DEFAULT_DEVICE
     precision: str | None = None
     ablations: tuple[str, ...] = ()
     boxes: str | None = None
-    film: tuple[str, ...] = ()
     engine: Engine = "processes"
     address: str | None = None
 
@@ -99,7 +92,6 @@ class EvaluationConfig:
                 ("seed", self.seed, 0),
                 ("workers", self.workers, 1),
                 ("batch", self.batch, 1),
-                ("videos", self.videos, 0),
             )
             if value is not None and value < least
         ]
@@ -128,8 +120,6 @@ class EvaluationConfig:
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
         if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.ablations):
             yield f"boxes is {self.boxes!r}, which only the ablation {DETECTED_BOXES} plugs in; ask for it."
-        if self.film and not self.report:
-            yield "film names episodes, but no report is asked for; films are part of it."
 
     @property
     def sources(self) -> tuple[PolicySource, ...]:

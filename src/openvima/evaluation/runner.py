@@ -12,13 +12,12 @@ from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
 from openvima.detector.hooks import extractor_maker
 from openvima.errors import ConfigError
-from openvima.evaluation.clips import FOLDER
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
-from openvima.evaluation.report_assets import finish, requested_episodes, require_extra
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
 from openvima.multiprocess import in_processes
+from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
@@ -48,19 +47,16 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         report: Called with episodes done, episodes in all and a note on what was played last.
 
     Returns:
-        `results.json` in `config.out`; the files of `openvima.evaluation.report_assets` are beside it.
+        `results.json` in `config.out`. `openvima.report` adds videos and a page.
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
         MissingExtraError: Something is not installed that networks, films or Ray need.
         WorkerError: A worker process died; what was finished is kept.
     """
-    if config.report:
-        require_extra()
     if config.boxes is not None:
         extractor_maker(config.boxes)  # a mistake there is named before anything is played
     batches = plan(config)
-    requested_episodes(config)
     policies = {source.name: source.record() for source in config.sources}
     found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
     path = config.out / FILE_NAME
@@ -73,9 +69,6 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)
         shutil.rmtree(config.out / _PARTS, ignore_errors=True)
-    if config.report:
-        episodes = sum(batch.episodes for batch in batches)
-        finish(config, results, None if report is None else lambda note: report(episodes, episodes, note))
     return path
 
 
@@ -103,7 +96,7 @@ def _play_all(
 ) -> dict[Batch, tuple[EpisodeOutcome, ...]]:
     """Play what has not been played yet."""
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # films of other results
+    shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
     prints = {name: json.dumps([what, dict(found)], sort_keys=True) for name, what in policies.items()}
     jobs = [Job(batch, prints[batch.policy]) for batch in batches]
     kept = {job.batch: _kept(job, config.out) for job in jobs}

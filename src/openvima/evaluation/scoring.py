@@ -50,7 +50,6 @@ def score(
         episodes=episodes,
         seed=seed,
         ablations=ablations,
-        report=False,
     )
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}

@@ -16,7 +16,7 @@ from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
-from openvima.films import import_av
+from openvima.video.encoder import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from openvima.data.lerobot.layout import VIDEO_PATH, FileNumber
 from openvima.data.schema import IMAGE_SHAPE
-from openvima.films import import_av, open_film
 from openvima.render import channels_last
+from openvima.video.encoder import import_av, open_video
 
 PixelFormat = Literal["yuv444p", "yuv420p"]
 PIXEL_FORMATS: tuple[PixelFormat, ...] = get_args(PixelFormat)
@@ -117,7 +117,7 @@ class NumberedVideo:
         self._number = self._number.next() if self._number else FileNumber()
         self._num_frames = self._num_bytes = 0
         path = self._number.path(self._folder, VIDEO_PATH, video_key=self._key)
-        self._container, self._stream = open_film(path, self._fps)
+        self._container, self._stream = open_video(path, self._fps)
         self._stream.height, self._stream.width = IMAGE_SHAPE
         self._stream.pix_fmt = self._pixels
         # Without look-ahead a frame's bytes come at once, which the limit on files needs. The faster preset

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
-from openvima.evaluation.report.published import leading_models, published_tasks
-from openvima.evaluation.report.text import ablation_name, counted
 from openvima.evaluation.results import LevelMean, Results
+from openvima.report.published import leading_models, published_tasks
+from openvima.report.text import ablation_name, counted
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
 _NOISE_MARK = "≈"

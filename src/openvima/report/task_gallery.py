@@ -11,12 +11,12 @@ from PIL import Image, ImageDraw
 from openvima.atomic_io import atomic_write_file
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.env.config import DEFAULT_SETUP
-from openvima.evaluation.film import SceneRenderer
-from openvima.evaluation.picture import save_episode_image
-from openvima.evaluation.prompt_strip import INK, draw_prompt_strip, font
+from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.tasks import TaskSpec, list_tasks, task_spec
+from openvima.video.prompt_strip import INK, draw_prompt_strip, font
+from openvima.video.recorder import SceneRenderer
 
 SHEET_NAME = "contact_sheet.png"
 PAGE_NAME = "index.html"

@@ -1,9 +1,9 @@
-"""Filmed episodes: the film, the prompt in pieces, and how the episode ended."""
+"""Clips: recorded episodes with their prompt and outcome, stored in the folder of an evaluation."""
 
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,18 @@ _INDEX = "clips.json"
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """One filmed episode.
+    """One recorded episode.
 
     Args:
         policy: Name of the policy in the results.
         task: Name of the task.
         level: Level of the episode.
         seed: Its seed, of domain "eval".
-        success: Whether the task was done.
+        success: Whether the episode was solved.
         steps: Actions taken.
         reason: Empty on success, else why not.
-        prompt: The prompt in reading order: pieces of text, and pictures as PNG files.
-        video: The film as an MP4 file.
+        prompt: The prompt in reading order: text, and images as PNG files.
+        video: The MP4 file.
         poster: The first frame as a PNG file.
     """
 
@@ -47,43 +47,34 @@ class Clip:
 
     @property
     def file_name(self) -> str:
-        """Name of the film among those of one evaluation."""
+        """Name of the video among those of one evaluation."""
         return f"{self.policy}_{self.task}_{self.level}_{self.seed}.mp4"
 
 
 def save_clips(clips: Sequence[Clip], folder: Path) -> Path:
-    """Write films and their list to the `videos` folder of an evaluation.
+    """Write videos and their index to the `videos` folder of an evaluation.
 
     Returns:
-        The list, a JSON file; it is written last.
+        The index, a JSON file; it is written last.
     """
     folder = folder / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     records = []
     for clip in clips:
         (folder / clip.file_name).write_bytes(clip.video)
-        prompt = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
-        records.append(
-            {
-                "policy": clip.policy,
-                "task": clip.task,
-                "level": clip.level,
-                "seed": clip.seed,
-                "success": clip.success,
-                "steps": clip.steps,
-                "reason": clip.reason,
-                "prompt": prompt,
-                "poster": _text(clip.poster),
-            }
-        )
+        record = asdict(clip)
+        del record["video"]
+        record["prompt"] = [part if isinstance(part, str) else {"png": _text(part)} for part in clip.prompt]
+        record["poster"] = _text(clip.poster)
+        records.append(record)
     return atomic_write_file(folder / _INDEX, json.dumps(records, indent=1, ensure_ascii=False) + "\n")
 
 
 def load_clips(folder: Path) -> tuple[Clip, ...]:
-    """Read the films of an evaluation's folder; none where nothing was filmed.
+    """Read the clips of an evaluation's folder; none if nothing was recorded.
 
     Raises:
-        DatasetError: The list is damaged or a film is missing.
+        DatasetError: The index is damaged or a video is missing.
     """
     index = folder / FOLDER / _INDEX
     if not index.is_file():
@@ -97,7 +88,7 @@ def load_clips(folder: Path) -> tuple[Clip, ...]:
 
 
 def png(image: Image.Image) -> bytes:
-    """Encode a picture as a PNG file."""
+    """Encode an image as a PNG file."""
     stream = BytesIO()
     image.save(stream, "PNG", optimize=True)
     return stream.getvalue()

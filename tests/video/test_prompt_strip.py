@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from openvima.evaluation.prompt_strip import draw_prompt_strip, prompt_pieces, thumbnail
 from openvima.scene import RenderedPrompt
+from openvima.video.prompt_strip import draw_prompt_strip, prompt_pieces, thumbnail
 
 GREEN, RED = (0, 200, 0), (200, 0, 0)
 

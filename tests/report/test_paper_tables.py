@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from openvima.evaluation.comparison import compare_pairs
-from openvima.evaluation.report.paper import latex, latex_text, markdown, paper_tables
 from openvima.evaluation.results import Results
+from openvima.report.paper import latex, latex_text, markdown, paper_tables
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ from html.parser import HTMLParser
 import pytest
 
 from openvima.errors import DatasetError
-from openvima.evaluation.clips import load_clips, save_clips
 from openvima.evaluation.comparison import compare
-from openvima.evaluation.report import write_report
-from openvima.evaluation.report.curves import read_charts, read_run_charts, run_labels
-from openvima.evaluation.report.figures import curve_chart
-from openvima.evaluation.report.page import default_command
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.report import write_report
+from openvima.report.curves import read_charts, read_run_charts, run_labels
+from openvima.report.figures import curve_chart
+from openvima.report.page import default_command
+from openvima.video.clips import load_clips, save_clips
 
 
 def outcomes(num_solved: int) -> tuple[EpisodeOutcome, ...]:

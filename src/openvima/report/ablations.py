@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, can_be_compared, compare_pairs
-from openvima.evaluation.report.markup import folded, policy_head, section
-from openvima.evaluation.report.tables import mean_cell, rate_cell
-from openvima.evaluation.report.text import (
+from openvima.evaluation.results import LevelMean, Results
+from openvima.report.markup import folded, policy_head, section
+from openvima.report.tables import mean_cell, rate_cell
+from openvima.report.text import (
     LEVEL_NAMES,
     ablation_description,
     ablation_name,
@@ -14,7 +15,6 @@ from openvima.evaluation.report.text import (
     prose,
     series_colours,
 )
-from openvima.evaluation.results import LevelMean, Results
 
 _BOUNDS = ("oracle", "random")  # kinds of policies between which a score lies
 

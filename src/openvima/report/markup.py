@@ -1,6 +1,6 @@
 """Pieces of HTML that several sections of the report share."""
 
-from openvima.evaluation.report.text import prose
+from openvima.report.text import prose
 
 DOT = '<span class="dot"></span>'  # in the colour of its policy
 

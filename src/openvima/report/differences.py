@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from openvima.evaluation.comparison import Comparison, Difference
-from openvima.evaluation.report.markup import breakable, folded, section
-from openvima.evaluation.report.text import counted, percent, points, points_span, probability, prose
+from openvima.report.markup import breakable, folded, section
+from openvima.report.text import counted, percent, points, points_span, probability, prose
 
 _METHOD = (
     "Both policies played the same seeds, so each episode is compared with itself. Differences are in "

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
-from openvima.evaluation.clips import Clip
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
-from openvima.evaluation.report import sections
-from openvima.evaluation.report.ablations import ablation_section
-from openvima.evaluation.report.curves import read_run_charts
-from openvima.evaluation.report.differences import comparison_section
-from openvima.evaluation.report.published_comparison import published_section
-from openvima.evaluation.report.tables import failure_table, rate_table
-from openvima.evaluation.report.text import headline, prose
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
+from openvima.report import sections
+from openvima.report.ablations import ablation_section
+from openvima.report.curves import read_run_charts
+from openvima.report.differences import comparison_section
+from openvima.report.published_comparison import published_section
+from openvima.report.tables import failure_table, rate_table
+from openvima.report.text import headline, prose
+from openvima.video.clips import Clip
 
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
@@ -108,7 +108,7 @@ def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain value
 
 
 def _page(results: Results, body: str, notes: Sequence[str]) -> str:
-    style = resources.files("openvima.evaluation.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = resources.files("openvima.report").joinpath("style.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -1,4 +1,4 @@
-"""What follows an evaluation's results: films of a few episodes, and the report."""
+"""Report assets: an evaluation followed by videos of some of its episodes and by the report."""
 
 import importlib.util
 import re
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation.clips import Clip, load_clips, png, save_clips
 from openvima.evaluation.config import (
     DEFAULT_BATCH,
     DEFAULT_DEVICE,
@@ -18,18 +17,47 @@ from openvima.evaluation.config import (
     cells,
 )
 from openvima.evaluation.results import Results, Row
+from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import PolicySource
 from openvima.multiprocess import in_processes
 from openvima.policies.bundled import PACKAGED
+from openvima.report.page import write_report
+from openvima.video.clips import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
-_METRICS = "metrics.jsonl"  # what a training run writes into its folder
+_METRICS = "metrics.jsonl"  # in the folder of a training run
 _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class VideoSelection:
+    """Which episodes to record for the report.
+
+    Args:
+        per_task: Solved episodes, and failures, of each trained policy and task.
+        record_video: Further episodes, of every policy: "task/seed" at the task's first level, or
+            "task/level/seed".
+
+    Raises:
+        ConfigError: `per_task` is negative.
+    """
+
+    per_task: int = 1
+    record_video: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.per_task < 0:
+            raise ConfigError(f"videos is {self.per_task}; it must be at least 0.")
+
+
+DEFAULT_VIDEOS = VideoSelection()
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingJob:
-    """One episode to film: a batch of one, under the name that its policy bears in the results."""
+    """One episode to record, as a batch of one."""
 
     batch: Batch
     fingerprint: str
@@ -41,12 +69,12 @@ class RecordingJob:
 
 
 def require_extra() -> None:
-    """Check, before any work, that films and charts can be made.
+    """Check that the packages of the extra `report` are installed.
 
     Raises:
-        MissingExtraError: They cannot.
+        MissingExtraError: One is not.
     """
-    missing = [name for name in ("matplotlib", "av") if importlib.util.find_spec(name) is None]
+    missing = [name for name in ("matplotlib", "av", "jinja2") if importlib.util.find_spec(name) is None]
     if missing:
         raise MissingExtraError(
             f"the report needs {' and '.join(missing)}; install with: pip install 'openvima[report]', "
@@ -54,103 +82,117 @@ def require_extra() -> None:
         )
 
 
-def finish(config: EvaluationConfig, results: Results, note: Callable[[str], None] | None = None) -> Path:
-    """Film some of the episodes and write `report.html`.
+def evaluate_and_report(
+    config: EvaluationConfig, videos: VideoSelection = DEFAULT_VIDEOS, progress: Progress | None = None
+) -> Path:
+    """Evaluate policies, record some of the episodes and write `report.html`: `openvima evaluate`.
 
     Args:
-        config: The evaluation's settings.
-        results: What it found.
-        note: Called after each film with what was done.
+        config: What to evaluate.
+        videos: Which episodes to record.
+        progress: As for `evaluate`.
 
     Returns:
-        The report.
-    """
-    from openvima.evaluation.report import write_report
+        `results.json`; `report.html` and the folder `videos` are beside it.
 
-    jobs = recording_jobs(config, results)
-    clips = _filmed(jobs, config, note)
-    return write_report(
+    Raises:
+        ConfigError: An episode to record is not part of the evaluation, or as for `evaluate`.
+        MissingExtraError: matplotlib, PyAV or Jinja is not installed, or as for `evaluate`.
+    """
+    require_extra()
+    requested_episodes(config, videos)
+    path = evaluate(config, progress)
+    results = Results.read(path)
+    episodes = sum(row.episodes for row in results.rows)
+    note = None if progress is None else lambda text: progress(episodes, episodes, text)
+    write_report(
         results,
         config.out / REPORT_NAME,
         command=command_of(config),
         metrics=find_metrics(config.sources),
-        clips=clips,
+        clips=_recorded(recording_jobs(config, videos, results), config, note),
     )
+    return path
 
 
-def _filmed(
+def _recorded(
     jobs: Sequence[RecordingJob], config: EvaluationConfig, note: Callable[[str], None] | None
 ) -> list[Clip]:
-    """Film the episodes that were not filmed before."""
+    """Record the episodes that were not recorded before."""
     clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
     missing = [job for job in jobs if job.episode not in clips]
-    for number, (job, clip) in enumerate(in_processes(film, missing, config.workers or 1), 1):
+    for number, (job, clip) in enumerate(in_processes(record_clip, missing, config.workers or 1), 1):
         clips[job.episode] = clip
         if note is not None:
-            note(f"filmed {number} of {len(missing)}")
-    wanted = [clips.pop(job.episode) for job in jobs]
-    found = [*wanted, *clips.values()]  # those of an earlier command stay
+            note(f"recorded {number} of {len(missing)}")
+    requested = [clips.pop(job.episode) for job in jobs]
+    found = [*requested, *clips.values()]  # those of an earlier command stay
     if missing:
         save_clips(found, config.out)
     return found
 
 
-def requested_episodes(config: EvaluationConfig) -> list[tuple[str, str, int]]:
-    """Read the episodes that `config.film` names: task, level, seed.
+def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list[tuple[str, str, int]]:
+    """Parse `videos.record_video` into task, level and seed.
 
     Raises:
-        ConfigError: A name cannot be read, or the episode is not played.
+        ConfigError: A name cannot be parsed, or the episode is not part of the evaluation.
     """
     played = cells(config)
-    chosen = []
-    for text in config.film:
+    requested = []
+    for text in videos.record_video:
         found = _EPISODE.fullmatch(text)
         if found is None:
-            raise ConfigError(f"film is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3.")
+            raise ConfigError(
+                f"record_video is {text!r}; give TASK/SEED or TASK/LEVEL/SEED, such as rotate/L1/3."
+            )
         task, wanted, seed = found[1], found[2], int(found[3])
         level = next((level for name, level in played if name == task and wanted in (None, level)), None)
         last = config.seed + config.episodes - 1
         if level is None or not config.seed <= seed <= last:
             raise ConfigError(
-                f"film is {text!r}, which is not played; tasks and levels are those of this evaluation, and "
-                f"seeds {config.seed} to {last}."
+                f"record_video is {text!r}, which is not evaluated; tasks and levels are those of this "
+                f"evaluation, and seeds {config.seed} to {last}."
             )
-        chosen.append((task, level, seed))
-    return chosen
+        requested.append((task, level, seed))
+    return requested
 
 
-def recording_jobs(config: EvaluationConfig, results: Results) -> list[RecordingJob]:
-    """Choose which episodes to film, without looking at them.
+def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[RecordingJob]:
+    """Choose which episodes to record.
 
-    Of each task at the first level that holds it: the first `config.videos` solved episodes of every trained
-    policy and of the oracle, and as many unsolved ones of trained policies. Where there are neither trained
-    policies nor the oracle, of all policies. And the episodes that were chosen by hand, of every policy.
+    Of each task at its first level: the first `videos.per_task` solved episodes of every trained policy and
+    of the oracle, and as many failures of trained policies. Without trained policies and oracle, of all
+    policies. Then the requested episodes, of every policy.
     """
-    sources, by_hand = config.sources, requested_episodes(config)
-    worth = [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources
+    sources, requested = config.sources, requested_episodes(config, videos)
     jobs = []
-    for source in worth:
+    for source in [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources:
         for task in results.tasks():
             levels = (results.row(source.name, task, level) for level in results.levels())
             row = next((row for row in levels if row is not None), None)
             if row is not None:
-                seeds = _seeds_to_film(row, config.videos, unsolved=source.kind != "oracle")
+                seeds = [outcome.seed for outcome in row.outcomes if outcome.success][: videos.per_task]
+                if source.kind != "oracle":
+                    failed = (outcome.seed for outcome in row.outcomes if not outcome.success)
+                    seeds += list(failed)[: videos.per_task]
                 jobs += [_job(config, results, source, row, seed) for seed in seeds]
     for source in sources:
-        for task, level, seed in by_hand:
+        for task, level, seed in requested:
             row = results.row(source.name, task, level)
             if row is not None:
                 jobs.append(_job(config, results, source, row, seed))
     return list(dict.fromkeys(jobs))
 
 
-def film(job: RecordingJob, count: Callable[[int], None]) -> Clip:
-    """Film one episode; runs in a worker process."""
+def record_clip(job: RecordingJob, count: Callable[[int], None]) -> Clip:
+    """Record one episode; runs in a worker process."""
     from PIL import Image
 
-    from openvima.evaluation.film import SceneRenderer, record_episode
-    from openvima.evaluation.prompt_strip import thumbnail
+    from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
+    from openvima.video.prompt_strip import thumbnail
+    from openvima.video.recorder import SceneRenderer
 
     batch = job.batch
     env = batch.setup.make(batch.task, batch.level, domain="eval", realtime=True)
@@ -158,9 +200,9 @@ def film(job: RecordingJob, count: Callable[[int], None]) -> Clip:
     poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
     with tempfile.TemporaryDirectory() as folder, one_thread(batch):
-        path = Path(folder, "film.mp4")
-        player = load_rollout_policy(batch, job.fingerprint)
-        outcome = record_episode(env, player, batch.first_seed, path, with_prompt=False)
+        path = Path(folder, "video.mp4")
+        policy = load_rollout_policy(batch, job.fingerprint)
+        outcome = record_episode(env, policy, batch.first_seed, path, with_prompt=False)
         video = path.read_bytes()
     count(1)
     return Clip(
@@ -178,7 +220,7 @@ def film(job: RecordingJob, count: Callable[[int], None]) -> Clip:
 
 
 def command_of(config: EvaluationConfig) -> str:
-    """The command that repeats an evaluation."""
+    """The command that reproduces an evaluation."""
     words = [
         "openvima evaluate",
         f"--policy {shlex.quote(','.join(config.policies))}",
@@ -200,19 +242,13 @@ def command_of(config: EvaluationConfig) -> str:
 def find_metrics(sources: Sequence[PolicySource]) -> Path | None:
     """The training record of the first trained policy that has one."""
     for source in sources:
-        if source.source in PACKAGED:  # a name and no place: what lies here is of something else
+        if source.source in PACKAGED:  # a name, not a path
             continue
         folder = Path(source.source)
         for candidate in (folder / _METRICS, folder.parent / _METRICS, folder.parent.parent / _METRICS):
             if source.kind == "run" and candidate.is_file():
                 return candidate
     return None
-
-
-def _seeds_to_film(row: Row, number: int, *, unsolved: bool) -> list[int]:
-    solved = [outcome.seed for outcome in row.outcomes if outcome.success][:number]
-    failed = [outcome.seed for outcome in row.outcomes if not outcome.success][:number] if unsolved else []
-    return solved + failed
 
 
 def _job(

@@ -3,11 +3,11 @@
 import base64
 from collections.abc import Sequence
 
-from openvima.evaluation.clips import Clip
-from openvima.evaluation.report.curves import Chart
-from openvima.evaluation.report.figures import curve_chart, level_chart
-from openvima.evaluation.report.markup import DOT, section
-from openvima.evaluation.report.text import (
+from openvima.evaluation.results import LevelMean, Results
+from openvima.report.curves import Chart
+from openvima.report.figures import curve_chart, level_chart
+from openvima.report.markup import DOT, section
+from openvima.report.text import (
     LEVEL_MEANINGS,
     LEVEL_NAMES,
     counted,
@@ -20,7 +20,7 @@ from openvima.evaluation.report.text import (
     series_colours,
     span,
 )
-from openvima.evaluation.results import LevelMean, Results
+from openvima.video.clips import Clip
 
 
 def heading(results: Results, notes: Sequence[str] = ()) -> str:

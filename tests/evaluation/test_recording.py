@@ -1,4 +1,4 @@
-"""Films and pictures of real episodes."""
+"""Videos and images of real episodes."""
 
 import av
 import numpy as np
@@ -7,9 +7,10 @@ from PIL import Image
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation import save_episode_image
-from openvima.evaluation.film import SceneRenderer, record_episode
+from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
 from openvima.sim.ur5 import HOME
+from openvima.video.recorder import SceneRenderer
 
 
 @pytest.fixture(scope="module")
@@ -22,9 +23,9 @@ def read(path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def test_a_film_shows_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
-    outcome = record_episode(env, OracleRolloutPolicy(), 0, tmp_path / "film.mp4", title="rotate", enlarge=2)
-    frames = read(tmp_path / "film.mp4")
+def test_a_video_contains_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
+    outcome = record_episode(env, OracleRolloutPolicy(), 0, tmp_path / "video.mp4", title="rotate", enlarge=2)
+    frames = read(tmp_path / "video.mp4")
     assert outcome.success
     assert 3 < len(frames) / 30 < 15
     rows, columns, _ = frames[0].shape
@@ -41,7 +42,7 @@ def test_a_film_shows_the_prompt_the_start_the_arm_and_the_end(env, tmp_path):
     )
 
 
-def test_equal_episodes_give_equal_films(env, tmp_path):
+def test_equal_episodes_give_equal_videos(env, tmp_path):
     for name in ("a.mp4", "b.mp4"):
         record_episode(env, OracleRolloutPolicy(), 1, tmp_path / name, with_prompt=False, enlarge=1)
     assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
@@ -49,20 +50,20 @@ def test_equal_episodes_give_equal_films(env, tmp_path):
 
 def test_the_arm_is_drawn_only_when_asked(env):
     env.reset(seed=2)
-    artist = SceneRenderer(env, enlarge=1)
-    bare, with_arm = artist.draw(env.scene, joints=None), artist.draw(env.scene, HOME)
+    renderer = SceneRenderer(env, enlarge=1)
+    bare, with_arm = renderer.draw(env.scene, joints=None), renderer.draw(env.scene, HOME)
     assert bare.shape == (128, 256, 3)
     assert np.array_equal(bare, np.moveaxis(env.reset(seed=2)[0]["rgb"]["front"], 0, -1))
     assert (bare != with_arm).any()
 
 
-def test_the_picture_of_an_episode_has_prompt_start_and_end(tmp_path):
+def test_the_image_of_an_episode_has_prompt_start_and_end(tmp_path):
     env = TabletopEnv("visual_manipulation")
     path = tmp_path / "new" / "look.png"
     outcome = save_episode_image(env, path, seed=0)
-    picture = np.asarray(Image.open(path)).astype(int)
+    image = np.asarray(Image.open(path)).astype(int)
     assert outcome.success
-    width, middle = picture.shape[1], picture.shape[1] // 2
-    start, end = picture[-256:-12, 12 : middle - 6], picture[-256:-12, middle + 6 : width - 12]
+    width, middle = image.shape[1], image.shape[1] // 2
+    start, end = image[-256:-12, 12 : middle - 6], image[-256:-12, middle + 6 : width - 12]
     assert start.shape == end.shape
     assert 0.5 < np.abs(start - end).mean() < 60

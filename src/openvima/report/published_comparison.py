@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 
-from openvima.evaluation.report.markup import DOT, folded, section
-from openvima.evaluation.report.published import (
+from openvima.evaluation.results import Results
+from openvima.report.markup import DOT, folded, section
+from openvima.report.published import (
     RELIABILITY,
     PublishedModel,
     leading_models,
     published_models,
     published_tasks,
 )
-from openvima.evaluation.report.tables import mean_cell
-from openvima.evaluation.report.text import prose, series_colours
-from openvima.evaluation.results import Results
+from openvima.report.tables import mean_cell
+from openvima.report.text import prose, series_colours
 
 
 def published_section(results: Results) -> str:

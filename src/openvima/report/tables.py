@@ -3,9 +3,11 @@
 from collections import Counter
 from collections.abc import Mapping
 
-from openvima.evaluation.report.markup import breakable, policy_head, section
-from openvima.evaluation.report.published import BESIDE, published_tasks
-from openvima.evaluation.report.text import (
+from openvima.evaluation.results import LevelMean, Results, Row
+from openvima.evaluation.statistics import mean_of_rates
+from openvima.report.markup import breakable, policy_head, section
+from openvima.report.published import BESIDE, published_tasks
+from openvima.report.text import (
     LEVEL_NAMES,
     counted,
     exact,
@@ -14,8 +16,6 @@ from openvima.evaluation.report.text import (
     series_colours,
     span,
 )
-from openvima.evaluation.results import LevelMean, Results, Row
-from openvima.evaluation.statistics import mean_of_rates
 
 _MOST_TASKS = 4  # that are named for a cause of failure
 _MOST_CAUSES = 8  # that are shown of a policy

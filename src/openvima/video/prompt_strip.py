@@ -1,4 +1,4 @@
-"""Multimodal prompts as people read them: words and small pictures in one line of text."""
+"""Multimodal prompts as images for people: words and thumbnails in reading order."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -15,13 +15,14 @@ Colour = tuple[int, int, int]
 INK: Colour = (28, 32, 38)
 PAPER: Colour = (255, 255, 255)
 EDGE: Colour = (208, 213, 220)
-_CLOSING = ".,;:!?)"  # marks that stick to what stands before them
-_ENLARGE = 4  # pictures are drawn at this multiple before they are scaled down to their place
+MUTED: Colour = (91, 100, 114)
+_CLOSING = ".,;:!?)"  # no space before these
+_ENLARGE = 4  # supersampling of thumbnails
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A word or a picture, with its size and the space in front of it, in pixels."""
+    """A word or a thumbnail, with its size and the space before it, in pixels."""
 
     content: str | Image.Image
     width: int
@@ -38,16 +39,16 @@ def prompt_pieces(prompt: RenderedPrompt) -> "list[str | PromptImage]":
 
 
 def thumbnail(image: PromptImage, height: int = 72) -> Image.Image:
-    """Draw the front view of a prompt image as a small picture.
+    """Draw the front view of a prompt image as a thumbnail.
 
-    Pictures of single objects are cut to the object; those of scenes are shown whole.
+    Images of single objects are cropped to the object; scenes stay whole.
 
     Args:
         image: Rendered image of one placeholder.
-        height: Height of the picture in pixels.
+        height: Height of the thumbnail in pixels.
 
     Returns:
-        RGB picture of that height, with rounded corners on white.
+        RGB image of that height, with rounded corners on white.
     """
     pixels = np.ascontiguousarray(channels_last(image.rgb["front"]))
     if image.kind == "object":
@@ -68,15 +69,15 @@ def draw_prompt_strip(
     paper: Colour = PAPER,
     ink: Colour = INK,
 ) -> np.ndarray:
-    """Draw a prompt as a strip: words and pictures in reading order, wrapped over as many lines as it takes.
+    """Draw a prompt as a strip of words and thumbnails, wrapped to a width.
 
     Args:
         prompt: The prompt as a policy receives it.
         width: Width of the strip in pixels.
-        image_height: Height of the pictures in pixels.
-        font_size: Size of the letters in pixels.
-        paper: Colour of the ground.
-        ink: Colour of the letters.
+        image_height: Height of the thumbnails in pixels.
+        font_size: Font size in pixels.
+        paper: Background colour.
+        ink: Text colour.
 
     Returns:
         Shape (height, `width`, 3), uint8; the height is even and follows from the number of lines.
@@ -106,11 +107,11 @@ def draw_prompt_strip(
 
 @cache
 def font(size: int, *, bold: bool = False) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
-    """Load a typeface that comes with the installation, so that strips look alike on every machine.
+    """Load the typeface that matplotlib ships, so that strips are the same on every machine.
 
     Args:
-        size: Size of the letters in pixels.
-        bold: Whether to take the bold cut.
+        size: Font size in pixels.
+        bold: Whether to load the bold face.
     """
     try:
         import matplotlib
@@ -130,7 +131,7 @@ def _piece(part: "str | PromptImage", image_height: int, typeface, font_size: in
 
 
 def _fitting(pieces: list[_Piece], width: int) -> list[_Piece]:
-    """Scale down pictures that are wider than a line."""
+    """Scale down thumbnails that are wider than a line."""
     fitting = []
     for piece in pieces:
         if not isinstance(piece.content, str) and piece.width > width:
@@ -155,7 +156,7 @@ def _wrap(pieces: list[_Piece], width: int) -> list[list[_Piece]]:
 
 
 def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
-    """Cut an object's picture to the object with a margin, never narrower than it is high."""
+    """Crop the image of an object to the object with a margin, never narrower than it is high."""
     shown = (segm != BACKGROUND_ID) & (pixels != 255).any(axis=2)
     if not shown.any():
         return pixels
@@ -185,6 +186,3 @@ def _rounded(picture: Image.Image, radius: int) -> Image.Image:
     framed.paste(picture, mask=mask.resize(picture.size, Image.Resampling.BOX))
     framed.paste(EDGE, mask=edge.resize(picture.size, Image.Resampling.BOX))
     return framed
-
-
-__all__ = ["draw_prompt_strip", "font", "prompt_pieces", "thumbnail"]

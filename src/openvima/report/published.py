@@ -74,5 +74,5 @@ def published_tasks(level: str) -> Mapping[str, float]:
 
 @cache
 def _content() -> dict[str, list[dict]]:
-    file = resources.files("openvima.evaluation.report").joinpath("published.json")
+    file = resources.files("openvima.report").joinpath("published.json")
     return json.loads(file.read_text(encoding="utf-8"))

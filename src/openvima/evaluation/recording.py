@@ -1,0 +1,83 @@
+"""Rolling out single episodes on video, or as one image of start and end."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from openvima.atomic_io import atomic_write_file
+from openvima.env.tabletop import TabletopEnv
+from openvima.evaluation.results import EpisodeOutcome
+from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
+from openvima.video.clips import png
+from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
+from openvima.video.recorder import ENLARGE, EpisodeRecorder, SceneRenderer
+
+_GAP = 12  # pixels between the parts
+
+
+def record_episode(
+    env: TabletopEnv,
+    policy: RolloutPolicy,
+    seed: int,
+    path: Path,
+    *,
+    title: str = "",
+    with_prompt: bool = True,
+    enlarge: int = ENLARGE,
+) -> EpisodeOutcome:
+    """Roll out one episode and record it in real time.
+
+    Args:
+        env: An environment with `realtime`.
+        policy: Decides the actions.
+        seed: The episode's seed.
+        path: The MP4 file to write.
+        title: Caption below the scene; no caption if empty.
+        with_prompt: Whether to draw the prompt above the scene.
+        enlarge: Factor on the benchmark's images.
+
+    Returns:
+        How the episode ended.
+    """
+    env.reset(seed=seed)
+    with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, enlarge=enlarge) as recorder:
+        (outcome,) = play([env], [seed], policy, after_step=recorder.record_step)
+        recorder.record_outcome(outcome.success, outcome.steps)
+    return outcome
+
+
+def save_episode_image(
+    env: TabletopEnv, path: Path, *, seed: int, policy: RolloutPolicy | None = None, enlarge: int = 2
+) -> EpisodeOutcome:
+    """Roll out one episode and save an image of it: the prompt above, start and end side by side.
+
+    Args:
+        env: The environment.
+        path: The PNG file to write.
+        seed: The episode's seed.
+        policy: Decides the actions; by default the oracle.
+        enlarge: Factor on the benchmark's images of 128 × 256 pixels.
+
+    Returns:
+        How the episode ended.
+    """
+    renderer = SceneRenderer(env, enlarge)
+    env.reset(seed=seed)
+    start = renderer.draw(env.scene, joints=None)
+    (outcome,) = play([env], [seed], policy or OracleRolloutPolicy())
+    end = renderer.draw(env.scene, joints=None)
+    gap = np.full((start.shape[0] + 26, _GAP, 3), 255, np.uint8)
+    ended = "after: solved" if outcome.success else "after: not solved"
+    scenes = np.concatenate([gap, _titled(start, "before"), gap, _titled(end, ended), gap], axis=1)
+    strip = draw_prompt_strip(env.prompt, width=scenes.shape[1])
+    image = np.concatenate([strip, scenes, np.full((_GAP, scenes.shape[1], 3), 255, np.uint8)])
+    atomic_write_file(path, png(Image.fromarray(image)))
+    return outcome
+
+
+def _titled(image: np.ndarray, title: str) -> np.ndarray:
+    line = Image.new("RGB", (image.shape[1], 26), PAPER)
+    ImageDraw.Draw(line).text((0, 13), title, font=font(14), fill=MUTED, anchor="lm")
+    return np.concatenate([np.asarray(line), image])

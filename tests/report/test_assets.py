@@ -1,0 +1,113 @@
+"""Report assets: which episodes are recorded, and the whole way to the report."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from openvima.errors import ConfigError, MissingExtraError
+from openvima.evaluation import EvaluationConfig
+from openvima.evaluation.sources import PolicySource
+from openvima.report import VideoSelection, assets, evaluate_and_report
+from openvima.video.clips import load_clips
+
+
+def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(results):
+    config = EvaluationConfig(("mine=runs/a", "oracle", "random"))
+    jobs = assets.recording_jobs(config, VideoSelection(2), results)
+    recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
+    assert recorded == [
+        *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
+        *(("mine", "stack<b>", "L1", seed) for seed in (0, 1, 6, 7)),
+        *(("oracle", "rotate", "L1", seed) for seed in (0, 1)),
+        *(("oracle", "stack<b>", "L1", seed) for seed in (0, 1)),
+    ]
+    assert {job.batch.source for job in jobs} == {"runs/a", "oracle"}
+    assert all(job.batch.episodes == 1 for job in jobs)
+
+
+def test_without_trained_policies_all_are_recorded(results):
+    jobs = assets.recording_jobs(EvaluationConfig(("random",)), VideoSelection(), results)
+    assert {job.batch.policy for job in jobs} == {"random"}
+
+
+def test_no_videos_are_recorded_if_none_are_requested(results):
+    assert assets.recording_jobs(EvaluationConfig(("oracle",)), VideoSelection(0), results) == []
+
+
+def test_requested_episodes_are_recorded_of_every_policy(results):
+    settings = {"tasks": ("rotate",), "levels": ("L1", "L3"), "episodes": 10}
+    config = EvaluationConfig(("mine=runs/a", "oracle"), **settings)
+    videos = VideoSelection(0, ("rotate/4", "rotate/L3/5"))
+    assert [job.episode for job in assets.recording_jobs(config, videos, results)] == [
+        *(("mine", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+        *(("oracle", "rotate", level, seed) for level, seed in (("L1", 4), ("L3", 5))),
+    ]
+
+
+@pytest.mark.parametrize("text", ["rotate", "rotate/L1", "rotate/10", "twist/3", "rotate/L2/3", "rotate/-1"])
+def test_requested_episodes_outside_the_evaluation_are_refused(text):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=10)
+    with pytest.raises(ConfigError, match=f"record_video is '{text}'"):
+        assets.requested_episodes(config, VideoSelection(record_video=(text,)))
+
+
+def test_further_videos_are_added_to_those_recorded_before(tmp_path):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=2, out=tmp_path)
+    notes = []
+    evaluate_and_report(config, VideoSelection(0, ("rotate/1",)))
+    evaluate_and_report(
+        config, VideoSelection(0, ("rotate/0",)), lambda done, total, note: notes.append(note)
+    )
+    assert notes == ["recorded 1 of 1"]
+    assert [clip.seed for clip in load_clips(tmp_path)] == [0, 1]
+
+
+def test_the_command_names_run_folders_and_what_differs_from_the_defaults():
+    config = EvaluationConfig(
+        ("mine=my runs/a", "oracle"), ("rotate",), ("L1", "L2"), episodes=7, seed=3, batch=4
+    )
+    assert assets.command_of(config) == (
+        "openvima evaluate --policy 'mine=my runs/a,oracle' --tasks rotate --levels L1,L2 --episodes 7 "
+        "--seed 3 --batch 4 --out DIR"
+    )
+
+
+def test_training_curves_are_those_of_the_first_trained_policy(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text("")
+    oracle = PolicySource("oracle", "oracle")
+    run = PolicySource("mine", str(tmp_path))
+    checkpoint = PolicySource("mine", str(tmp_path / "checkpoints" / "step-1"))
+    assert assets.find_metrics([oracle, run]) == tmp_path / "metrics.jsonl"
+    assert assets.find_metrics([checkpoint]) == tmp_path / "metrics.jsonl"
+    assert assets.find_metrics([oracle]) is None
+
+
+def test_a_missing_extra_is_named_before_any_episode(tmp_path, monkeypatch):
+    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None if name == "av" else object())
+    with pytest.raises(MissingExtraError, match=r"needs av; install with: pip install 'openvima\[report\]'"):
+        evaluate_and_report(EvaluationConfig(("oracle",), out=tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_evaluation_leaves_results_videos_and_a_report(tmp_path):
+    config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), episodes=2, out=tmp_path / "first")
+    notes = []
+    path = evaluate_and_report(config, progress=lambda done, total, note: notes.append(note))
+    folder = path.parent
+    assert sorted(file.name for file in folder.iterdir()) == [
+        "evaluation_log.json",
+        "report.html",
+        "results.json",
+        "videos",
+    ]
+    assert notes[-1] == "recorded 1 of 1"
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.count("<video") == 1 and "✓ solved in 1 step" in page
+    assert contents(folder) == contents(evaluate_and_report(replace(config, out=tmp_path / "second")).parent)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All that must not depend on time or machine."""
+    files = (file for file in folder.rglob("*") if file.is_file() and "log" not in file.name)
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
