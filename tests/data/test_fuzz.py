@@ -25,7 +25,7 @@ from small_data_sets import (
 )
 
 MadeUp = Callable[..., Demonstration]
-LOOK = VerifyConfig(replay=0)
+NO_REPLAY = VerifyConfig(replay=0)
 FIRST = "stack-train-00000.arrow"
 SECOND = "stack-train-00001.arrow"
 
@@ -41,7 +41,7 @@ def folder(tmp_path: Path, info: ShardInfo, demos: list[Demonstration]) -> Path:
 
 
 def test_a_whole_data_set_is_clean(folder: Path, demos: list[Demonstration]) -> None:
-    assert verify(folder, LOOK).problems == ()
+    assert verify(folder, NO_REPLAY).problems == ()
     assert read_all(folder) == [demo.content_hash() for demo in demos]
 
 
@@ -50,7 +50,7 @@ def test_any_accident_is_found_and_named(folder: Path, name: str) -> None:
     path, whole, hashes = folder / name, (folder / name).read_bytes(), read_all(folder)
     for seed in range(60):
         path.write_bytes(damaged(whole, seed))
-        found, read = verify(folder, LOOK), read_all(folder)
+        found, read = verify(folder, NO_REPLAY), read_all(folder)
         if found.is_clean:
             assert _is_same(path, whole), f"seed {seed}"
         else:
@@ -81,14 +81,14 @@ def test_a_file_that_ends_early_is_found(folder: Path, name: str, share: float) 
     path = folder / name
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    assert [problem.file for problem in verify(folder, LOOK).problems] == [name]
+    assert [problem.file for problem in verify(folder, NO_REPLAY).problems] == [name]
     assert read_all(folder) is None
 
 
 @pytest.mark.parametrize("name", ["dataset.json", "index.parquet", FIRST])
 def test_a_file_that_is_missing_is_found(folder: Path, name: str) -> None:
     (folder / name).unlink()
-    problem, *others = verify(folder, LOOK).problems
+    problem, *others = verify(folder, NO_REPLAY).problems
     assert others == []
     assert (problem.file, problem.cause) == (name, "it is missing")
     with pytest.raises((DatasetError, ShardError), match=name):
@@ -101,7 +101,7 @@ def test_a_damaged_record_is_named_and_the_others_are_read(folder: Path, demos: 
     place = Dataset(folder).index.column("offset")[1].as_py() + 5000
     content[place] ^= 1
     path.write_bytes(content)
-    problem, *others = verify(folder, LOOK).problems
+    problem, *others = verify(folder, NO_REPLAY).problems
     assert others == []
     assert problem.file == FIRST
     assert "record 1 of 2" in problem.cause
@@ -116,7 +116,7 @@ def test_shards_that_changed_places_are_found(folder: Path) -> None:
     first, second = (folder / FIRST).read_bytes(), (folder / SECOND).read_bytes()
     (folder / FIRST).write_bytes(second)
     (folder / SECOND).write_bytes(first)
-    assert {problem.file for problem in verify(folder, LOOK).problems} == {FIRST, SECOND}
+    assert {problem.file for problem in verify(folder, NO_REPLAY).problems} == {FIRST, SECOND}
     with pytest.raises(ShardError, match=FIRST):
         _ = Dataset(folder)[0]
 
@@ -127,7 +127,7 @@ def test_a_file_of_another_data_set_is_found(
 ) -> None:
     other = write_folder(folder.parent / "other", info, [demos[:2], demos[1:2] + demos[3:]])
     shutil.copy(other / name, folder / name)
-    assert not verify(folder, LOOK).is_clean
+    assert not verify(folder, NO_REPLAY).is_clean
     with pytest.raises((DatasetError, ShardError)):
         list(Dataset(folder))
 
@@ -146,7 +146,9 @@ def test_a_manifest_that_was_edited_with_care_is_found(
     folder: Path, key: str, value: object, cause: str
 ) -> None:
     edit_manifest(folder, lambda manifest: manifest.update({key: value}))
-    causes = {problem.cause for problem in verify(folder, LOOK).problems if problem.file == "dataset.json"}
+    causes = {
+        problem.cause for problem in verify(folder, NO_REPLAY).problems if problem.file == "dataset.json"
+    }
     assert any(cause in found for found in causes)
 
 
@@ -186,7 +188,7 @@ def test_nothing_in_a_shard_is_run(folder: Path, tmp_path: Path) -> None:
     with pa.OSFile(str(folder / FIRST), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
         for batch in batches:
             writer.write_batch(pa.record_batch(batch.columns, schema=schema))
-    assert not verify(folder, LOOK).is_clean
+    assert not verify(folder, NO_REPLAY).is_clean
     _ = Shard(folder / FIRST)[0]
     assert not (tmp_path / "sprung").exists()
 
@@ -202,7 +204,7 @@ class _Trap:
 def test_looking_changes_nothing(folder: Path) -> None:
     (folder / FIRST).write_bytes(b"ARROW1")
     before = contents(folder)
-    verify(folder, LOOK)
+    verify(folder, NO_REPLAY)
     assert contents(folder) == before
 
 

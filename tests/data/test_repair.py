@@ -1,4 +1,4 @@
-"""Repair: generated data sets become what they were, others keep every whole record."""
+"""Repair: generated data sets are restored, others keep every whole record."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ Damage = Callable[[Path], object]
 TASKS = ("rotate", "sweep_without_exceeding")
 FIRST, LAST = "rotate-train-00000.arrow", "sweep_without_exceeding-train-00001.arrow"
 STACK = "stack-train-00000.arrow"
-LOOK = VerifyConfig(replay=0)
+NO_REPLAY = VerifyConfig(replay=0)
 
 
 def _fail_seed_1(env: TabletopEnv, seed: int) -> object:
@@ -94,14 +94,14 @@ def offset(folder: Path, episode: int) -> int:
 
 def test_a_whole_data_set_stays_as_it_is(whole: Path) -> None:
     before = contents(whole)
-    done = repair(whole, LOOK)
+    done = repair(whole, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
-    assert (done.made_anew, done.rewritten, done.lost) == ((), (), ())
+    assert (done.regenerated, done.rewritten, done.lost) == ((), (), ())
     assert contents(whole) == before
 
 
 @pytest.mark.parametrize(
-    ("damage", "made_anew"),
+    ("damage", "regenerated"),
     [
         (lambda f: (f / FIRST).unlink(), {FIRST, f"failed/{FIRST}"}),
         (lambda f: flip(f / FIRST, 9000), {FIRST, f"failed/{FIRST}"}),
@@ -119,13 +119,13 @@ def test_a_whole_data_set_stays_as_it_is(whole: Path) -> None:
     ],
 )
 def test_a_generated_data_set_becomes_what_it_was(
-    folder: Path, whole: Path, damage: Damage, made_anew: set[str]
+    folder: Path, whole: Path, damage: Damage, regenerated: set[str]
 ) -> None:
     damage(folder)
-    assert not verify(folder, LOOK).is_clean
-    done = repair(folder, LOOK)
+    assert not verify(folder, NO_REPLAY).is_clean
+    done = repair(folder, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
-    assert set(done.made_anew) == made_anew
+    assert set(done.regenerated) == regenerated
     assert contents(folder) == contents(whole)
 
 
@@ -136,7 +136,7 @@ def test_everything_at_once_is_repaired(folder: Path, whole: Path) -> None:
     (folder / "index.parquet").unlink()
     (folder / LAST).unlink()
     flip(folder / FIRST, 9000)
-    done = repair(folder, LOOK)
+    done = repair(folder, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
     assert contents(folder) == contents(whole)
 
@@ -147,7 +147,7 @@ def test_a_lost_manifest_and_shard_are_not_guessed(folder: Path) -> None:
         path.write_bytes(b"")
     before = contents(folder)
     with pytest.raises(DatasetError, match=r"manifest of .*demos is lost.*Repeat the command"):
-        repair(folder, LOOK)
+        repair(folder, NO_REPLAY)
     assert contents(folder) == before
 
 
@@ -158,7 +158,7 @@ def test_shards_that_are_not_all_of_some_settings_are_not_taken_for_them(folder:
         writer.write(demo)  # one episode instead of two
     before = contents(folder)
     with pytest.raises(DatasetError, match="is lost"):
-        repair(folder, LOOK)
+        repair(folder, NO_REPLAY)
     assert contents(folder) == before
 
 
@@ -166,12 +166,12 @@ def test_other_versions_generate_nothing(folder: Path, monkeypatch: pytest.Monke
     flip(folder / FIRST, 9000)
     before = contents(folder)
     monkeypatch.setattr(
-        "openvima.data.verification.regenerate.package_versions", lambda: {"numpy": "99", "openvima": "0.1.0"}
+        "openvima.data.verification.repairing.package_versions", lambda: {"numpy": "99", "openvima": "0.1.0"}
     )
     with pytest.raises(
         DatasetError, match=r"numpy [\d.]+ \(installed: 99\)\. Install .* nothing was changed"
     ):
-        repair(folder, LOOK)
+        repair(folder, NO_REPLAY)
     assert contents(folder) == before
 
 
@@ -179,8 +179,8 @@ def test_other_versions_still_write_a_lost_index_again(
     folder: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "index.parquet").unlink()
-    monkeypatch.setattr("openvima.data.verification.regenerate.package_versions", lambda: {"numpy": "99"})
-    assert repair(folder, LOOK).after.is_clean
+    monkeypatch.setattr("openvima.data.verification.repairing.package_versions", lambda: {"numpy": "99"})
+    assert repair(folder, NO_REPLAY).after.is_clean
     assert contents(folder) == contents(whole)
 
 
@@ -191,7 +191,7 @@ def test_a_shard_that_comes_out_otherwise_replaces_nothing(
     before = contents(folder)
     monkeypatch.setattr(oracle_rollouts, "attempt", _attempt)  # so that seed 1 is solved
     with pytest.raises(DatasetError, match=r"generated again, but not with the bytes"):
-        repair(folder, LOOK)
+        repair(folder, NO_REPLAY)
     assert contents(folder) == before
 
 
@@ -199,9 +199,9 @@ def test_a_shard_that_was_damaged_before_it_was_listed_is_repaired_too(folder: P
     flip(folder / FIRST, offset(folder, 0) + 10_000)
     (folder / "dataset.json").unlink()
     generate(GenerateConfig(out=folder, tasks=TASKS, episodes=3, shard_size=2, keep_failed=True))
-    problem, *_ = verify(folder, LOOK).problems
+    problem, *_ = verify(folder, NO_REPLAY).problems
     assert problem.file == FIRST
-    assert repair(folder, LOOK).after.is_clean
+    assert repair(folder, NO_REPLAY).after.is_clean
     assert contents(folder) == contents(whole)
 
 
@@ -214,22 +214,22 @@ def test_a_repair_that_is_stopped_changes_nothing_and_can_be_repeated(folder: Pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        repair(folder, LOOK, stop)
+        repair(folder, NO_REPLAY, stop)
     assert contents(folder) == before
     (folder / ".repair.tmp").mkdir()  # as after a kill
-    assert repair(folder, LOOK).after.is_clean
+    assert repair(folder, NO_REPLAY).after.is_clean
     assert contents(folder) == contents(whole)
 
 
 def test_failed_episodes_are_repaired_with_the_others(folder: Path) -> None:
     with pytest.raises(DatasetError, match=r"failed belongs to .*demos; repair that"):
-        repair(folder / "failed", LOOK)
+        repair(folder / "failed", NO_REPLAY)
 
 
 def test_of_data_that_cannot_be_made_again_the_whole_records_are_kept(merged: Path) -> None:
     hashes = [demo.content_hash() for demo in Dataset(merged)]
     flip(merged / STACK, offset(merged, 1) + 3000)
-    done = repair(merged, LOOK)
+    done = repair(merged, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
     assert done.rewritten == (STACK,)
     assert done.lost == (f"stack train seed 1 ({STACK}, record 1)",)
@@ -257,7 +257,7 @@ def test_no_whole_record_is_lost_whatever_else_is(
     damage(merged / STACK, offset(merged, 1))
     if not has_index:
         (merged / "index.parquet").unlink()
-    done = repair(merged, LOOK)
+    done = repair(merged, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
     assert [demo.content_hash() for demo in Dataset(merged)] == [hashes[k] for k in kept]
     assert bool(done.lost) == (len(kept) < 6 or not has_index)
@@ -272,22 +272,22 @@ def test_a_record_of_which_one_pixel_changed_is_not_kept(
     demos = [dataclasses.replace(demo, segm=noise) for demo in demos]
     write_folder(tmp_path, info, [demos])
     flip(tmp_path / STACK, offset(tmp_path, 1) + 200_000)  # noise is stored as it is, so this still decodes
-    assert not verify(tmp_path, LOOK).is_clean
+    assert not verify(tmp_path, NO_REPLAY).is_clean
     if not has_index:
         (tmp_path / "index.parquet").unlink()
-    assert repair(tmp_path, LOOK).after.is_clean
+    assert repair(tmp_path, NO_REPLAY).after.is_clean
     assert [demo.content_hash() for demo in Dataset(tmp_path)] == [demos[0].content_hash()]
 
 
-def test_a_salvage_that_is_stopped_before_the_index_is_written_loses_nothing(
+def test_a_rewrite_that_is_stopped_before_the_index_is_written_loses_nothing(
     merged: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hashes = [demo.content_hash() for demo in Dataset(merged)]
     flip(merged / STACK, offset(merged, 0) + 3000)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("openvima.data.verification.repairing.finish_folder", _interrupted)
-        repair(merged, LOOK)
-    assert repair(merged, LOOK).after.is_clean
+        repair(merged, NO_REPLAY)
+    assert repair(merged, NO_REPLAY).after.is_clean
     assert [demo.content_hash() for demo in Dataset(merged)] == hashes[1:]
 
 
@@ -299,11 +299,11 @@ def test_a_manifest_of_imported_data_is_written_again_as_far_as_it_can_be_read(m
     before = contents(merged)
     text = (merged / "dataset.json").read_text()
     (merged / "dataset.json").write_text(text.replace('"episodes": 6', '"episodes": 8'))
-    assert repair(merged, LOOK).after.is_clean
+    assert repair(merged, NO_REPLAY).after.is_clean
     assert contents(merged) == before
     (merged / "dataset.json").write_text("{")
     with pytest.raises(OpenVimaError, match="is lost"):
-        repair(merged, LOOK)
+        repair(merged, NO_REPLAY)
 
 
 def test_records_without_anything_that_says_what_they_are_stay_where_they_are(merged: Path) -> None:
@@ -312,26 +312,26 @@ def test_records_without_anything_that_says_what_they_are_stay_where_they_are(me
     blank(path, path.stat().st_size - 200, 200)
     before = contents(merged)
     with pytest.raises(ShardError, match=rf"{STACK} has 3 whole records, but its schema and its footer"):
-        repair(merged, LOOK)
+        repair(merged, NO_REPLAY)
     assert contents(merged) == before
 
 
-def test_tokens_that_are_not_those_of_the_demonstrations_are_found_and_deleted(
+def test_cache_files_that_differ_from_the_demonstrations_are_found_and_deleted(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
     first, second = (path for path in sorted(open_object_cache(Dataset(folder)).folder.glob("rotate-*")))
     num_files = len(list(folder.glob("*.arrow")))
     assert main(["data", "verify", str(folder), "--replay", "0"]) == 0
-    assert f"0 played again, {num_files} files of tokens compared\n" in capsys.readouterr().out
+    assert f"0 replayed, {num_files} cache files compared\n" in capsys.readouterr().out
     flip(first, first.stat().st_size // 2)  # elsewhere a bit of a packed run may give the same pixels
     cut(second, 100)
     names = [str(path.relative_to(folder)) for path in (first, second)]
-    assert sorted({problem.file for problem in verify(folder, LOOK).problems}) == names
-    done = repair(folder, LOOK)
+    assert sorted({problem.file for problem in verify(folder, NO_REPLAY).problems}) == names
+    done = repair(folder, NO_REPLAY)
     assert done.after.is_clean, done.after.problems
     assert done.deleted == tuple(names)
     open_object_cache(Dataset(folder))
-    assert verify(folder, LOOK).is_clean
+    assert verify(folder, NO_REPLAY).is_clean
 
 
 def test_the_command_says_what_it_did(folder: Path, capsys: pytest.CaptureFixture) -> None:
@@ -341,7 +341,7 @@ def test_the_command_says_what_it_did(folder: Path, capsys: pytest.CaptureFixtur
     shown = capsys.readouterr().out
     assert f"before: 1 problem\n  {LAST}: it is missing" in shown
     assert f"generated again\n  {LAST}" in shown
-    assert "nothing is wrong" in shown
+    assert "no problems" in shown
     (folder / LAST).unlink()
     assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["repaired"]["made_anew"] == [LAST]
+    assert json.loads(capsys.readouterr().out)["repaired"]["regenerated"] == [LAST]

@@ -105,7 +105,7 @@ def test_a_task_that_is_gone_is_named(
     tmp_path: Path, made_up: Callable[..., Demonstration], info: ShardInfo
 ) -> None:
     shard = stored(tmp_path / "a.arrow", made_up(), replace(info, assets="procedural", images=False))
-    with pytest.raises(ShardError, match=r"cannot be redrawn.*'stack'.*openvima 0 \(installed"):
+    with pytest.raises(ShardError, match=r"cannot be rerendered.*'stack'.*openvima 0 \(installed"):
         _ = shard[0]
 
 

@@ -1,4 +1,4 @@
-"""Verification: what is looked at beyond checksums, and episodes played again."""
+"""Verification beyond checksums, and replayed episodes."""
 
 import dataclasses
 import json
@@ -67,16 +67,16 @@ def rewrite(folder: Path, name: str, change: Callable[[Demonstration], Demonstra
     finish_folder(folder, sorted(folder.glob("*.arrow")), **origin)
 
 
-def test_a_generated_data_set_is_clean_and_plays_again(whole: Path) -> None:
+def test_a_generated_data_set_is_clean_and_replays(whole: Path) -> None:
     calls = []
     found = verify(whole, ALL, lambda *call: calls.append(call))
     assert found.is_clean, found.problems
     assert found.notes == ()
     assert (found.num_shards, found.num_episodes, found.num_replayed) == (4, 6, 6)
-    assert calls[-1] == (6, 6, "playing again")
+    assert calls[-1] == (6, 6, "replaying")
 
 
-def test_one_episode_of_each_task_is_played_again_unless_told_otherwise(whole: Path) -> None:
+def test_one_episode_of_each_task_is_replayed_by_default(whole: Path) -> None:
     assert verify(whole).num_replayed == len(TASKS)
     assert verify(whole, NONE).num_replayed == 0
 
@@ -94,7 +94,7 @@ def test_a_shard_that_the_manifest_does_not_list_is_named(folder: Path) -> None:
     assert causes(verify(folder, NONE)) == {"rotate-train-00009.arrow": ["the manifest does not list it"]}
 
 
-def test_failed_episodes_can_be_verified_where_they_lie(
+def test_failed_episodes_can_be_verified_alone(
     tmp_path: Path, made_up: MadeUp, info: ShardInfo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_folder(tmp_path, info, [[with_plain_images(made_up(1))]], command=COMMAND)
@@ -196,11 +196,11 @@ def test_a_shard_of_other_settings_is_found(folder: Path) -> None:
     assert "it says that it is rotate-train-00005.arrow" in found
 
 
-def test_an_oracle_that_acts_otherwise_is_found_by_playing(folder: Path) -> None:
+def test_an_oracle_that_acts_differently_is_found_by_replaying(folder: Path) -> None:
     other = Action.planar((0.3, 0.1), (0.6, -0.2))
     rewrite(folder, FIRST, lambda demo: dataclasses.replace(demo, actions=(other,) * demo.num_steps))
     found = verify(folder, ALL)
-    assert causes(found) == {FIRST: ["played again, the oracle acts otherwise in step 0 (records 0, 1 of 2)"]}
+    assert causes(found) == {FIRST: ["replayed, the oracle acts differently in step 0 (records 0, 1 of 2)"]}
     assert found.num_replayed == 6
 
 
@@ -225,23 +225,23 @@ def _with_another_path(demo: Demonstration) -> Demonstration:
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
-        (_with_a_pixel_changed, "the images are others after step 0"),
-        (_with_an_object_moved, "objects lie elsewhere after step 0"),
-        (_with_another_path, "the arm takes another path in step 0"),
+        (_with_a_pixel_changed, "the images differ after step 0"),
+        (_with_an_object_moved, "object poses differ after step 0"),
+        (_with_another_path, "the joint path differs in step 0"),
         (lambda demo: dataclasses.replace(demo, num_redraws=9), "the seed gives another episode"),
         (
             lambda demo: dataclasses.replace(demo, prompt=dataclasses.replace(demo.prompt, text="Do it.")),
-            "the prompt is another one",
+            "the prompt differs",
         ),
     ],
 )
-def test_playing_again_names_what_is_not_the_same_first(
+def test_replaying_names_the_first_difference(
     folder: Path, change: Callable[[Demonstration], Demonstration], cause: str
 ) -> None:
     rewrite(folder, FIRST, change)
     found = causes(verify(folder, ALL))
-    assert [text for text in found[FIRST] if text.startswith("played again")] == [
-        f"played again, {cause} (records 0, 1 of 2)"
+    assert [text for text in found[FIRST] if text.startswith("replayed")] == [
+        f"replayed, {cause} (records 0, 1 of 2)"
     ]
 
 
@@ -255,16 +255,16 @@ def test_what_other_versions_wrote_is_compared_and_noted(
     found = verify(folder, ALL)
     assert found.is_clean
     assert "installed are openvima 9, pyarrow 1. Only equal versions promise equal" in found.notes[0]
-    assert "which may be why: played again, the arm takes another path in step 0" in found.notes[1]
+    assert "which may be why: replayed, the joint path differs in step 0" in found.notes[1]
 
 
-def test_imported_episodes_are_not_played(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
+def test_imported_episodes_are_not_replayed(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
     info = dataclasses.replace(info, domain="published")
     demo = dataclasses.replace(with_plain_images(made_up()), domain="published", joint_paths=(), scenes=())
     found = verify(write_folder(tmp_path, info, [[demo]]), ALL)
     assert found.is_clean, found.problems
     assert found.num_replayed == 0
-    assert found.notes == ("1 episodes are imported ones; these cannot be played again.",)
+    assert found.notes == ("1 episodes are imported ones; these cannot be replayed.",)
 
 
 def test_a_task_that_is_not_installed_is_noted(tmp_path: Path, made_up: MadeUp, info: ShardInfo) -> None:
@@ -273,13 +273,13 @@ def test_a_task_that_is_not_installed_is_noted(tmp_path: Path, made_up: MadeUp, 
     assert "there is no task 'stack'" in found.notes[1]
 
 
-def test_every_task_plays_again(tmp_path: Path) -> None:
+def test_every_task_replays(tmp_path: Path) -> None:
     found = verify(generate(GenerateConfig(out=tmp_path, episodes=1)), ALL)
     assert found.is_clean, found.problems
     assert found.num_replayed == found.num_episodes >= 13
 
 
-def test_data_without_images_are_compared_through_what_is_drawn(tmp_path: Path) -> None:
+def test_data_without_images_are_compared_after_rendering(tmp_path: Path) -> None:
     config = GenerateConfig(out=tmp_path, tasks=("rotate",), episodes=2, images=False)
     found = verify(generate(config), ALL)
     assert found.is_clean, found.problems
@@ -336,14 +336,14 @@ def test_settings_and_folders_that_cannot_be_are_refused(tmp_path: Path) -> None
         verify(tmp_path)
 
 
-def test_the_command_ends_with_0_where_all_is_well(whole: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_exits_with_0_without_problems(whole: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["data", "verify", str(whole), "--replay", "1"]) == 0
     shown = capsys.readouterr().out
-    assert "4 shards, 6 episodes compared with their hashes, 2 played again" in shown
-    assert "nothing is wrong" in shown
+    assert "4 shards, 6 episodes compared with their hashes, 2 replayed" in shown
+    assert "no problems" in shown
 
 
-def test_the_command_ends_with_1_and_names_what_is_wrong(folder: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_exits_with_1_and_names_problems(folder: Path, capsys: pytest.CaptureFixture) -> None:
     (folder / FIRST).unlink()
     assert main(["data", "verify", str(folder), "--replay", "0"]) == 1
     shown = capsys.readouterr().out
@@ -362,7 +362,7 @@ def test_the_command_refuses_what_is_no_number_of_episodes(
     assert "--replay is 'some'" in capsys.readouterr().err
 
 
-def test_shards_of_failed_episodes_are_looked_at_too(folder: Path, made_up: MadeUp, info: ShardInfo) -> None:
+def test_shards_of_failed_episodes_are_verified_too(folder: Path, made_up: MadeUp, info: ShardInfo) -> None:
     failed = dataclasses.replace(
         with_plain_images(made_up()), outcome=Outcome(failure=True, reason="it fell")
     )

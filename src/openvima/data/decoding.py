@@ -34,7 +34,7 @@ def decode(batch: pa.RecordBatch, info: ShardInfo) -> Demonstration:
 
     Returns:
         The demonstration; its images belong to the caller, who may write to them. Where the file stores none,
-        its dictionaries of images are empty until `redrawing.redrawn` fills them.
+        its dictionaries of images are empty until `rerender.rerendered` fills them.
     """
     row = decode_columns(batch)
     views = VIEWS if info.images else ()

@@ -21,7 +21,7 @@ from openvima.scene import RenderedPrompt, Scene
 from openvima.tasks import sample_episode
 
 
-def redrawn(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
+def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
     """Give a demonstration its images back.
 
     Args:
@@ -107,6 +107,6 @@ def _changed(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardEr
     if others:
         versions = f"{', '.join(others)}; read it with those, or generate it again"
     return ShardError(
-        f"{demo.task} of seed {demo.seed} is stored without images and cannot be redrawn as it was{details}. "
-        f"It was written with {versions}."
+        f"{demo.task} of seed {demo.seed} is stored without images and cannot be rerendered identically"
+        f"{details}. It was written with {versions}."
     )

@@ -59,10 +59,10 @@ class Shard:
             raise self._row_error(row, error) from None
         if self.info.images:
             return demo
-        from openvima.data.rerender import redrawn  # with which the renderer comes
+        from openvima.data.rerender import rerendered  # with which the renderer comes
 
         try:
-            return redrawn(demo, self.info, batch.column("content_hash")[0].as_py())
+            return rerendered(demo, self.info, batch.column("content_hash")[0].as_py())
         except ShardError as error:
             raise ShardError(f"{self.path}, record {row}: {error}") from None
 

@@ -1,4 +1,4 @@
-"""`openvima data verify`: look for all that is wrong with demonstrations, and repair it."""
+"""`openvima data verify`: verify and repair demonstrations."""
 
 import json
 from collections.abc import Iterator
@@ -24,36 +24,36 @@ def verify(
     assets: str | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Look for all that is wrong with demonstrations: bytes, form, values, and episodes played again.
+    """Verify demonstrations: checksums, schema, values, and replayed episodes.
 
-    Exit status 0 if nothing is wrong, else 1. Problems are named with file, cause and remedy.
+    Exit status 0 if there are no problems, else 1. Problems are listed with file, cause and remedy.
 
     Example: openvima data verify demos --workers 2
 
     Args:
         folder: Folder of demonstrations.
-        replay: Episodes of each task to play again in the simulator and to compare bit by bit, or "all".
-        repair: Generate damaged shards again, or keep the whole records of those that were imported.
+        replay: Episodes of each task to replay in the simulator and compare bit by bit, or "all".
+        repair: Generate damaged shards again, or keep the whole records of those that cannot be generated.
         workers: Number of processes.
-        seed: Another one replays other episodes.
+        seed: Decides which episodes are replayed.
         assets: Folder of the original benchmark's assets, for data made with them.
-        as_json: Print the result for machines.
+        as_json: Print the result as JSON.
 
     Returns:
         Exit status.
     """
     from openvima.data.verification import VerifyConfig
-    from openvima.data.verification import repair as make_whole
-    from openvima.data.verification import verify as look
+    from openvima.data.verification import repair as repair_folder
+    from openvima.data.verification import verify as verify_folder
 
     config = VerifyConfig(_number(replay), seed=seed, assets=assets, workers=workers)
     with progress_bar("repairing" if repair else "verifying") as report:
-        done = make_whole(folder, config, report) if repair else None
-        found = done.after if done is not None else look(folder, config, report)
+        done = repair_folder(folder, config, report) if repair else None
+        found = done.after if done is not None else verify_folder(folder, config, report)
     if as_json:
         print(json.dumps((done or found).record(), indent=2, ensure_ascii=False))
     else:
-        print("\n".join([*(() if done is None else _deeds(done)), *_findings(found)]))
+        print("\n".join([*(() if done is None else _repair_text(done)), *_text(found)]))
     return 0 if found.is_clean else 1
 
 
@@ -70,26 +70,26 @@ def _number(replay: str) -> int | None:
     return int(replay)
 
 
-def _deeds(done: "Repair") -> Iterator[str]:
-    """Say what a repair found and did."""
+def _repair_text(done: "Repair") -> Iterator[str]:
+    """Yield the lines about a repair."""
     yield f"before: {_number_of_problems(done.before)}"
     yield from (f"  {problem.file}: {problem.cause}" for problem in done.before.problems)
-    for deed, names in (
-        ("generated again", done.made_anew),
+    for title, names in (
+        ("generated again", done.regenerated),
         ("whole records kept", done.rewritten),
         ("lost", done.lost),
         ("deleted", done.deleted),
     ):
         if names:
-            yield deed
+            yield title
             yield from (f"  {name}" for name in names)
     yield ""
 
 
-def _findings(found: "Verification") -> Iterator[str]:
+def _text(found: "Verification") -> Iterator[str]:
     yield (
         f"{found.folder}: {found.num_shards:,} shards, {found.num_episodes:,} episodes compared with their "
-        f"hashes, {found.num_replayed:,} played again{_tokens(found)}"
+        f"hashes, {found.num_replayed:,} replayed{_cache_text(found)}"
     )
     yield from (f"note: {note}" for note in found.notes)
     yield _number_of_problems(found)
@@ -98,11 +98,11 @@ def _findings(found: "Verification") -> Iterator[str]:
     yield from (f"  → {remedy}" for remedy in sorted({problem.remedy for problem in found.problems}))
 
 
-def _tokens(found: "Verification") -> str:
-    return f", {found.num_token_files:,} files of tokens compared" if found.num_token_files else ""
+def _cache_text(found: "Verification") -> str:
+    return f", {found.num_cache_files:,} cache files compared" if found.num_cache_files else ""
 
 
 def _number_of_problems(found: "Verification") -> str:
     if found.is_clean:
-        return "nothing is wrong"
+        return "no problems"
     return "1 problem" if len(found.problems) == 1 else f"{len(found.problems)} problems"

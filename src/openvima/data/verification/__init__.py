@@ -1,4 +1,4 @@
-"""Checking data sets, down to playing episodes again, and making damaged ones whole."""
+"""Verifying and repairing data sets."""
 
 from openvima.data.verification.checks import verify
 from openvima.data.verification.findings import Problem, Verification, VerifyConfig

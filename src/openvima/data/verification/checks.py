@@ -1,4 +1,4 @@
-"""Verifying a data folder: what it says of itself, its shards, and a sample of episodes played again."""
+"""Verifying a data folder: manifest and index, shards, object cache, and a sample of replayed episodes."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,26 +11,26 @@ from openvima.data.manifest import (
     compose,
     joint_hash,
 )
+from openvima.data.verification.cache_files import check_cache
 from openvima.data.verification.findings import Problem, Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
-from openvima.data.verification.token_files import check_tokens
 from openvima.multiprocess import in_processes
 
 DEFAULT = VerifyConfig()
 
 
 def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | None = None) -> Verification:
-    """Look for everything that is wrong with a data set; nothing is changed.
+    """Find all problems of a data set; nothing is changed.
 
     Args:
-        folder: Folder of demonstrations. Its `failed` episodes and its tokens are looked at too.
-        config: How thoroughly to look.
-        report: Called with episodes done, episodes in all, and what is being done.
+        folder: Folder of demonstrations. Its `failed` episodes and its object cache are checked too.
+        config: How thoroughly to verify.
+        report: Called with episodes done, episodes in all, and the current stage.
 
     Returns:
-        All problems; none if every byte is as it was written and says what it should.
+        The result.
 
     Raises:
         DatasetError: There is no data set.
@@ -50,8 +50,8 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
     results = dict(_checked(tasks, config, report))
     found = [results[task.path.name] for task in tasks]
     replayed = replay(inventory, results, config, report)
-    tokens = check_tokens(folder, _joint_hashes(found), config.workers, report)
-    own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems, *tokens.problems]
+    num_cache_files, cache_problems = check_cache(folder, _joint_hashes(found), config.workers, report)
+    own = [*inventory.problems, *_whole_faults(inventory, found), *replayed.problems, *cache_problems]
     place = "" if folder == root else f"{folder.relative_to(root)}/"
     problems = [Problem(place + problem.file, problem.cause, problem.remedy) for problem in own]
     problems += [problem for findings in found for problem in findings.problems]
@@ -62,7 +62,7 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
         num_shards=len(tasks),
         num_episodes=sum(findings.num_episodes for findings in found),
         num_replayed=replayed.num_episodes,
-        num_token_files=tokens.num_files,
+        num_cache_files=num_cache_files,
         damaged=tuple(place + task.path.name for task in tasks if results[task.path.name].is_damaged),
     )
 
@@ -70,7 +70,7 @@ def _verify(folder: Path, root: Path, config: VerifyConfig, report: Report | Non
 def _checked(
     tasks: Sequence[ShardTask], config: VerifyConfig, report: Report | None
 ) -> Iterator[tuple[str, ShardFindings]]:
-    """Yield the name of each shard with what was found in it."""
+    """Yield the name of each shard with its findings."""
     total = sum(0 if task.index is None else task.index.num_rows for task in tasks)
     watch = None if report is None else (lambda done: report(done, max(done, total), "comparing"))
     for task, findings in in_processes(check_shard, tasks, config.workers, report=watch):
@@ -78,7 +78,7 @@ def _checked(
 
 
 def _joint_hashes(found: Sequence[ShardFindings]) -> dict[str, str]:
-    """Name of each whole shard to the hash of its episodes together."""
+    """Name of each whole shard to the joint hash of its episodes."""
     summaries = [f.summary for f in found if f.summary is not None and not f.is_damaged]
     return {summary.name: joint_hash(summary.index.column("content_hash")) for summary in summaries}
 
@@ -89,7 +89,7 @@ def _tasks(inventory: Inventory, root: Path) -> list[ShardTask]:
     return [
         ShardTask(
             path=inventory.folder / name,
-            shown_as=str((inventory.folder / name).relative_to(root)),
+            label=str((inventory.folder / name).relative_to(root)),
             entry=None if manifest is None else manifest["shards"][name],
             index=None if inventory.index is None else parts.get(name, inventory.index.slice(0, 0)),
             config=generated.get("config", {}),
@@ -102,9 +102,9 @@ def _tasks(inventory: Inventory, root: Path) -> list[ShardTask]:
 
 
 def _whole_faults(inventory: Inventory, found: Sequence[ShardFindings]) -> Iterator[Problem]:
-    """Yield what is wrong with index and manifest where every shard is as it should be."""
+    """Yield problems of index and manifest that contradict whole shards."""
     summaries = [findings.summary for findings in found if findings.summary is not None]
-    yield from _twins(summaries)
+    yield from _duplicates(summaries)
     manifest = inventory.manifest
     if manifest is None or len(summaries) < len(found):
         return
@@ -117,16 +117,16 @@ def _whole_faults(inventory: Inventory, found: Sequence[ShardFindings]) -> Itera
         yield Problem(INDEX_NAME, cause, inventory.remedy)
 
 
-def _twins(summaries: Sequence[ShardSummary]) -> Iterator[Problem]:
-    """Yield episodes that are there twice."""
+def _duplicates(summaries: Sequence[ShardSummary]) -> Iterator[Problem]:
+    """Yield shards with episodes that occur twice."""
     first: dict[str, str] = {}
     for summary in summaries:
-        twins = []
+        duplicates = []
         for content_hash in summary.index.column("content_hash").to_pylist():
             if content_hash in first:
-                twins.append(content_hash)
+                duplicates.append(content_hash)
             first.setdefault(content_hash, summary.name)
-        if twins:
-            cause = f"{len(twins)} of its {summary.index.num_rows} episodes are there twice, "
-            cause += f"the first of them also in {first[twins[0]]}"
+        if duplicates:
+            cause = f"{len(duplicates)} of its {summary.index.num_rows} episodes are there twice, "
+            cause += f"the first of them also in {first[duplicates[0]]}"
             yield Problem(summary.name, cause, "Take one away, and repeat the command that wrote the folder.")

@@ -1,4 +1,4 @@
-"""What must hold inside every demonstration, whoever made it."""
+"""Invariants of every demonstration, wherever it comes from."""
 
 from collections.abc import Iterator
 
@@ -16,12 +16,12 @@ from openvima.scene import (
 )
 from openvima.tasks.oracle import TIED_TO_TABLE
 
-PUBLISHED = "published"  # domain of demonstrations that were not made here
+PUBLISHED = "published"  # domain of imported demonstrations
 _UNIT_TOLERANCE = 1e-3  # float32 quaternions of published data are off by up to 1e-7
 
 
 def faults(demo: Demonstration) -> Iterator[str]:
-    """Yield what cannot be in a demonstration.
+    """Yield violated invariants of a demonstration.
 
     Args:
         demo: The demonstration, with its images.

@@ -1,7 +1,7 @@
-"""What a verification is asked for, and what it finds."""
+"""Settings and results of a verification."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +10,16 @@ from openvima.multiprocess import check_workers
 
 Report = Callable[[int, int, str], None]
 
-_SHOWN_ROWS = 8  # of those that a problem concerns
+_MAX_ROWS_NAMED = 8
 
 
 @dataclass(frozen=True, slots=True)
 class VerifyConfig:
-    """How thoroughly to look.
+    """Settings of a verification.
 
     Args:
-        replay: Episodes of each task to play again; None means all.
-        seed: Another one replays other episodes.
+        replay: Episodes of each task to replay in the simulator; None means all.
+        seed: Decides which episodes are replayed.
         assets: Asset pack to replay with, as for `openvima generate`; None means the one of that name.
         workers: Number of processes.
 
@@ -40,7 +40,7 @@ class VerifyConfig:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """Something that is not as it should be.
+    """A problem of one file.
 
     Args:
         file: Name of the file, relative to the data folder.
@@ -58,17 +58,17 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was looked at, and what was found.
+    """Result of a verification.
 
     Args:
         folder: The data folder.
         problems: All problems, by file.
-        notes: What is worth knowing but not wrong.
-        num_shards: Shards that were looked at.
+        notes: Remarks that are no problems.
+        num_shards: Shards that were checked.
         num_episodes: Episodes that were decoded and compared with their content hashes.
-        num_replayed: Episodes that were played again.
-        num_token_files: Files of tokens that were compared with what is cut out of the demonstrations now.
-        damaged: Names of shards whose bytes are not those that were written, or that are missing.
+        num_replayed: Episodes that were replayed.
+        num_cache_files: Files of the object cache that were compared with the demonstrations.
+        damaged: Names of shards that are missing or have other bytes than were written.
     """
 
     folder: Path
@@ -77,26 +77,18 @@ class Verification:
     num_shards: int = 0
     num_episodes: int = 0
     num_replayed: int = 0
-    num_token_files: int = 0
+    num_cache_files: int = 0
     damaged: tuple[str, ...] = ()
 
     @property
     def is_clean(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no problems."""
         return not self.problems
 
     def joined(self, other: "Verification") -> "Verification":
-        """Add what was found in a folder inside this one."""
-        return Verification(
-            folder=self.folder,
-            problems=self.problems + other.problems,
-            notes=self.notes + other.notes,
-            num_shards=self.num_shards + other.num_shards,
-            num_episodes=self.num_episodes + other.num_episodes,
-            num_replayed=self.num_replayed + other.num_replayed,
-            num_token_files=self.num_token_files + other.num_token_files,
-            damaged=self.damaged + other.damaged,
-        )
+        """Add the results of a folder inside this one."""
+        names = [field.name for field in fields(self) if field.name != "folder"]
+        return replace(self, **{name: getattr(self, name) + getattr(other, name) for name in names})
 
     def record(self) -> dict[str, Any]:  # Any: JSON
         """Return everything as plain values."""
@@ -106,21 +98,21 @@ class Verification:
             "shards": self.num_shards,
             "episodes": self.num_episodes,
             "replayed": self.num_replayed,
-            "token_files": self.num_token_files,
+            "cache_files": self.num_cache_files,
             "problems": [asdict(problem) for problem in self.problems],
             "notes": list(self.notes),
         }
 
 
 def by_cause(faults: Iterable[tuple[int, str]], num_rows: int) -> list[str]:
-    """Say once what is wrong with several records.
+    """Group faults of records by cause.
 
     Args:
-        faults: Row and what is wrong with it.
+        faults: Row and cause of each.
         num_rows: Rows of the shard.
 
     Returns:
-        One text a cause, with the rows.
+        One text per cause, with the rows.
     """
     rows: dict[str, list[int]] = {}
     for row, cause in faults:
@@ -129,6 +121,6 @@ def by_cause(faults: Iterable[tuple[int, str]], num_rows: int) -> list[str]:
 
 
 def _listed(rows: list[int]) -> str:
-    shown = ", ".join(str(row) for row in rows[:_SHOWN_ROWS])
-    more = f" and {len(rows) - _SHOWN_ROWS} more" if len(rows) > _SHOWN_ROWS else ""
+    shown = ", ".join(str(row) for row in rows[:_MAX_ROWS_NAMED])
+    more = f" and {len(rows) - _MAX_ROWS_NAMED} more" if len(rows) > _MAX_ROWS_NAMED else ""
     return f"record{'s' if len(rows) > 1 else ''} {shown}{more}"

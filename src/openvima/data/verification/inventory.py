@@ -1,4 +1,4 @@
-"""What a data folder says of itself: manifest, index, and the names of its files."""
+"""Manifest, index and file names of a data folder, before its shards are opened."""
 
 import json
 from collections.abc import Iterator
@@ -26,15 +26,15 @@ from openvima.errors import DatasetError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inventory:
-    """What is known of a folder before its shards are opened.
+    """Contents of a data folder.
 
     Args:
         folder: The folder.
-        manifest: Its manifest; None where it cannot be trusted.
-        index: Its index; None where it cannot be trusted.
-        problems: What is wrong with both, and with the names of files.
-        notes: What is worth knowing.
-        doubtful: A manifest that can be read and yet not be trusted.
+        manifest: Its manifest; None if it cannot be trusted.
+        index: Its index; None if it cannot be trusted.
+        problems: Problems of both, and of file names.
+        notes: Remarks that are no problems.
+        doubtful: Origin in a damaged manifest that is still readable.
     """
 
     folder: Path
@@ -46,24 +46,24 @@ class Inventory:
 
     @property
     def is_generated(self) -> bool:
-        """Whether the simulation can make lost shards again."""
+        """Whether lost shards can be generated again."""
         return self.manifest is not None and self.manifest["command"] == COMMAND
 
     @property
     def holds_failed(self) -> bool:
-        """Whether it is the part of a data set that holds the episodes which were not solved."""
+        """Whether it holds the unsolved episodes of a data set."""
         folder = self.folder.resolve()  # which has a name and a parent, even if "." was given
         return folder.name == FAILED_FOLDER and (folder.parent / MANIFEST_NAME).is_file()
 
     @property
     def remedy(self) -> str:
-        """What mends a file of the folder."""
+        """How to repair a file of the folder."""
         return remedy(self.folder.parent if self.holds_failed else self.folder)
 
     def shard_names(self) -> list[str]:
         """Return the names of the manifest's shards in the order of the data set.
 
-        Where there is no manifest, they are those of the files that are there.
+        Without a manifest, they are the names of all shard files.
         """
         if self.manifest is None:
             return sorted(path.name for path in self.folder.glob("*.arrow"))
@@ -86,7 +86,7 @@ class Inventory:
 
 
 def take_inventory(folder: Path) -> Inventory:
-    """Read what a folder says of itself.
+    """Read manifest, index and file names of a folder.
 
     Args:
         folder: A folder of demonstrations.
@@ -114,7 +114,7 @@ def take_inventory(folder: Path) -> Inventory:
         problems.append(Problem(INDEX_NAME, "it is missing", found.remedy))
     except DatasetError as error:
         problems.append(Problem(INDEX_NAME, str(error), found.remedy))
-    problems += () if manifest is None else _strangers(shards, manifest)
+    problems += () if manifest is None else _unlisted(shards, manifest)
     doubtful = _doubtful(folder / MANIFEST_NAME) if manifest is None else None
     notes = tuple(_leftovers(folder))
     return replace(
@@ -123,17 +123,17 @@ def take_inventory(folder: Path) -> Inventory:
 
 
 def _doubtful(path: Path) -> dict[str, Any] | None:  # Any: JSON
-    """Read what a damaged manifest says of its origin, if that is still in its place."""
+    """Read the origin in a damaged manifest, if it is intact."""
     try:
         manifest = json.loads(path.read_bytes())
         origin = {key: manifest[key] for key in ORIGIN_TYPES}
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
-    are_theirs = all(isinstance(origin[key], kind) for key, kind in ORIGIN_TYPES.items())
-    return origin if are_theirs else None
+    is_valid = all(isinstance(origin[key], kind) for key, kind in ORIGIN_TYPES.items())
+    return origin if is_valid else None
 
 
-def _strangers(shards: list[str], manifest: dict[str, Any]) -> Iterator[Problem]:  # Any: JSON
+def _unlisted(shards: list[str], manifest: dict[str, Any]) -> Iterator[Problem]:  # Any: JSON
     remedy = "If a run was stopped, repeat its command; otherwise move the file elsewhere."
     for name in shards:
         if name not in manifest["shards"]:

@@ -1,4 +1,4 @@
-"""Playing stored episodes again: the same seed, oracle and actions must show the same bytes."""
+"""Replaying stored episodes: seed, oracle and actions must reproduce the same bytes."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -24,18 +24,18 @@ from openvima.scene import RenderedPrompt
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
 
-_REMEDY = "The files are as they were written: another machine or other code made them. Generate them anew."
-_NO_MATTER = "pyarrow"  # its version decides bytes of files, not of episodes
+_REMEDY = "The files are intact, but another machine or other code wrote them. Generate them again."
+_IRRELEVANT = "pyarrow"  # its version decides bytes of files, not of episodes
 
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """What came of playing episodes again.
+    """Result of replaying episodes.
 
     Args:
-        num_episodes: How many were played.
-        problems: Shards with episodes that were not the same.
-        notes: What could not be played or compared, and why.
+        num_episodes: Number of replayed episodes.
+        problems: Shards with episodes that differ.
+        notes: Episodes that could not be replayed or compared, and why.
     """
 
     num_episodes: int = 0
@@ -45,12 +45,12 @@ class Replayed:
 
 @dataclass(frozen=True, slots=True)
 class ReplayTask:
-    """Episodes of one shard to play again.
+    """Episodes of one shard to replay.
 
     Args:
         path: The file.
-        info: What it says of itself.
-        rows: Which of its records.
+        info: Its metadata.
+        rows: Its records to replay.
         assets: Name or folder of the asset pack.
     """
 
@@ -66,44 +66,44 @@ def replay(
     config: VerifyConfig,
     report: Report | None = None,
 ) -> Replayed:
-    """Play a sample of episodes again.
+    """Replay a sample of episodes.
 
     Args:
         inventory: The folder.
-        findings: What was found in its shards; only those that could be read are played.
-        config: How many episodes, and where the assets are.
-        report: Called with episodes done, episodes in all, and what is being done.
+        findings: Results of its shards; only readable ones are replayed.
+        config: Number of episodes, and the assets.
+        report: Called with episodes done, episodes in all, and the current stage.
     """
     if config.replay == 0:
         return Replayed()
     tasks = list(_chosen(inventory, findings, config))
     total = sum(len(task.rows) for task in tasks)
-    watch = None if report is None else (lambda done: report(done, total, "playing again"))
+    watch = None if report is None else (lambda done: report(done, total, "replaying"))
     problems, notes = [], _notes_on_origin(findings)
-    num_played = 0
+    num_replayed = 0
     for task, found in in_processes(replay_shard, tasks, config.workers, report=watch):
         name = task.path.name
         if isinstance(found, str):
-            notes.append(f"{name} cannot be played again: {found}")
+            notes.append(f"{name} cannot be replayed: {found}")
             continue
-        num_played += len(task.rows)
+        num_replayed += len(task.rows)
         for cause in by_cause(found, findings[name].num_episodes):
             if others := _other_versions(task.info):
-                notes.append(f"{name}, written by {others}, which may be why: played again, {cause}")
+                notes.append(f"{name}, written by {others}, which may be why: replayed, {cause}")
             else:
-                problems.append(Problem(name, f"played again, {cause}", _REMEDY))
-    return Replayed(num_played, tuple(problems), tuple(notes))
+                problems.append(Problem(name, f"replayed, {cause}", _REMEDY))
+    return Replayed(num_replayed, tuple(problems), tuple(notes))
 
 
 def replay_shard(task: ReplayTask, count: Callable[[int], None]) -> list[tuple[int, str]] | str:
-    """Play episodes of a shard again.
+    """Replay episodes of a shard.
 
     Args:
-        task: Which.
-        count: Called with the number of episodes played so far.
+        task: The episodes.
+        count: Called with the number of episodes replayed so far.
 
     Returns:
-        Row and first difference of those that are not the same; or why none can be played.
+        Row and first difference of those that differ; or why none can be replayed.
     """
     shard, found = Shard(task.path), []
     try:
@@ -124,29 +124,29 @@ def replay_shard(task: ReplayTask, count: Callable[[int], None]) -> list[tuple[i
 
 
 def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
-    """Play the actions of a demonstration and compare all that is to be seen, bit by bit.
+    """Replay a demonstration and compare prompt, scenes, images, actions and joint paths bit by bit.
 
     Args:
         env: An environment of the same task, level and settings.
         demo: The demonstration.
 
     Returns:
-        What is not the same first; nothing if all is.
+        The first difference; empty if there is none.
 
     Raises:
-        SamplingError: The seed no longer has an episode.
-        OracleError: The oracle no longer has an action.
+        SamplingError: The task no longer samples an episode for the seed.
+        OracleError: The oracle no longer finds an action.
     """
     observation, _ = env.reset(seed=demo.seed)
     if (env.episode.num_redraws, env.episode.max_steps) != (demo.num_redraws, demo.max_steps):
         return "the seed gives another episode"
     if not _is_same_prompt(env.prompt, demo.prompt):
-        return "the prompt is another one"
+        return "the prompt differs"
     for step, action in enumerate((*demo.actions, None)):
         if env.scene != demo.scenes[step]:
-            return f"objects lie elsewhere {_when(step)}"
+            return f"object poses differ {_when(step)}"
         if not _is_same_view(observation, demo.observation(step)):
-            return f"the images are others {_when(step)}"
+            return f"the images differ {_when(step)}"
         if action is None:
             break
         decision = env.oracle_decision()
@@ -155,17 +155,17 @@ def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
             demo.pick_ids[step],
             demo.place_ids[step],
         ):
-            return f"the oracle acts otherwise in step {step}"
+            return f"the oracle acts differently in step {step}"
         observation, *_ = env.step(action)
         if not np.array_equal(env.joint_path, demo.joint_paths[step]):
-            return f"the arm takes another path in step {step}"
-    return "" if env.outcome == demo.outcome else "it ends otherwise"
+            return f"the joint path differs in step {step}"
+    return "" if env.outcome == demo.outcome else "the outcome differs"
 
 
 def _chosen(
     inventory: Inventory, findings: Mapping[str, ShardFindings], config: VerifyConfig
 ) -> Iterator[ReplayTask]:
-    """Choose the episodes of each task whose content hashes, hashed with the seed, are smallest."""
+    """Choose a pseudorandom sample of each task by hashes of content and seed."""
     ranked: dict[str, list[tuple[bytes, str, int]]] = {}
     for name, found in findings.items():
         if found.is_damaged or found.summary is None or found.info is None or found.info.domain == PUBLISHED:
@@ -188,7 +188,7 @@ def _chosen(
 def _notes_on_origin(findings: Mapping[str, ShardFindings]) -> list[str]:
     infos = [(found.info, found.num_episodes) for found in findings.values() if found.info is not None]
     imported = sum(num for info, num in infos if info.domain == PUBLISHED)
-    notes = [f"{imported} episodes are imported ones; these cannot be played again."] if imported else []
+    notes = [f"{imported} episodes are imported ones; these cannot be replayed."] if imported else []
     others = {_other_versions(info) for info, _ in infos if info.domain != PUBLISHED} - {""}
     installed = ", ".join(f"{name} {version}" for name, version in package_versions().items())
     return notes + [
@@ -198,9 +198,9 @@ def _notes_on_origin(findings: Mapping[str, ShardFindings]) -> list[str]:
 
 
 def _other_versions(info: ShardInfo) -> str:
-    """Name the packages that wrote a shard, if others are installed; nothing if the same are."""
+    """Name the versions that wrote a shard; empty if they are installed."""
     installed, wrote = package_versions(), info.versions
-    if all(wrote.get(name) == version for name, version in installed.items() if name != _NO_MATTER):
+    if all(wrote.get(name) == version for name, version in installed.items() if name != _IRRELEVANT):
         return ""
     return ", ".join(f"{name} {version}" for name, version in wrote.items())
 

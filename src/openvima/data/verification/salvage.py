@@ -1,8 +1,7 @@
-"""Keeping the whole records of a damaged shard, wherever in the file they lie."""
+"""Rewriting a damaged shard with its whole records, wherever they are in the file."""
 
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,45 +10,33 @@ import pyarrow as pa
 from openvima.data.checksums import MAGIC_BYTES, Span, mapped
 from openvima.data.decoding import decode
 from openvima.data.encoding import ShardInfo
-from openvima.data.rerender import redrawn
+from openvima.data.rerender import rerendered
 from openvima.data.schema import COLUMNS
 from openvima.data.shard import ODD_ERRORS, Shard
 from openvima.data.writer import ShardWriter
 from openvima.errors import OpenVimaError, ShardError
 
-_MARK = 0xFFFFFFFF  # begins every message of an Arrow file, at a multiple of 8
-_WORD_BYTES = 4
+_MARK = 0xFFFFFFFF  # begins every message of an Arrow file, at a multiple of 8 bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Salvaged:
-    """What was kept of a damaged shard.
-
-    Args:
-        num_kept: Records that were whole; they are in the shard, which is whole again.
-        content_hashes: Theirs.
-    """
-
-    num_kept: int
-    content_hashes: tuple[str, ...]
-
-
-def salvage(path: Path, spans: list[Span] | None) -> Salvaged:
-    """Write a shard anew with those of its records that are whole; without any it is deleted.
+def rewrite(path: Path, spans: list[Span] | None) -> set[str]:
+    """Rewrite a shard with those of its records that are whole; without any it is deleted.
 
     Args:
         path: The shard; it may be missing.
-        spans: What the index holds of its records; without, they are compared with their content hashes.
+        spans: Its records in the index; without, records are compared with their content hashes.
+
+    Returns:
+        Content hashes of the records that were kept.
 
     Raises:
-        ShardError: There are whole records, but nothing in the file says what they have in common.
+        ShardError: There are whole records, but schema and footer are damaged.
     """
     if not path.is_file():
-        return Salvaged(0, ())
+        return set()
     content = mapped(path) if path.stat().st_size else memoryview(b"")
     info = _info(path, content)
     batches = list(_whole_records(content, info, spans))
-    hashes = tuple(batch.column("content_hash")[0].as_py() for batch in batches)
     if not batches:
         path.unlink()
     elif info is None:
@@ -61,11 +48,11 @@ def salvage(path: Path, spans: list[Span] | None) -> Salvaged:
         with ShardWriter(path, info) as writer:
             for batch in batches:
                 writer.copy(batch)
-    return Salvaged(len(batches), hashes)
+    return {batch.column("content_hash")[0].as_py() for batch in batches}
 
 
 def _info(path: Path, content: memoryview) -> ShardInfo | None:
-    """Read what a shard says of itself at its end, or else at its beginning."""
+    """Read the metadata of a shard from its footer, or else from its head."""
     try:
         return Shard(path).info
     except ShardError:
@@ -80,14 +67,11 @@ def _info(path: Path, content: memoryview) -> ShardInfo | None:
 def _whole_records(
     content: memoryview, info: ShardInfo | None, spans: list[Span] | None
 ) -> Iterator[pa.RecordBatch]:
-    """Yield the records that are whole, in the order of the file.
-
-    Each begins with a mark; where a damaged length hides the next one, looking for marks finds it.
-    """
+    """Yield whole records in the order of the file; each is found by its mark."""
     known = None if spans is None else {(span.num_bytes, span.crc32) for span in spans}
-    words = np.frombuffer(content[: len(content) // 8 * 8], dtype="<u4")
+    words = np.frombuffer(content[: len(content) // 8 * 8], dtype="<u4")[::2]
     end = 0
-    for position in (np.flatnonzero(words[::2] == _MARK) * 2 * _WORD_BYTES).tolist():
+    for position in (np.flatnonzero(words == _MARK) * 8).tolist():
         if position < end:  # inside the record before
             continue
         try:
@@ -113,6 +97,6 @@ def _has_own_hash(batch: pa.RecordBatch, info: ShardInfo | None) -> bool:
     stored = batch.column("content_hash")[0].as_py()
     try:
         demo = decode(batch, info)
-        return (demo if info.images else redrawn(demo, info, stored)).content_hash() == stored
+        return (demo if info.images else rerendered(demo, info, stored)).content_hash() == stored
     except OpenVimaError:
         return False

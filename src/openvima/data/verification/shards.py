@@ -1,4 +1,4 @@
-"""Checking one shard: bytes, form, and every record in it."""
+"""Checking one shard: bytes, schema, and every record."""
 
 import itertools
 import re
@@ -22,21 +22,21 @@ _KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "suc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShardTask:
-    """One shard to look at.
+    """A shard to check.
 
     Args:
         path: The file.
-        shown_as: Its name in messages, relative to the data folder.
+        label: Its name in messages, relative to the data folder.
         entry: Its entry in the manifest; None where that cannot be trusted.
         index: Its part of the index; None where that cannot be trusted.
         config: Settings of the manifest that all generated shards share; empty for others.
         versions: Those of the manifest, for generated shards; empty for others.
-        is_failed: Whether it holds episodes that were not solved.
-        remedy: What mends it.
+        is_failed: Whether it holds unsolved episodes.
+        remedy: How to repair it.
     """
 
     path: Path
-    shown_as: str
+    label: str
     entry: dict[str, Any] | None  # Any: JSON
     index: pa.Table | None
     config: dict[str, Any]  # Any: JSON
@@ -47,13 +47,13 @@ class ShardTask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShardFindings:
-    """What was found in a shard.
+    """Result of checking a shard.
 
     Args:
-        problems: All that is wrong.
-        is_damaged: Whether its bytes are not those that were written, or it is missing.
-        summary: What index and manifest should hold of it; None where it cannot be read.
-        info: What it says of itself; None where it cannot be read.
+        problems: All problems.
+        is_damaged: Whether it is missing or has other bytes than were written.
+        summary: Its rows of the index and its entry of the manifest, as they should be; None if unreadable.
+        info: Its metadata; None if unreadable.
         num_episodes: Records that were decoded.
     """
 
@@ -68,8 +68,8 @@ def check_shard(task: ShardTask, count: Callable[[int], None]) -> ShardFindings:
     """Check a shard.
 
     Args:
-        task: The shard, and what is known of it.
-        count: Called with the number of episodes looked at so far.
+        task: The shard.
+        count: Called with the number of episodes checked so far.
     """
     causes = list(_byte_faults(task))
     if causes:
@@ -88,17 +88,17 @@ def check_shard(task: ShardTask, count: Callable[[int], None]) -> ShardFindings:
 
 
 def _problems(task: ShardTask, causes: Sequence[str]) -> tuple[Problem, ...]:
-    return tuple(Problem(task.shown_as, cause, task.remedy) for cause in causes)
+    return tuple(Problem(task.label, cause, task.remedy) for cause in causes)
 
 
 def _cause(error: OpenVimaError, path: Path) -> str:
-    """The message of a reader's error without what a problem says besides: file, record and remedy."""
+    """Return a reader's error message without file, record and remedy, which a problem adds."""
     text = str(error).removesuffix(f" {remedy(path.parent)}").removesuffix(".")
     return re.sub(rf"^{re.escape(str(path))}(, record \d+)?: (record \d+ of \d+ is )?", "", text)
 
 
 def _byte_faults(task: ShardTask) -> Iterator[str]:
-    """Yield what is wrong with the bytes, and where."""
+    """Yield damage of the bytes, with its place."""
     if not task.path.is_file():
         yield "it is missing"
         return
@@ -119,7 +119,7 @@ def _byte_faults(task: ShardTask) -> Iterator[str]:
 def _record_faults(
     task: ShardTask, shard: Shard, count: Callable[[int], None]
 ) -> Iterator[tuple[int, str, bool]]:
-    """Yield row, what is wrong, and whether damaged bytes are the reason."""
+    """Yield row, fault, and whether damaged bytes are the cause."""
     keys = shard.table(_KEY_COLUMNS).to_pylist()
     for row, key in enumerate(keys):
         try:
@@ -127,10 +127,10 @@ def _record_faults(
         except ShardError as error:
             yield row, _cause(error, shard.path), shard.info.images
             continue
-        except OpenVimaError as error:  # the pack of which its images would be drawn is not there
-            yield row, f"its images cannot be drawn: {error}", False
+        except OpenVimaError as error:  # the asset pack that its images need is not there
+            yield row, f"its images cannot be rendered: {error}", False
             continue
-        # Images that were drawn anew have been compared already.
+        # Rendered images were compared on reading.
         if shard.info.images and demo.content_hash() != key["content_hash"]:
             yield row, "its content hash is not that of its content", True
         if demo.num_steps != key["steps"]:
@@ -146,7 +146,7 @@ def _record_faults(
 
 
 def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
-    """Yield where a generated shard contradicts the manifest."""
+    """Yield contradictions between a generated shard and the manifest."""
     for name in ("level", "domain", "assets", "compat", "difficulty", "compression", "images"):
         if name in task.config and getattr(info, name) != task.config[name]:
             yield f"{name} is {getattr(info, name)}, in the manifest {task.config[name]}"
@@ -157,7 +157,7 @@ def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
 
 
 def _summary_faults(task: ShardTask, summary: ShardSummary) -> Iterator[str]:
-    """Yield where manifest and index say other things than the shard."""
+    """Yield contradictions of manifest and index with the shard."""
     if task.entry is not None and summary.entry != task.entry:
         names = [key for key, value in summary.entry.items() if task.entry.get(key) != value]
         yield f"the manifest says otherwise of its {', '.join(names) or 'entries'}"
