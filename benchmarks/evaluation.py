@@ -110,7 +110,7 @@ def play_batches(policy: NetworkPolicy, num_envs: int, first_seed: int) -> list[
 def play_one(policy: NetworkPolicy, batch: Batch) -> Sequence[EpisodeOutcome]:
     """Play a batch as a worker process does."""
     batch = pickle.loads(pickle.dumps(Job(batch, ""))).batch
-    envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+    envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
     return pickle.loads(pickle.dumps(tuple(play(envs, batch.seeds, PromptedRolloutPolicy(policy)))))
 
 

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env import EnvConfig
-from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
+from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv, VideoFrame
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.config import Batch
 from openvima.evaluation.results import EpisodeOutcome
@@ -111,9 +111,9 @@ def play_shown(player: RolloutPolicy, wanted: Wanted, *, first_seed: int, width:
     seeds = [wanted.seed] if wanted.seed is not None else range(first_seed, first_seed + MAX_TRIES)
     for seed in seeds:
         env.reset(seed=seed)
-        frames = [Frame(env.scene, HOME)]
+        frames = [VideoFrame(env.scene, HOME)]
 
-        def record(env: TabletopEnv, frames: list[Frame] = frames) -> None:
+        def record(env: TabletopEnv, frames: list[VideoFrame] = frames) -> None:
             frames += env.frames
 
         (outcome,) = play([env], [seed], player, after_step=record)
@@ -292,7 +292,7 @@ def main() -> None:
             first.level,
             first_seed=0,
             episodes=1,
-            setup=EnvConfig(),
+            env_config=EnvConfig(),
         )
         player = load_rollout_policy(batch)
         played = [play_shown(player, entry, first_seed=options.seed, width=width) for entry in wanted]

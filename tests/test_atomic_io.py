@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from openvima.atomic_io import atomic_folder, remove_abandoned, restore_folder
+from openvima.atomic_io import atomic_folder, remove_stale, restore_folder
 
 KILLED = 9
 # Writes a folder and dies at the n-th time that a folder is to be renamed or deleted.
@@ -105,5 +105,5 @@ def test_files_of_processes_that_still_run_are_not_abandoned(tmp_path: Path) -> 
     names = [f".a.arrow.{os.getpid()}.tmp", f".b.arrow.{gone.pid}.tmp", ".c.tmp", f".d.{10**30}.tmp"]
     for name in names:
         (tmp_path / name).touch()
-    remove_abandoned(tmp_path)
+    remove_stale(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {names[0], names[2]}

@@ -12,7 +12,7 @@ import pytest
 
 import worker_jobs
 from openvima.errors import ConfigError, SceneError, WorkerError
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 30) -> None:
@@ -35,7 +35,7 @@ def test_all_jobs_run_on_one_thread_each(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     counts = []
     paths = [tmp_path / str(k) for k in range(3)]
-    list(in_processes(worker_jobs.write_number, paths, 2, report=counts.append))
+    list(imap_unordered(worker_jobs.write_number, paths, 2, report=counts.append))
     assert [path.read_text() for path in paths] == ["1"] * 3
     assert counts[-1] == 9
     assert os.environ["OMP_NUM_THREADS"] == "7"
@@ -43,28 +43,28 @@ def test_all_jobs_run_on_one_thread_each(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_an_error_of_a_job_reaches_the_caller() -> None:
     with pytest.raises(SceneError, match="job 1 fails"):
-        list(in_processes(worker_jobs.fail, [0, 1, 2], 2, report=lambda count: None))
+        list(imap_unordered(worker_jobs.fail, [0, 1, 2], 2, report=lambda count: None))
 
 
 def test_a_killed_worker_is_reported() -> None:
     with pytest.raises(WorkerError, match="was killed"):
-        list(in_processes(worker_jobs.die, [0, 1, 2], 2, report=lambda count: None))
+        list(imap_unordered(worker_jobs.die, [0, 1, 2], 2, report=lambda count: None))
 
 
 def test_one_worker_counts_over_all_items(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     counts = []
-    list(in_processes(worker_jobs.write_number, [tmp_path / "a", tmp_path / "b"], 1, report=counts.append))
+    list(imap_unordered(worker_jobs.write_number, [tmp_path / "a", tmp_path / "b"], 1, report=counts.append))
     assert counts == [3, 6]
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     paths = [tmp_path / "a", tmp_path / "b"]
     code = (
-        "import sys, pathlib, worker_jobs; from openvima.multiprocess import in_processes\n"
+        "import sys, pathlib, worker_jobs; from openvima.multiprocess import imap_unordered\n"
         "if __name__ == '__main__':\n"
         "    paths = [pathlib.Path(p) for p in sys.argv[1:]]\n"
-        "    list(in_processes(worker_jobs.note_pid_and_hang, paths, 2))\n"
+        "    list(imap_unordered(worker_jobs.note_pid_and_hang, paths, 2))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(code)
@@ -86,4 +86,4 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("num_workers", [0, -1, 5000])
 def test_a_number_of_workers_that_cannot_be_is_refused(num_workers: int) -> None:
     with pytest.raises(ConfigError, match=rf"workers is {num_workers}; it must lie within 1 … 1024\."):
-        list(in_processes(worker_jobs.write_number, [], num_workers))
+        list(imap_unordered(worker_jobs.write_number, [], num_workers))

@@ -90,7 +90,7 @@ def restore_folder(path: Path) -> None:
         os.replace(aside, path)
 
 
-def remove_abandoned(folder: Path) -> None:
+def remove_stale(folder: Path) -> None:
     """Delete what writers have left in a folder that were killed; those that still run keep their files.
 
     Where the system does not tell which processes run, nothing is deleted.

@@ -32,7 +32,7 @@ class Job(Protocol):
         """Do it."""
 
 
-def in_processes(
+def imap_unordered(
     job: Job, items: Sequence[Any], num_workers: int, *, report: Callable[[int], None] | None = None
 ) -> Iterator[tuple[Any, Any]]:
     """Apply a job to every item.
@@ -52,10 +52,10 @@ def in_processes(
         Exception: Whatever a job raised; the other jobs are stopped.
     """
     watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
-    yield from in_watched_processes(job, items, num_workers, watch=watch)
+    yield from imap_with_progress(job, items, num_workers, watch=watch)
 
 
-def in_watched_processes(
+def imap_with_progress(
     job: Job,
     items: Sequence[Any],
     num_workers: int,
@@ -66,9 +66,9 @@ def in_watched_processes(
     """Apply a job to every item, and follow each of them.
 
     Args:
-        job: As for `in_processes`; it calls `count` with `num_counts` numbers.
-        items: As for `in_processes`.
-        num_workers: As for `in_processes`.
+        job: As for `imap_unordered`; it calls `count` with `num_counts` numbers.
+        items: As for `imap_unordered`.
+        num_workers: As for `imap_unordered`.
         num_counts: Numbers that a job tells.
         watch: Called now and then with the numbers of all jobs, in the order of the items.
 
@@ -89,7 +89,7 @@ def in_watched_processes(
     # One row a job: no lock that a killed worker could keep.
     counters = context.RawArray("q", len(items) * num_counts)
     others = set(multiprocessing.active_children())
-    with one_thread_each():
+    with single_threaded_workers():
         pool = ProcessPoolExecutor(
             min(num_workers, len(items)), mp_context=context, initializer=_start_worker, initargs=(counters,)
         )
@@ -139,7 +139,7 @@ def _one_after_the_other(
 
 
 @contextlib.contextmanager
-def one_thread_each() -> Iterator[None]:
+def single_threaded_workers() -> Iterator[None]:
     """Let processes that start inside the block use one thread each; it is read before our code is."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
@@ -154,7 +154,7 @@ def one_thread_each() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
+def defer_sigint() -> Iterator[None]:
     """Put off Ctrl-C until the end of the block; processes that start inside never receive it.
 
     It reaches every process of a terminal at once, so a worker that is still importing would print a
@@ -180,13 +180,13 @@ def interrupts_held() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def become_worker() -> None:
+def init_worker() -> None:
     """Make this process a worker: it leaves Ctrl-C to its parent, and ends when the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=end_with_parent, args=(None,), daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(None,), daemon=True).start()
 
 
-def end_with_parent(patience_s: float | None = PARENT_END_S) -> None:
+def exit_with_parent(patience_s: float | None = PARENT_END_S) -> None:
     """End this worker at once when its parent has ended.
 
     Args:
@@ -201,7 +201,7 @@ def end_with_parent(patience_s: float | None = PARENT_END_S) -> None:
 def _start_worker(counters: Any) -> None:  # Any: see `_counters`
     global _counters
     _counters = counters
-    become_worker()
+    init_worker()
 
 
 def _run_one(job: Job, item: Any, slot: int, num_counts: int) -> Any:  # Any: see `Job`

@@ -22,7 +22,7 @@ OBJECT_STORE_BYTES = 100 * 2**20  # by default Ray takes 30 % of the memory; res
 AUTO = "auto"  # the cluster that this machine belongs to
 
 
-def on_cluster(
+def ray_imap_unordered(
     job: Job,
     items: Sequence[Any],
     num_workers: int | None,

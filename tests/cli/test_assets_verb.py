@@ -30,7 +30,7 @@ def import_small_pack(tmp_path, monkeypatch, *, damaged: bool = False) -> int:
 
 
 def test_a_gallery_prints_its_page(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(gallery, "draw_portrait", lambda *_, **__: np.zeros((1, 1, 4), np.uint8))
+    monkeypatch.setattr(gallery, "draw_thumbnail", lambda *_, **__: np.zeros((1, 1, 4), np.uint8))
     assert main(["assets", "gallery", "--out", str(tmp_path / "gallery")]) == 0
     page = tmp_path / "gallery" / "index.html"
     assert capsys.readouterr().out.strip() == str(page)

@@ -11,7 +11,7 @@ import worker_jobs
 from openvima.data import GenerateConfig, GenerationProgress, generate, plan
 from openvima.data.resuming import is_finished
 from openvima.errors import ConfigError, MissingExtraError, SceneError, WorkerError
-from openvima.ray_backend import on_cluster
+from openvima.ray_backend import ray_imap_unordered
 from small_data_sets import contents
 from small_generations import config
 
@@ -79,7 +79,9 @@ def test_jobs_on_ray_use_one_thread_each(
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     counts = []
     paths = [tmp_path / str(k) for k in range(3)]
-    done = list(on_cluster(worker_jobs.write_number, paths, 2, watch=lambda rows: counts.append(list(rows))))
+    done = list(
+        ray_imap_unordered(worker_jobs.write_number, paths, 2, watch=lambda rows: counts.append(list(rows)))
+    )
     assert sorted(item for item, _ in done) == paths
     assert [path.read_text() for path in paths] == ["1"] * 3
     assert counts[-1] == [(3,), (3,), (3,)]
@@ -87,12 +89,12 @@ def test_jobs_on_ray_use_one_thread_each(
 
 def test_an_error_of_a_job_on_ray_reaches_the_caller(ray: ModuleType) -> None:
     with pytest.raises(SceneError, match=r"^job 1 fails$"):
-        list(on_cluster(worker_jobs.fail, [0, 1, 2], 2))
+        list(ray_imap_unordered(worker_jobs.fail, [0, 1, 2], 2))
 
 
 def test_a_killed_worker_of_ray_is_reported(ray: ModuleType) -> None:
     with pytest.raises(WorkerError, match=r"worker of the Ray cluster died.*same command continues"):
-        list(on_cluster(worker_jobs.die, [0, 1, 2], 2))
+        list(ray_imap_unordered(worker_jobs.die, [0, 1, 2], 2))
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,7 +114,7 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_cluster_that_does_not_answer_is_named(address: str, message: str) -> None:
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=message):
-        list(on_cluster(worker_jobs.fail, [0], None, address=address))
+        list(ray_imap_unordered(worker_jobs.fail, [0], None, address=address))
 
 
 def test_ranges_of_shards_in_any_order_make_the_same_data_set(whole: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, ShardError
 
 
-def info_of(demo: Demonstration, setup: EnvConfig) -> ShardInfo:
+def info_of(demo: Demonstration, env_config: EnvConfig) -> ShardInfo:
     return ShardInfo(
         demo.task,
         demo.level,
@@ -24,8 +24,8 @@ def info_of(demo: Demonstration, setup: EnvConfig) -> ShardInfo:
         first_seed=0,
         assets=demo.assets,
         versions=demo.versions,
-        compat=setup.compat,
-        difficulty=setup.difficulty,
+        compat=env_config.compat,
+        difficulty=env_config.difficulty,
         images=False,
     )
 
@@ -42,7 +42,7 @@ def recorded() -> Demonstration:
 
 
 @pytest.mark.parametrize(
-    ("task", "level", "setup"),
+    ("task", "level", "env_config"),
     [
         ("visual_manipulation", "L2", EnvConfig()),
         ("visual_manipulation", "train", EnvConfig(compat=True)),
@@ -56,10 +56,10 @@ def recorded() -> Demonstration:
     ],
 )
 def test_redrawn_images_are_those_of_the_environment(
-    tmp_path: Path, task: str, level: str, setup: EnvConfig
+    tmp_path: Path, task: str, level: str, env_config: EnvConfig
 ) -> None:
-    demo = rollout_oracle(setup.make(task, level, domain="train"), 3)
-    shard = stored(tmp_path / "a.arrow", demo, info_of(demo, setup))
+    demo = rollout_oracle(env_config.make(task, level, domain="train"), 3)
+    shard = stored(tmp_path / "a.arrow", demo, info_of(demo, env_config))
     read = shard[0]
     for view in ("front", "top"):
         assert read.rgb[view].shape == demo.rgb[view].shape

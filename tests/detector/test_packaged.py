@@ -7,7 +7,7 @@ pytest.importorskip("torch")
 
 from openvima.detector import load_extractor
 from openvima.env import TabletopEnv
-from openvima.perception.iou import slots_of_ids
+from openvima.perception.iou import match_ids_to_slots
 from openvima.perception.objects import GROUND_TRUTH
 
 TASKS = ("visual_manipulation", "rearrange", "same_shape", "sweep_without_exceeding")
@@ -28,7 +28,7 @@ def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
         for found, true in pairs:
             shown = true.masks.any(axis=0)
             num_true += int(np.count_nonzero(shown))
-            num_right += len(slots_of_ids(found, true))
+            num_right += len(match_ids_to_slots(found, true))
             num_found += len(found)
     assert num_right >= 0.95 * num_true
     assert num_found <= 1.25 * num_true  # objects that are told in parts, and those that are none

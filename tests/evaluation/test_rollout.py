@@ -26,7 +26,7 @@ class Env:
         self.prompt = RenderedPrompt("Wait.", {})
         self.actions = []
         goals = (SimpleNamespace(object_id=5), SimpleNamespace(object_id=6))
-        problem = SimpleNamespace(goals=goals, oracle_first=(), num_required=None)
+        problem = SimpleNamespace(goals=goals, prerequisites=(), num_required=None)
         self.episode = SimpleNamespace(num_redraws=2, oracle_max_steps=1, problem=problem)
         self.progress = SimpleNamespace(open_goals=(1,))
 

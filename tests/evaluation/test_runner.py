@@ -109,5 +109,5 @@ def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
 
 def test_an_unknown_asset_pack_is_named_before_anything_is_written(tmp_path):
     with pytest.raises(AssetError, match="nosuch"):
-        evaluate(replace(ORACLE, out=tmp_path / "out", setup=EnvConfig(assets="nosuch")))
+        evaluate(replace(ORACLE, out=tmp_path / "out", env_config=EnvConfig(assets="nosuch")))
     assert not (tmp_path / "out").exists()

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.cli import quickstart  # noqa: E402
 from openvima.cli.main import main  # noqa: E402
-from openvima.env.config import DEFAULT_SETUP  # noqa: E402
+from openvima.env.config import DEFAULT_ENV_CONFIG  # noqa: E402
 from openvima.errors import CheckpointError, PolicyError, UnknownPolicyError  # noqa: E402
 from openvima.evaluation import Results  # noqa: E402
 from openvima.evaluation.config import Batch  # noqa: E402
@@ -183,6 +183,6 @@ def test_the_weights_of_the_package_solve_tasks_with_novel_objects() -> None:
     assert sum(parameter.numel() for parameter in policy.network.parameters()) <= 10_000_000
     solved = []
     for task in ("visual_manipulation", "rotate", "rearrange"):
-        envs = [DEFAULT_SETUP.make(task, "L3", domain="user") for _ in range(4)]
+        envs = [DEFAULT_ENV_CONFIG.make(task, "L3", domain="user") for _ in range(4)]
         solved += [outcome.success for outcome in play(envs, range(4), PromptedRolloutPolicy(policy))]
     assert sum(solved) >= 9

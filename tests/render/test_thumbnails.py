@@ -12,7 +12,7 @@ from openvima.catalog.procedural import ProceduralAssets
 from openvima.errors import AssetError
 from openvima.render import Rasteriser, gallery
 from openvima.render.gallery import PICTURES, write_gallery
-from openvima.render.thumbnails import draw_portrait
+from openvima.render.thumbnails import draw_thumbnail
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def rasteriser() -> Rasteriser:
 @pytest.mark.parametrize("view", ["front", "top"])
 @pytest.mark.parametrize("name", list(OBJECTS))
 def test_every_object_fills_its_portrait_and_none_is_cut_off(rasteriser, name, view) -> None:
-    opacity = draw_portrait(rasteriser, name, "tiger", view)[..., 3]
+    opacity = draw_thumbnail(rasteriser, name, "tiger", view)[..., 3]
     assert opacity.shape == (240, 320)
     border = np.concatenate([opacity[0], opacity[-1], opacity[:, 0], opacity[:, -1]])
     assert not border.any()
@@ -33,16 +33,16 @@ def test_every_object_fills_its_portrait_and_none_is_cut_off(rasteriser, name, v
 
 
 def test_a_portrait_has_the_lit_colours_of_its_texture(rasteriser) -> None:
-    picture = draw_portrait(rasteriser, "block", "red", "top", detail=2)
+    picture = draw_thumbnail(rasteriser, "block", "red", "top", detail=2)
     assert picture.shape == (480, 640, 4)
     assert picture[240, 320].tolist() == [239, 81, 83, 255]  # 0.93967 of red, as light from above gives
     assert picture[5, 5].tolist() == [0, 0, 0, 0]
 
 
 def test_letters_stand_upright_and_a_hole_is_transparent(rasteriser) -> None:
-    letter = draw_portrait(rasteriser, "letter A", "blue", "top")[..., 3]
+    letter = draw_thumbnail(rasteriser, "letter A", "blue", "top")[..., 3]
     assert letter[:80].astype(bool).sum() < letter[160:].astype(bool).sum()  # narrow above, wide below
-    assert draw_portrait(rasteriser, "ring", "blue", "top")[120, 160, 3] == 0
+    assert draw_thumbnail(rasteriser, "ring", "blue", "top")[120, 160, 3] == 0
 
 
 class _Incomplete(ProceduralAssets):
@@ -68,7 +68,7 @@ def quick_portraits(monkeypatch: pytest.MonkeyPatch) -> None:
         rasteriser.assets.texture(texture_name)
         return np.zeros((1, 1, 4), np.uint8)
 
-    monkeypatch.setattr(gallery, "draw_portrait", one_pixel)
+    monkeypatch.setattr(gallery, "draw_thumbnail", one_pixel)
 
 
 def test_the_page_names_every_object_and_texture_and_all_its_pictures_exist(

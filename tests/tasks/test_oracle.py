@@ -9,7 +9,7 @@ from openvima.catalog import Assets
 from openvima.errors import OracleError
 from openvima.render.labels import label_raster
 from openvima.scene import Action, AtPose, Placement, Pose, Problem, Scene, angle_difference
-from openvima.tasks import Progress, begin, list_tasks, oracle_action, sample_episode, stream, task_spec
+from openvima.tasks import Progress, begin, list_tasks, make_rng, oracle_action, sample_episode, task_spec
 from openvima.tasks.oracle import visible_point
 
 RNG = np.random.default_rng(0)
@@ -56,10 +56,10 @@ def test_a_hidden_object_is_an_error_that_names_it(assets: Assets) -> None:
 def test_decisions_are_deterministic_and_draw_nothing(task: str, assets: Assets) -> None:
     for seed in range(10):
         problem = sample_episode(task, seed=seed).problem
-        rngs = [stream("user", task, "train", number, "oracle") for number in (1, 2)]
+        rngs = [make_rng("user", task, "train", number, "oracle") for number in (1, 2)]
         first, second = (decide(problem, assets, rng=rng) for rng in rngs)
         assert first == second
-        assert rngs[0].bit_generator.state == stream("user", task, "train", 1, "oracle").bit_generator.state
+        assert rngs[0].bit_generator.state == make_rng("user", task, "train", 1, "oracle").bit_generator.state
 
 
 @pytest.mark.parametrize("task", list_tasks())

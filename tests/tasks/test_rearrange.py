@@ -6,7 +6,7 @@ from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, Assets, pool
 from openvima.errors import ConfigError, OracleError
 from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, Problem
-from openvima.tasks import advance, begin, oracle_action, sample_episode, stream, task_spec
+from openvima.tasks import advance, begin, make_rng, oracle_action, sample_episode, task_spec
 from openvima.tasks.table import is_in_the_way
 from playing import judged, pictured
 
@@ -57,9 +57,9 @@ def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
         has_distractor = distractor_of(problem) is not None
         assert has_distractor is (len(problem.goals) == 1)
         assert len(problem.scene.placements) == len(problem.goals) + has_distractor
-    single = (bool(p.oracle_first) for p in problems if len(p.goals) == 1)
+    single = (bool(p.prerequisites) for p in problems if len(p.goals) == 1)
     assert_frequencies(single, {True: 0.5, False: 0.5})
-    assert not any(p.oracle_first for p in problems if len(p.goals) > 1)
+    assert not any(p.prerequisites for p in problems if len(p.goals) > 1)
 
 
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
@@ -97,7 +97,7 @@ def test_nothing_starts_in_the_way_of_a_target(problems: list[Problem]) -> None:
         for own, target in goals:
             at_target = own.at(target)
             standing = [placement for placement, _ in goals]
-            if taken is not None and not problem.oracle_first:
+            if taken is not None and not problem.prerequisites:
                 standing.append(taken)
             for placement in standing:
                 assert not is_in_the_way(placement, at_target)
@@ -111,13 +111,13 @@ def test_a_distractor_in_the_way_stands_exactly_on_the_target_at_its_own_height(
 ) -> None:
     for problem in problems:
         distractor = distractor_of(problem)
-        if distractor is None or not problem.oracle_first:
+        if distractor is None or not problem.prerequisites:
             continue
         ((own, target),) = moves(problem)
         assert distractor.pose.position[:2] == target.position[:2]
         assert distractor.pose.quaternion == target.quaternion
         assert distractor.pose.z == assets.geometry(distractor.object, distractor.size).rest_z_m
-        (parking,) = problem.oracle_first
+        (parking,) = problem.prerequisites
         assert parking.object_id == distractor.id
         parked = distractor.at(parking.target)
         assert not is_in_the_way(parked, own.at(target))
@@ -163,7 +163,7 @@ def test_objects_may_be_moved_in_any_order_and_stay_done() -> None:
 def test_a_parked_distractor_leaves_the_target_to_the_object(conflict: Problem) -> None:
     ((own, target),), (_, distractor) = moves(conflict), ids(conflict)
     inward = 1.0 if target.y < 0 else -1.0
-    for parked in (conflict.oracle_first[0].target, target.moved(dy=0.101 * inward), FAR_AWAY):
+    for parked in (conflict.prerequisites[0].target, target.moved(dy=0.101 * inward), FAR_AWAY):
         assert judged(conflict, {distractor: parked}, {own.id: target})[1].success
 
 
@@ -215,7 +215,7 @@ def test_the_oracle_needs_a_step_an_object_and_one_to_clear_the_target(
 ) -> None:
     problem = sample_episode(TASK, seed=5, **options).problem
     rng, scene, progress, outcome = (
-        stream("user", TASK, "train", 5, "oracle"),
+        make_rng("user", TASK, "train", 5, "oracle"),
         problem.scene,
         begin(problem),
         0,
@@ -223,11 +223,11 @@ def test_the_oracle_needs_a_step_an_object_and_one_to_clear_the_target(
     picked = []
     for _ in range(num_steps):
         picked.append(oracle_action(problem, progress, scene, assets=assets, rng=rng).pick_id)
-        wanted = [g for g in (*problem.oracle_first, *problem.goals) if isinstance(g, AtPose)]
+        wanted = [g for g in (*problem.prerequisites, *problem.goals) if isinstance(g, AtPose)]
         scene = scene.with_poses({g.object_id: g.target for g in wanted if g.object_id == picked[-1]})
         progress, outcome = advance(problem, progress, scene)
     assert outcome.success
-    assert picked == [g.object_id for g in (*problem.oracle_first, *problem.goals)]
+    assert picked == [g.object_id for g in (*problem.prerequisites, *problem.goals)]
     with pytest.raises(OracleError, match="nothing left to do"):
         oracle_action(problem, progress, scene, assets=assets, rng=rng)
 

@@ -44,7 +44,7 @@ def test_scenes_are_those_of_rearrange(assets: Assets) -> None:
         )
         assert first.scene == second.scene and list(first.goals) == goals_of(second)[0]
         assert first.prompt.images == second.prompt.images
-        assert first.oracle_first == second.oracle_first
+        assert first.prerequisites == second.prerequisites
 
 
 def test_the_prompt_is_the_published_sentence() -> None:
@@ -96,14 +96,14 @@ def test_an_object_has_to_come_back_near_its_start(distance: float, success: boo
 
 def test_waiting_at_the_start_restores_nothing() -> None:
     problem, own, target, distractor = single(conflict=True)
-    parked = problem.oracle_first[0].target
+    parked = problem.prerequisites[0].target
     assert judged(problem, {distractor.id: parked}, {}, {own.id: target}) == (Progress((1,)), Outcome())
 
 
 def test_a_parked_distractor_is_left_where_it_is() -> None:
     problem, own, target, distractor = single(conflict=True)
     park, arrange, restore = (
-        {distractor.id: problem.oracle_first[0].target},
+        {distractor.id: problem.prerequisites[0].target},
         {own.id: target},
         {own.id: own.pose},
     )
@@ -145,8 +145,8 @@ def test_distractors_start_and_park_away_from_targets_and_starts() -> None:
         (arrange,), (restore,) = goals_of(problem)
         (other,) = (p for p in problem.scene.placements if p.id != arrange.object_id)
         assert other.pose.planar_distance(restore.target) >= 0.1
-        if problem.oracle_first:
-            parking = problem.oracle_first[0].target
+        if problem.prerequisites:
+            parking = problem.prerequisites[0].target
             assert min(parking.planar_distance(goal.target) for goal in problem.goals) >= 0.1
         else:
             assert other.pose.planar_distance(arrange.target) >= 0.1
@@ -154,7 +154,7 @@ def test_distractors_start_and_park_away_from_targets_and_starts() -> None:
 
 def test_the_distractor_can_be_asked_back_too() -> None:
     problem, own, target, distractor = single(conflict=True, restore_distractor=True)
-    park = {distractor.id: problem.oracle_first[0].target}
+    park = {distractor.id: problem.prerequisites[0].target}
     arrange, restore, back = {own.id: target}, {own.id: own.pose}, {distractor.id: distractor.pose}
     assert judged(problem, park, arrange, restore)[1] == Outcome()
     assert judged(problem, park, arrange, restore, back)[1].success
@@ -203,7 +203,7 @@ def test_the_oracle_takes_the_shortest_way(
         decision = oracle_action(problem, progress, scene, assets=assets, rng=rng)
         waiting = [problem.goals[index] for index in progress.open_goals]
         goal = next(
-            g for g in (*problem.oracle_first, *waiting) if not g.is_met(scene) and isinstance(g, AtPose)
+            g for g in (*problem.prerequisites, *waiting) if not g.is_met(scene) and isinstance(g, AtPose)
         )
         assert decision.pick_id == goal.object_id
         scene = scene.with_poses({goal.object_id: goal.target})

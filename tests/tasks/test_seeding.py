@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 
 from openvima.errors import ConfigError
-from openvima.tasks import DOMAINS, stream
+from openvima.tasks import DOMAINS, make_rng
 from strategies import seeds
 
 
 def first_draw(*key: object, attempt: int = 0) -> int:
-    return int(stream(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]  # keys are built below
+    return int(make_rng(*key, attempt=attempt).integers(2**63))  # type: ignore[arg-type]  # keys are built below
 
 
 @given(seeds)
@@ -38,7 +38,8 @@ def test_large_seeds_do_not_wrap_onto_small_ones() -> None:
 
 def test_names_hash_alike_in_another_process() -> None:
     code = (
-        "from openvima.tasks import stream; print(stream('eval', 'rotate', 'L2', 7, 'scene').integers(2**63))"
+        "from openvima.tasks import make_rng; "
+        "print(make_rng('eval', 'rotate', 'L2', 7, 'scene').integers(2**63))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(result.stdout) == first_draw("eval", "rotate", "L2", 7, "scene")

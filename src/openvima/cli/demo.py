@@ -55,7 +55,7 @@ def main(
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
 
-    setup = EnvConfig(assets, compat, difficulty)
+    env_config = EnvConfig(assets, compat, difficulty)
     batch = Batch(
         policy,
         policy,
@@ -63,11 +63,11 @@ def main(
         level,
         first_seed=seed,
         episodes=1,
-        setup=setup,
+        env_config=env_config,
         device=device,
         boxes=boxes or "",
     )
-    env = setup.make(task, level, domain="user", realtime=True)
+    env = env_config.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
     outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from openvima.cli.lists import parse_list
 from openvima.cli.progress import progress_bar
-from openvima.cli.words import words_in
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -98,24 +98,24 @@ def main(
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
     config = EvaluationConfig(
-        policies=words_in(policy),
-        tasks=held_out_tasks(words_in(levels)) if in_context and tasks == "all" else words_in(tasks),
-        levels=words_in(levels),
+        policies=parse_list(policy),
+        tasks=held_out_tasks(parse_list(levels)) if in_context and tasks == "all" else parse_list(tasks),
+        levels=parse_list(levels),
         episodes=episodes,
         seed=seed,
         workers=workers,
         out=out,
-        setup=EnvConfig(assets, compat, difficulty),
+        env_config=EnvConfig(assets, compat, difficulty),
         batch=batch,
         force=force,
         device=device,
         precision=precision,
-        ablations=_with_boxes(words_in(ablations), boxes),
+        ablations=_with_boxes(parse_list(ablations), boxes),
         boxes=boxes,
         engine=engine,
         address=address,
     )
-    selection = VideoSelection(videos, words_in(record_video))
+    selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
         raise ConfigError("--record-video needs the report; drop --no-report.")
     with progress_bar("evaluation") as bar:

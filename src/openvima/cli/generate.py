@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import Literal
 
+from openvima.cli.lists import parse_list
 from openvima.cli.progress import generation_table
-from openvima.cli.words import words_in
 from openvima.errors import ConfigError
 
 
@@ -69,12 +69,12 @@ def main(
 
     config = GenerateConfig(
         out=out,
-        tasks=words_in(tasks),
+        tasks=parse_list(tasks),
         episodes=episodes,
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        setup=EnvConfig(assets, compat, difficulty),
+        env_config=EnvConfig(assets, compat, difficulty),
         compression=compression,
         images=images,
         keep_failed=keep_failed,

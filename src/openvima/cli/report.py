@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openvima.cli.words import words_in
+from openvima.cli.lists import parse_list
 
 if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison
@@ -120,7 +120,7 @@ def _pairs(names: str) -> list[tuple[str, str]]:
     """Pair the first name with each of the others."""
     from openvima.errors import ConfigError
 
-    first, *others = words_in(names) or ("",)
+    first, *others = parse_list(names) or ("",)
     if not others:
         raise ConfigError(f"--compare is {names!r}; give two or more policies with commas in between.")
     return [(first, other) for other in others]

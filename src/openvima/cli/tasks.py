@@ -100,5 +100,5 @@ def _write_gallery(folder: Path, assets: str) -> int:
     from openvima.report.task_gallery import save_task_gallery
 
     with progress_bar("tasks") as report:
-        print(save_task_gallery(folder, setup=EnvConfig(assets), report=report))
+        print(save_task_gallery(folder, env_config=EnvConfig(assets), report=report))
     return 0

@@ -17,7 +17,7 @@ from openvima.data.resuming import (
     storage_error,
 )
 from openvima.errors import ConfigError, DatasetError
-from openvima.multiprocess import Counts, in_watched_processes
+from openvima.multiprocess import Counts, imap_with_progress
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
@@ -93,11 +93,11 @@ def _engine(
 ) -> Iterator[tuple[Block, None]]:
     if config.engine == "processes":
         num_workers = config.workers or 1
-        return in_watched_processes(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
-    from openvima.ray_backend import on_cluster
+        return imap_with_progress(write_block, missing, num_workers, num_counts=NUM_COUNTS, watch=watch)
+    from openvima.ray_backend import ray_imap_unordered
 
     num_workers = config.workers or (1 if config.address is None else None)
-    return on_cluster(
+    return ray_imap_unordered(
         write_block, missing, num_workers, address=config.address, num_counts=NUM_COUNTS, watch=watch
     )
 

@@ -56,7 +56,7 @@ def trials(block: Block) -> Iterator[Demonstration | Skipped]:
     Raises:
         OracleError: The seeds ran out.
     """
-    env = _env(block.info.task, block.info.level, block.setup)
+    env = _env(block.info.task, block.info.level, block.env_config)
     num_solved, reason = 0, ""
     for seed in block.seeds:
         trial = attempt(env, seed)
@@ -90,5 +90,5 @@ def why_skipped(demo: Demonstration) -> Skipped:
 
 
 @lru_cache(maxsize=4)
-def _env(task: str, level: str, setup: EnvConfig) -> TabletopEnv:
-    return setup.make(task, level, domain=DOMAIN)
+def _env(task: str, level: str, env_config: EnvConfig) -> TabletopEnv:
+    return env_config.make(task, level, domain=DOMAIN)

@@ -16,7 +16,7 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.env.config import DEFAULT_SETUP, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
@@ -51,7 +51,7 @@ class GenerateConfig:
         level: "train" or "L1" to "L4".
         start_seed: First seed.
         shard_size: Episodes in a file; None lets files grow with their number, from 4 episodes to 1,000.
-        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         compression: Codec of the files: "lz4", or "zstd", which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
         keep_failed: Keep the episodes that the oracle did not solve too, in the folder's `failed`.
@@ -72,7 +72,7 @@ class GenerateConfig:
     level: str = "train"
     start_seed: int = 0
     shard_size: int | None = None
-    setup: EnvConfig = DEFAULT_SETUP
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
     compression: Compression = "lz4"
     images: bool = True
     keep_failed: bool = False
@@ -138,7 +138,7 @@ class GenerateConfig:
             "shard_size": self.shard_size or 0,
             "compression": self.compression,
             "images": self.images,
-            **self.setup.record(),
+            **self.env_config.record(),
         }
 
     @staticmethod
@@ -157,7 +157,7 @@ class GenerateConfig:
             settings: dict[str, Any] = {
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
-                "setup": EnvConfig(record["assets"], record["compat"], record["difficulty"]),
+                "env_config": EnvConfig(record["assets"], record["compat"], record["difficulty"]),
                 **{name: record[name] for name in ("level", "episodes", "start_seed")},
                 **{name: record[name] for name in ("compression", "images")},
             }
@@ -175,7 +175,7 @@ class Block:
         info: What all its rows have in common.
         episodes: Number of successful episodes.
         seeds: Seeds to try, in order.
-        setup: As in `GenerateConfig`.
+        env_config: As in `GenerateConfig`.
         failed_path: File for the episodes that the oracle did not solve; None throws them away.
     """
 
@@ -183,7 +183,7 @@ class Block:
     info: ShardInfo
     episodes: int
     seeds: range
-    setup: EnvConfig
+    env_config: EnvConfig
     failed_path: Path | None = None
 
 
@@ -196,7 +196,7 @@ def plan(config: GenerateConfig) -> list[Block]:
     Returns:
         One block a shard, by task and number. They depend on what is asked for, not on who does it.
     """
-    versions, assets = package_versions(), load_assets(config.setup.assets).name
+    versions, assets = package_versions(), load_assets(config.env_config.assets).name
     blocks = []
     for task in config.resolved_tasks():
         for number, episodes, seeds in _division(config):
@@ -209,13 +209,15 @@ def plan(config: GenerateConfig) -> list[Block]:
                 first_seed=config.start_seed,
                 assets=assets,
                 versions=versions,
-                compat=config.setup.compat,
-                difficulty=config.setup.difficulty,
+                compat=config.env_config.compat,
+                difficulty=config.env_config.difficulty,
                 compression=config.compression,
                 images=config.images,
             )
             failed = config.out / FAILED_FOLDER / info.file_name if config.keep_failed else None
-            blocks.append(Block(config.out / info.file_name, info, episodes, seeds, config.setup, failed))
+            blocks.append(
+                Block(config.out / info.file_name, info, episodes, seeds, config.env_config, failed)
+            )
     return blocks
 
 

@@ -8,13 +8,21 @@ from openvima.env.registration import make, register_environments
 
 if TYPE_CHECKING:
     from openvima.env.action_validation import stack_actions
-    from openvima.env.tabletop import Frame, TabletopEnv
+    from openvima.env.tabletop import TabletopEnv, VideoFrame
     from openvima.env.vector import make_vec
 
-__all__ = ["EnvConfig", "Frame", "TabletopEnv", "make", "make_vec", "register_environments", "stack_actions"]
+__all__ = [
+    "EnvConfig",
+    "TabletopEnv",
+    "VideoFrame",
+    "make",
+    "make_vec",
+    "register_environments",
+    "stack_actions",
+]
 
 _HOMES = {
-    "Frame": "tabletop",
+    "VideoFrame": "tabletop",
     "TabletopEnv": "tabletop",
     "make_vec": "vector",
     "stack_actions": "action_validation",

@@ -71,4 +71,4 @@ class EnvConfig:
         return words + ([f"--difficulty {self.difficulty}"] if self.difficulty != "easy" else [])
 
 
-DEFAULT_SETUP = EnvConfig()
+DEFAULT_ENV_CONFIG = EnvConfig()

@@ -32,7 +32,7 @@ from openvima.sim.world import World
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
-from openvima.tasks.seeding import checked_seed, stream
+from openvima.tasks.seeding import checked_seed, make_rng
 
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
 FRAMES_PER_SECOND = 30
@@ -40,7 +40,7 @@ _LARGEST_SEED = 2**31  # of the seeds that a reset without one draws
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class VideoFrame:
     """One picture of a film, not rendered yet.
 
     Args:
@@ -64,14 +64,14 @@ class _Run:
     num_steps: int = 0
     grasped: int | None = None
     joint_path: np.ndarray = field(default_factory=lambda: np.zeros((0, 6), np.float32))
-    frames: list[Frame] = field(default_factory=list)
+    frames: list[VideoFrame] = field(default_factory=list)
     prompt: RenderedPrompt | None = None
 
     def watch(self, scene: Scene) -> None:
         self.progress = goals.watch(self.episode.problem, self.progress, scene)
 
     def record(self, scene: Scene, joints: np.ndarray) -> None:
-        self.frames.append(Frame(scene, np.array(joints)))
+        self.frames.append(VideoFrame(scene, np.array(joints)))
 
     def advance(self) -> None:
         self.num_steps += 1
@@ -153,7 +153,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         _check_render_mode(render_mode)
         self.task = task
         self.level = task_spec(task).checked_level(level)
-        stream(domain, task, self.level, 0, purpose="scene")  # refuses an unknown domain
+        make_rng(domain, task, self.level, 0, purpose="scene")  # refuses an unknown domain
         self.domain = domain
         self.assets = load_assets(assets)
         self.compat = compat
@@ -190,7 +190,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         super().reset(seed=seed)
         self._run = None  # should the rest fail, nobody goes on with the episode before
         episode = given or self._sample(seed)
-        rng = stream(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
+        rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
         world = World(episode.problem.scene, self.assets, compat=self.compat)
         self._run = _Run(episode, world, goals.begin(episode.problem), rng)
         return self._observe(), self._info()
@@ -294,7 +294,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         return self._running().joint_path
 
     @property
-    def frames(self) -> tuple[Frame, ...]:
+    def frames(self) -> tuple[VideoFrame, ...]:
         """The film of the last step, 30 frames a second; empty unless `realtime`."""
         return tuple(self._running().frames)
 

@@ -25,7 +25,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 
 from openvima.env.action_validation import ActionValidator
 from openvima.errors import WorkerError
-from openvima.multiprocess import become_worker, end_with_parent, interrupts_held, one_thread_each
+from openvima.multiprocess import defer_sigint, exit_with_parent, init_worker, single_threaded_workers
 
 _PATIENCE_S = 5.0  # for an idle worker to end by itself, and for an error to arrive
 
@@ -45,8 +45,8 @@ class AsyncTabletopEnvs(AsyncVectorEnv):
         self._gate = ActionValidator(len(recipes), autoreset_mode)
         self._starting = contextlib.ExitStack()
         try:
-            with self._starting, one_thread_each():
-                self._starting.enter_context(interrupts_held())
+            with self._starting, single_threaded_workers():
+                self._starting.enter_context(defer_sigint())
                 # Spawned, not forked: a child of a process with threads can inherit locks that nobody opens.
                 super().__init__(
                     [functools.partial(_build, recipe, os.getpid()) for recipe in recipes],
@@ -191,7 +191,7 @@ class _Answering(gymnasium.Wrapper):
         # Gymnasium's worker closes its environment as its last act. If that is because nobody takes its
         # answers any more, the parent has died, and the worker goes without a traceback.
         if isinstance(sys.exc_info()[1], OSError):
-            end_with_parent()
+            exit_with_parent()
         super().close()
 
     def get_wrapper_attr(self, name: str) -> Any:
@@ -212,5 +212,5 @@ def _attempt(function: Any, *args: object, **kwargs: object) -> Any:
 def _build(recipe: Callable[[], gymnasium.Env], parent_pid: int) -> gymnasium.Env:
     """Build a sub-environment in a worker; Gymnasium also builds one in the parent, to learn its spaces."""
     if os.getpid() != parent_pid:
-        become_worker()
+        init_worker()
     return _Answering(recipe())

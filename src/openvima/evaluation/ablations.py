@@ -31,7 +31,7 @@ from openvima.policies.tokenizer import word_ids
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import ObjectRecord, Prompt, PromptImage, RenderedPrompt
 from openvima.tasks.sampling import sample_episode
-from openvima.tasks.seeding import stream
+from openvima.tasks.seeding import make_rng
 
 NO_PROMPT = "no_prompt"
 OTHER_PROMPT_IMAGES = "other_prompt_images"
@@ -84,7 +84,7 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
     if ablation in ("", DETECTED_BOXES):
         return AblatedInput(env.prompt)
     episode = env.episode
-    rng = stream(episode.domain, episode.task, episode.level, episode.seed, f"control {ablation}")
+    rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, f"control {ablation}")
     if ablation == OTHER_PROMPT_IMAGES:
         return AblatedInput(_with_images_of_another(env, rng))
     if ablation == SCRAMBLED_WORDS:

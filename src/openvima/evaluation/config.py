@@ -13,7 +13,7 @@ from typing import Literal
 
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
-from openvima.env.config import DEFAULT_SETUP, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, IN_CONTEXT
 from openvima.evaluation.results import EpisodeOutcome, Row
@@ -46,7 +46,7 @@ class EvaluationConfig:
         workers: Processes; the results do not depend on their number. None means one, or as many as the Ray
             cluster at `address` has processors.
         out: Folder to write to.
-        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         batch: Episodes that are played together, so that a policy decides for all of them at once.
         force: Overwrite results of another evaluation in `out`.
         device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
@@ -74,7 +74,7 @@ class EvaluationConfig:
     seed: int = 0
     workers: int | None = None
     out: Path = Path("evaluation")
-    setup: EnvConfig = DEFAULT_SETUP
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
     batch: int = DEFAULT_BATCH
     force: bool = False
     device: str = DEFAULT_DEVICE
@@ -156,7 +156,7 @@ class EvaluationConfig:
             "seed": self.seed,
             "domain": "eval",
             "batch": self.batch,
-            **self.setup.record(),
+            **self.env_config.record(),
             **({} if self.device == DEFAULT_DEVICE else {"device": self.device}),
             **({"precision": self.precision} if self.precision else {}),
             **({"ablations": list(self.ablations)} if self.ablations else {}),
@@ -175,7 +175,7 @@ class Batch:
         level: Level of the episodes.
         first_seed: Seed of the first one.
         episodes: How many.
-        setup: As in `EvaluationConfig`.
+        env_config: As in `EvaluationConfig`.
         device: As in `EvaluationConfig`.
         ablation: What is taken from the policy; empty for nothing.
         precision: As in `EvaluationConfig`; empty for the policy's own.
@@ -188,7 +188,7 @@ class Batch:
     level: str
     first_seed: int
     episodes: int
-    setup: EnvConfig = DEFAULT_SETUP
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
     device: str = DEFAULT_DEVICE
     ablation: str = ""
     precision: str = ""
@@ -210,7 +210,7 @@ class Batch:
 
     def with_whole_paths(self) -> "Batch":
         """Return the batch for a process with another working directory."""
-        source, assets, boxes = self.source, self.setup.assets, self.boxes
+        source, assets, boxes = self.source, self.env_config.assets, self.boxes
         is_path = PolicySource(self.policy, source).kind == "run" and source not in PACKAGED
         if is_path and Path(source).exists():
             source = str(Path(source).absolute())
@@ -221,7 +221,7 @@ class Batch:
             boxes = f"{name}={Path(folder).absolute()}"
         elif ".py:" in boxes:
             boxes = str(Path(boxes).absolute())
-        return replace(self, source=source, setup=replace(self.setup, assets=assets), boxes=boxes)
+        return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 
 def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
@@ -277,7 +277,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             level=level,
             first_seed=config.seed + offset,
             episodes=min(config.batch, config.episodes - offset),
-            setup=config.setup,
+            env_config=config.env_config,
             device=config.device,
             ablation=ablation,
             precision=config.precision or "",

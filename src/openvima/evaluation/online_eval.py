@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from openvima.env.config import DEFAULT_SETUP, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies.base import load_policy
@@ -19,13 +19,13 @@ class OnlineEval:
     Args:
         tasks: Names of the tasks.
         episodes: Episodes of each task, at level L1; none of them occurs in training or evaluation.
-        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         device: Where the policy computes.
     """
 
     tasks: tuple[str, ...]
     episodes: int
-    setup: EnvConfig = DEFAULT_SETUP
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
     device: str = "cpu"
 
     def __call__(self, checkpoint: Path) -> dict[str, float]:
@@ -36,6 +36,6 @@ class OnlineEval:
 
     def _rate(self, task: str, policy: object) -> float:
         seeds = range(self.episodes)
-        envs = [self.setup.make(task, ONLINE_EVAL_LEVEL, domain=_DOMAIN) for _ in seeds]
+        envs = [self.env_config.make(task, ONLINE_EVAL_LEVEL, domain=_DOMAIN) for _ in seeds]
         outcomes = play(envs, seeds, PromptedRolloutPolicy(policy))
         return sum(outcome.success for outcome in outcomes) / len(outcomes)

@@ -52,7 +52,7 @@ class _EpisodeSlot:
         if picks and not self.grasped:
             return NOTHING_PICKED, NOTHING_PICKED
         problem = self.env.episode.problem
-        right = {goal.object_id for goal in (*problem.goals, *problem.oracle_first)}
+        right = {goal.object_id for goal in (*problem.goals, *problem.prerequisites)}
         if picks and not self.grasped & right:
             return WRONG_PICKED, WRONG_PICKED
         num_met = len(problem.goals) - len(self.env.progress.open_goals)

@@ -16,7 +16,7 @@ from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
@@ -62,7 +62,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
     if results is None:
-        load_assets(config.setup.assets)  # an unfit pack is named before anything is written
+        load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         started = time.perf_counter()
         outcomes = _play_all(config, batches, policies, found, report)
         results = Results(rows_of(batches, outcomes), config.record(), found, policies)
@@ -118,13 +118,13 @@ def _play_all(
 def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tuple[EpisodeOutcome, ...]]]:
     """Play batches with the engine that was asked for; yields them as they finish."""
     if config.engine == "processes":
-        yield from in_processes(play_batch, jobs, config.workers or 1)
+        yield from imap_unordered(play_batch, jobs, config.workers or 1)
         return
-    from openvima.ray_backend import on_cluster
+    from openvima.ray_backend import ray_imap_unordered
 
     sent = {Job(job.batch.with_whole_paths(), job.fingerprint): job for job in jobs}
     workers = config.workers or (1 if config.address is None else None)
-    for job, played in on_cluster(play_batch, list(sent), workers, address=config.address):
+    for job, played in ray_imap_unordered(play_batch, list(sent), workers, address=config.address):
         yield sent[job], played
 
 
@@ -135,7 +135,7 @@ def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, 
     batch = job.batch
     with one_thread(batch):
         player = load_rollout_policy(batch, job.fingerprint)
-        envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+        envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         outcomes = tuple(play(envs, batch.seeds, player))
     count(len(outcomes))
     return outcomes

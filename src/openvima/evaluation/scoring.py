@@ -54,7 +54,7 @@ def score(
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
     for batch in batches:
-        envs = [batch.setup.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
+        envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
         player = load_rollout_policy(batch) if given is None else PromptedRolloutPolicy(given, batch.ablation)
         outcomes[batch] = tuple(play(envs, batch.seeds, player))

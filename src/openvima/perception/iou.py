@@ -4,19 +4,19 @@ import numpy as np
 
 from openvima.perception.objects import ObjectViews
 
-LEAST_OVERLAP = 0.5  # intersection over union, as boxes are commonly called right
+IOU_THRESHOLD = 0.5  # intersection over union, as boxes are commonly called right
 
 
-def overlaps(some: ObjectViews, others: ObjectViews) -> np.ndarray:
+def object_iou(some: ObjectViews, others: ObjectViews) -> np.ndarray:
     """Return how much objects overlap others, shape (objects, others), float64.
 
     That is intersection over union of their boxes, in the view in which it is larger; 0 where no view shows
     both.
     """
-    return box_overlaps(some.boxes, some.masks, others.boxes, others.masks)
+    return box_iou(some.boxes, some.masks, others.boxes, others.masks)
 
 
-def box_overlaps(
+def box_iou(
     some: np.ndarray, some_shown: np.ndarray, others: np.ndarray, others_shown: np.ndarray
 ) -> np.ndarray:
     """Return the same from boxes, (2, N, 4) and (2, M, 4), and where they are shown, (2, N) and (2, M)."""
@@ -28,7 +28,7 @@ def box_overlaps(
     return shares.max(axis=0)
 
 
-def slots_of_ids(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
+def match_ids_to_slots(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
     """Say which slot shows each true object that was found.
 
     Always the two are paired that overlap most of those that are left, so that no slot counts twice.
@@ -41,9 +41,9 @@ def slots_of_ids(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
         Id of a true object to the slot in `found`; those without a box that overlaps theirs by half are left
         out.
     """
-    shares = overlaps(found, true)
+    shares = object_iou(found, true)
     slots = {}
-    while shares.size and shares.max() >= LEAST_OVERLAP:
+    while shares.size and shares.max() >= IOU_THRESHOLD:
         slot, row = (int(index) for index in np.unravel_index(shares.argmax(), shares.shape))
         slots[int(true.ids[row])] = slot
         shares[slot], shares[:, row] = 0, 0

@@ -27,7 +27,7 @@ from openvima.catalog import (
 from openvima.errors import AssetError
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Rasteriser
-from openvima.render.thumbnails import Detail, draw_portrait
+from openvima.render.thumbnails import Detail, draw_thumbnail
 
 Report = Callable[[int, int, str], None]
 
@@ -101,7 +101,7 @@ class _Artist:
         return self._picture(
             _slug(f"{object_name} in {texture_name} {view}"),
             f"{texture_name} {object_name}" + (", from above" if view == "top" else ""),
-            lambda: draw_portrait(self.rasteriser, object_name, texture_name, view, detail=detail),
+            lambda: draw_thumbnail(self.rasteriser, object_name, texture_name, view, detail=detail),
         )
 
     def swatch(self, texture_name: str) -> str:

@@ -21,7 +21,7 @@ _SAMPLES = 2  # per pixel, across and down: smooths edges, which the benchmark's
 _LONG = 2  # times as long as wide: such an object lies across the picture
 
 
-def draw_portrait(
+def draw_thumbnail(
     rasteriser: Rasteriser, object_name: str, texture_name: str, view: View, *, detail: Detail = 1
 ) -> np.ndarray:
     """Draw an object of the catalogue so that it fills the picture, in the light of the benchmark.

@@ -19,7 +19,7 @@ from openvima.evaluation.config import (
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import PolicySource
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import PACKAGED
 from openvima.report.page import write_report
 from openvima.video.clips import Clip, load_clips, png, save_clips
@@ -121,7 +121,7 @@ def _recorded(
     """Record the episodes that were not recorded before."""
     clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
     missing = [job for job in jobs if job.episode not in clips]
-    for number, (job, clip) in enumerate(in_processes(record_clip, missing, config.workers or 1), 1):
+    for number, (job, clip) in enumerate(imap_unordered(record_clip, missing, config.workers or 1), 1):
         clips[job.episode] = clip
         if note is not None:
             note(f"recorded {number} of {len(missing)}")

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env import EnvConfig, TabletopEnv
-from openvima.env.config import DEFAULT_SETUP
+from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
@@ -38,7 +38,7 @@ def save_task_gallery(
     folder: Path,
     *,
     tasks: Sequence[str] = (),
-    setup: EnvConfig = DEFAULT_SETUP,
+    setup: EnvConfig = DEFAULT_ENV_CONFIG,
     seed: int = 0,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:

@@ -20,7 +20,7 @@ class Problem:
         stages: Sizes of groups of consecutive goals. After a step only goals of the first group with an open
             one are tested, so a step never completes goals of two groups. Empty: all goals are one group.
         num_required: Exact number of goals to fulfil (more at once is a failure); None means all.
-        oracle_first: Moves that the oracle makes before it works on the goals, such as clearing a target. A
+        prerequisites: Moves that the oracle makes before it works on the goals, such as clearing a target. A
             policy need not make them.
         oracle_max_steps: Steps within which the oracle must be done; None: as registered for the task.
 
@@ -34,7 +34,7 @@ class Problem:
     constraints: tuple[Constraint, ...] = ()
     stages: tuple[int, ...] = ()
     num_required: int | None = None
-    oracle_first: tuple[AtPose, ...] = ()
+    prerequisites: tuple[AtPose, ...] = ()
     oracle_max_steps: int | None = None
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from openvima.tasks.goals import Progress, advance, begin, watch
 from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.registry import TaskSpec, list_tasks, register_task, task_spec
 from openvima.tasks.sampling import sample_episode
-from openvima.tasks.seeding import DOMAINS, stream
+from openvima.tasks.seeding import DOMAINS, make_rng
 from openvima.tasks.table import TableSampler
 
 __all__ = [
@@ -16,10 +16,10 @@ __all__ = [
     "advance",
     "begin",
     "list_tasks",
+    "make_rng",
     "oracle_action",
     "register_task",
     "sample_episode",
-    "stream",
     "task_spec",
     "watch",
 ]

@@ -50,7 +50,7 @@ def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
         prompt=Prompt(problem.prompt.text, images),
         goals=tuple(_renumbered_goal(goal, new_of) for goal in problem.goals),
         constraints=tuple(_renumbered_constraint(constraint, new_of) for constraint in problem.constraints),
-        oracle_first=tuple(_renumbered_goal(goal, new_of) for goal in problem.oracle_first),
+        prerequisites=tuple(_renumbered_goal(goal, new_of) for goal in problem.prerequisites),
     )
 
 

@@ -61,7 +61,7 @@ def oracle_action(
     goals = [problem.goals[index] for index in progress.open_goals]
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
-    chores = [goal for goal in problem.oracle_first if not goal.is_met(scene)]
+    chores = [goal for goal in problem.prerequisites if not goal.is_met(scene)]
     goal = (chores or goals)[0]
     if isinstance(goal, AtPose):
         point = visible_point(scene, goal.object_id, assets=assets, rng=rng if compat else None)

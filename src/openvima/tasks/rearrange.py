@@ -47,5 +47,5 @@ def sample(
         prompt=Prompt.parse(TEMPLATE, scene=arrangement.picture),
         goals=arrangement.goals,
         constraints=(DistractorsApart(arrangement.distractor_ids, at_end=True),),
-        oracle_first=arrangement.chores,
+        prerequisites=arrangement.chores,
     )

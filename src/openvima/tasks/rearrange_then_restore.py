@@ -58,5 +58,5 @@ def sample(
         goals=(*arrange, *restore),
         constraints=(apart,),
         stages=(len(arrange), len(restore)),
-        oracle_first=arrangement.chores,
+        prerequisites=arrangement.chores,
     )

@@ -5,7 +5,7 @@ from openvima.errors import ConfigError, SamplingError, unknown_name
 from openvima.scene import Episode
 from openvima.tasks.ids import shuffled_ids
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, task_spec
-from openvima.tasks.seeding import checked_seed, stream
+from openvima.tasks.seeding import checked_seed, make_rng
 from openvima.tasks.table import TableSampler
 
 MAX_REDRAWS = 100
@@ -54,7 +54,7 @@ def sample_episode(
     pool, pack = spec.pool(level), load_assets(assets)
     reason = SamplingError()
     for attempt in range(MAX_REDRAWS + 1):
-        rng = stream(domain, task, level, number, "scene", attempt=attempt)
+        rng = make_rng(domain, task, level, number, "scene", attempt=attempt)
         table = TableSampler(rng, pool, assets=pack, end_effector=spec.end_effector, compat=compat)
         try:
             problem = spec.sample(table, **options)
@@ -62,7 +62,7 @@ def sample_episode(
             reason = error
             continue
         if not compat:
-            problem = shuffled_ids(problem, stream(domain, task, level, number, "ids", attempt=attempt))
+            problem = shuffled_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
         oracle_max_steps = problem.oracle_max_steps or spec.oracle_max_steps
         max_steps = oracle_max_steps + EXTRA_STEPS
         return Episode(task, level, domain, number, problem, oracle_max_steps, max_steps, num_redraws=attempt)

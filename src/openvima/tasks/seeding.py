@@ -15,7 +15,7 @@ MAX_SEED = 2**63 - 1
 _WORD = 2**32
 
 
-def stream(
+def make_rng(
     domain: str, task: str, level: str, seed: int, purpose: str, *, attempt: int = 0
 ) -> np.random.Generator:
     """Return the generator of one purpose of one episode.

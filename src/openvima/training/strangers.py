@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
-from openvima.perception.iou import box_overlaps
+from openvima.perception.iou import box_iou
 from openvima.perception.preprocessing import ObjectTable
 from openvima.training.dataset import Example
 
@@ -39,7 +39,7 @@ def with_strangers(example: Example, other: Example, rng: np.random.Generator) -
     there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))
     there = there.with_image_offset(other.base).select(rng.permutation(len(there)))
     there = there.select(np.asarray(there.masks.all(axis=1)))
-    taken = box_overlaps(*_boxes_by_view(there), *_boxes_by_view(episode.objects)) > 0
+    taken = box_iou(*_boxes_by_view(there), *_boxes_by_view(episode.objects)) > 0
     there = there.select(np.flatnonzero(~taken.any(axis=1))[:count])
     there = replace(there, ids=episode.objects.ids.max(initial=-1) + 1 + np.arange(len(there)))
     steps = episode.objects.split(episode.objects_per_step)

@@ -17,7 +17,7 @@ from openvima.data.object_cache.cache_file import write_cache_file
 from openvima.data.object_cache.episode import preprocess
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
-from openvima.perception.iou import overlaps
+from openvima.perception.iou import object_iou
 from openvima.perception.objects import GROUND_TRUTH, observe
 
 CLUMSY = Boxes("clumsy-1", Clumsy)
@@ -31,7 +31,7 @@ def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -
         for t, table in enumerate(tokens.objects.split(tokens.objects_per_step)):
             found, true = Clumsy().in_observation(demo.observation(t)), observe(demo.observation(t))
             assert table.ids.tolist() == list(range(len(found)))
-            shares = overlaps(found, true)
+            shares = object_iou(found, true)
             for slots, asked in ((tokens.pick_ids, demo.pick_ids[t]), (tokens.place_ids, demo.place_ids[t])):
                 slot, there = (
                     slots[t],

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from openvima.cli.lists import parse_list
 from openvima.cli.progress import progress_bar
-from openvima.cli.words import words_in
 
 
 def import_published(
@@ -49,7 +49,7 @@ def import_published(
     config = ImportConfig(
         source=source,
         out=out,
-        tasks=words_in(tasks),
+        tasks=parse_list(tasks),
         part=part,
         episodes=episodes,
         compression=compression,

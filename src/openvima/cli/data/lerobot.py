@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from openvima.cli.lists import parse_tasks
 from openvima.cli.progress import progress_bar
-from openvima.cli.words import tasks_in
 
 
 def export_lerobot(
@@ -44,7 +44,7 @@ def export_lerobot(
     config = LerobotConfig(
         data=folder,
         out=out,
-        tasks=tasks_in(tasks),
+        tasks=parse_tasks(tasks),
         fps=fps,
         pixels=pixels,
         data_file_mb=data_file_mb,

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from openvima.cli.lists import parse_tasks
 from openvima.cli.progress import progress_bar
-from openvima.cli.words import tasks_in
 
 Compression = Literal["lz4", "zstd"]
 
@@ -45,7 +45,7 @@ def sample(
     from openvima.data.subsets import SubsetConfig
     from openvima.data.subsets import sample as write_sample
 
-    config = SubsetConfig(folder, out, tasks_in(tasks), seed, compression, workers, force)
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
     with progress_bar("demonstrations") as report:
         print(write_sample(config, share, report=report))
     return 0
@@ -85,7 +85,7 @@ def split(
     from openvima.data.subsets import SubsetConfig, parse_parts
     from openvima.data.subsets import split as write_split
 
-    config = SubsetConfig(folder, out, tasks_in(tasks), seed, compression, workers, force)
+    config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
     shares = parse_parts(parts)
     with progress_bar("demonstrations") as report:
         written = write_split(config, shares, report=report)
@@ -126,7 +126,9 @@ def merge(
 
     if len(folders) < 2:
         raise ConfigError("give at least two folders: what to merge, and last where to write it.")
-    config = MergeConfig(folders[:-1], folders[-1], tasks_in(tasks), duplicates, compression, workers, force)
+    config = MergeConfig(
+        folders[:-1], folders[-1], parse_tasks(tasks), duplicates, compression, workers, force
+    )
     with progress_bar("demonstrations") as report:
         print(write_merged(config, report=report))
     return 0

@@ -10,7 +10,7 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
-from openvima.atomic_io import remove_abandoned
+from openvima.atomic_io import remove_stale
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, write_cache_file
@@ -18,7 +18,7 @@ from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
 
@@ -186,7 +186,7 @@ def open_object_cache(
             raise DatasetError(
                 f"cannot keep tokens in {target}: {error.strerror}. Name another folder."
             ) from None
-        remove_abandoned(target)
+        remove_stale(target)
         total = sum(item.source.index.num_rows for item in work)
         work.sort(key=lambda item: -item.source.index.num_rows)
 
@@ -195,7 +195,7 @@ def open_object_cache(
                 report(done, total, "")
 
         try:
-            for _ in in_processes(_write, work, workers, report=say):
+            for _ in imap_unordered(_write, work, workers, report=say):
                 pass  # the result of a job is its file
         finally:
             _extractor.cache_clear()  # where it was made here

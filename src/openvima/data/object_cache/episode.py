@@ -7,7 +7,7 @@ import numpy as np
 from openvima.data.records import Demonstration
 from openvima.data.schema import VIEWS
 from openvima.perception.image_stack import ImageStack
-from openvima.perception.iou import slots_of_ids
+from openvima.perception.iou import match_ids_to_slots
 from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
@@ -114,7 +114,7 @@ def preprocess(
     pick_ids, place_ids = np.array(demo.pick_ids, np.int16), np.array(demo.place_ids, np.int16)
     if extractor is not None:
         for t, (observation, found) in enumerate(zip(observations, views, strict=True)):
-            slots = slots_of_ids(found, observe(observation))
+            slots = match_ids_to_slots(found, observe(observation))
             pick_ids[t], place_ids[t] = (slots.get(int(ids[t]), -1) for ids in (pick_ids, place_ids))
     false_positives = FalsePositives(
         np.zeros((demo.num_steps, len(VIEWS)), np.int32), np.zeros((demo.num_steps, len(VIEWS), 4), np.int16)

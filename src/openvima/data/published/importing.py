@@ -23,7 +23,7 @@ from openvima.data.resuming import FULL_DISK, clear, is_finished, storage_error
 from openvima.data.shard import Shard
 from openvima.data.writer import ShardWriter, remove_leftovers
 from openvima.errors import ConfigError, DatasetError
-from openvima.multiprocess import MAX_WORKERS, Counts, in_watched_processes
+from openvima.multiprocess import MAX_WORKERS, Counts, imap_with_progress
 
 COMMAND = "openvima data import"
 LICENCE = "CC BY 4.0"  # of the published data set
@@ -124,7 +124,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         if missing:
             (config.out / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
         watch = _watch(report, blocks, missing)
-        for block, found in in_watched_processes(
+        for block, found in imap_with_progress(
             write_block, missing, config.workers, num_counts=2, watch=watch
         ):
             broken[block.path] = found

@@ -12,7 +12,7 @@ from openvima.data.planning import LARGEST_SHARD
 from openvima.data.reader import Dataset
 from openvima.data.writer import ShardWriter
 from openvima.errors import DatasetError, ShardError
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def write_shards(
     """
     total = sum(shard.num_episodes for shard in shards)
     count = None if report is None else (lambda done: report(done, total, ""))
-    for _ in in_processes(write_shard, shards, num_workers, report=count):
+    for _ in imap_unordered(write_shard, shards, num_workers, report=count):
         pass  # a shard's result is its file
 
 

@@ -15,7 +15,7 @@ from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.shard import Shard
 from openvima.data.verification.findings import Problem, Report, by_cause
 from openvima.errors import OpenVimaError, ShardError
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 
 _REMEDY = "Delete it; `openvima data preprocess` makes it again."
 _WITHOUT_OBJECTS = ("task", "seed", "end_effector", "actions")
@@ -58,7 +58,7 @@ def check_cache(
     total = sum(len(Shard(task.shard)) for task in tasks)
     watch = None if report is None else (lambda done: report(done, total, "comparing the object cache"))
     num_files, problems = 0, []
-    for task, causes in in_processes(check_cache_file, tasks, num_workers, report=watch):
+    for task, causes in imap_unordered(check_cache_file, tasks, num_workers, report=watch):
         if causes is not None:
             num_files += 1
             name = str(task.path.relative_to(folder))

@@ -16,7 +16,7 @@ from openvima.data.verification.findings import Problem, Report, Verification, V
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 
 DEFAULT = VerifyConfig()
 
@@ -73,7 +73,7 @@ def _checked(
     """Yield the name of each shard with its findings."""
     total = sum(0 if task.index is None else task.index.num_rows for task in tasks)
     watch = None if report is None else (lambda done: report(done, max(done, total), "comparing"))
-    for task, findings in in_processes(check_shard, tasks, config.workers, report=watch):
+    for task, findings in imap_unordered(check_shard, tasks, config.workers, report=watch):
         yield task.path.name, findings
 
 

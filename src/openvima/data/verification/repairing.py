@@ -24,7 +24,7 @@ from openvima.data.verification.findings import Report, Verification, VerifyConf
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.salvage import rewrite
 from openvima.errors import DatasetError, OpenVimaError
-from openvima.multiprocess import Counts, in_watched_processes
+from openvima.multiprocess import Counts, imap_with_progress
 
 _STAGING = ".repair.tmp"
 
@@ -240,7 +240,7 @@ def _write(blocks: Sequence[Block], num_workers: int, report: Report | None) -> 
         if report is not None:
             report(sum(row[0] for row in counts), total, "generating again")
 
-    for _ in in_watched_processes(write_block, blocks, num_workers, num_counts=NUM_COUNTS, watch=watch):
+    for _ in imap_with_progress(write_block, blocks, num_workers, num_counts=NUM_COUNTS, watch=watch):
         pass  # a block's result is its file
 
 

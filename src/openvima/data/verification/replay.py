@@ -18,7 +18,7 @@ from openvima.data.verification.inventory import Inventory
 from openvima.data.verification.shards import ShardFindings
 from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, OpenVimaError
-from openvima.multiprocess import in_processes
+from openvima.multiprocess import imap_unordered
 from openvima.scene import RenderedPrompt
 
 if TYPE_CHECKING:  # comes with the simulator
@@ -81,7 +81,7 @@ def replay(
     watch = None if report is None else (lambda done: report(done, total, "replaying"))
     problems, notes = [], _notes_on_origin(findings)
     num_replayed = 0
-    for task, found in in_processes(replay_shard, tasks, config.workers, report=watch):
+    for task, found in imap_unordered(replay_shard, tasks, config.workers, report=watch):
         name = task.path.name
         if isinstance(found, str):
             notes.append(f"{name} cannot be replayed: {found}")
@@ -235,5 +235,5 @@ def _setup(task: ReplayTask) -> EnvConfig:
 
 
 @lru_cache(maxsize=4)
-def _env(task: str, level: str, domain: str, setup: EnvConfig) -> "TabletopEnv":
-    return setup.make(task, level, domain=domain)
+def _env(task: str, level: str, domain: str, env_config: EnvConfig) -> "TabletopEnv":
+    return env_config.make(task, level, domain=domain)
