@@ -189,7 +189,7 @@ def summary(steps: Iterable[StepDifference]) -> dict[str, float | int | None]:
     Returns:
         `same_moved`: share of steps in which the same bodies moved; `place_error_mm_median` and
         `yaw_error_deg_median`: of bodies that were carried; `sweep_error_mm_median`: of bodies that the
-        benchmark's blade moved.
+        benchmark's spatula moved.
     """
     steps = tuple(steps)
     carried = [body for step in steps for body in step.bodies if body.is_carried]

@@ -38,8 +38,8 @@ from openvima.tasks import list_tasks, task_spec
 FIRST_SEED = 2_000_000
 SINKING_M = 0.002  # by which the lowest corner may be below the floor: contacts are springs
 FARTHEST_M = 3.0  # from the robot; nothing slides that far
-# Before the first action, after lifting and after setting down; a sweep settles before, when the blade comes
-# down and after, and goes at most across the whole table, with a little way for its run-up and bow.
+# Before the first action, after lifting and after setting down; a sweep settles before, when the spatula is
+# lowered and after, and crosses at most the whole table, with a margin for run-up and bow.
 _ACROSS_M = math.dist(WORKSPACE_LOW, WORKSPACE_HIGH) + 0.1
 LIMIT_TICKS = {
     "suction": 3 * SETTLE_LIMIT_TICKS,

@@ -6,7 +6,7 @@ from openvima.scene import AtPose, DistractorsApart, Outcome, Placement, Pose, P
 from openvima.tasks import advance, begin
 
 
-def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
+def roles(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     """Target, base and distractors."""
     (goal,) = problem.goals
     (constraint,) = problem.constraints
@@ -16,9 +16,9 @@ def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     return scene[goal.object_id], scene[goal.relative_to], [scene[i] for i in constraint.object_ids]
 
 
-def cast_of_twins(problem: Problem) -> tuple[Placement, Placement, Placement, list[Placement]]:
+def roles_with_twins(problem: Problem) -> tuple[Placement, Placement, Placement, list[Placement]]:
     """Target, base, the other object of the target's shape, and the rest."""
-    target, base, distractors = cast(problem)
+    target, base, distractors = roles(problem)
     (twin,) = [distractor for distractor in distractors if distractor.object == target.object]
     return target, base, twin, [distractor for distractor in distractors if distractor is not twin]
 
@@ -38,7 +38,7 @@ def beside(problem: Problem, anchor: Pose, distance_m: float, *, moved_id: int) 
 
 def assert_judged_at_its_limits(problem: Problem) -> None:
     """Both sides of every limit, for the target and for each distractor."""
-    target, base, distractors = cast(problem)
+    target, base, distractors = roles(problem)
     near, far = (beside(problem, base.pose, d, moved_id=target.id) for d in (0.099, 0.101))
     assert judged(problem, {}) == Outcome()
     assert judged(problem, {target.id: near}).success

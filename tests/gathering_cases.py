@@ -3,7 +3,7 @@
 from openvima.scene import AtPose, DistractorsApart, Placement, Problem
 
 
-def cast(problem: Problem) -> tuple[Placement, list[Placement], list[Placement]]:
+def roles(problem: Problem) -> tuple[Placement, list[Placement], list[Placement]]:
     """Base, objects that belong into it, distractors."""
     goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
     (constraint,) = problem.constraints

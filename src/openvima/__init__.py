@@ -16,7 +16,7 @@ __all__ = ["TabletopEnv", "__version__", "list_tasks", "make", "make_vec"]
 _HOMES = {"TabletopEnv": "env", "make_vec": "env", "list_tasks": "tasks"}
 
 
-def __getattr__(name: str) -> object:  # these take heavier packages with them
+def __getattr__(name: str) -> object:  # these import heavier packages
     if name in _HOMES:
         return getattr(importlib.import_module(f"openvima.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

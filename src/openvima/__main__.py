@@ -1,4 +1,4 @@
-"""Lets `python -m openvima` stand for the `openvima` program."""
+"""Run the `openvima` program by `python -m openvima`."""
 
 import sys
 

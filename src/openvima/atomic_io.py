@@ -1,4 +1,4 @@
-"""Files and folders that bear their name only once they are whole."""
+"""Atomic writes of files and folders."""
 
 import contextlib
 import os
@@ -10,12 +10,12 @@ from typing import BinaryIO
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to be written under a temporary name; it gets its own when the block ends well.
+    """Write a file under a temporary name and rename it when the block succeeds.
 
-    After an exception nothing is left, after a crash a hidden `.tmp` file. The folder must exist.
+    An exception leaves nothing, a crash a hidden `.tmp` file. The folder must exist.
 
     Args:
-        path: Final name; a file that bears it is replaced in one move.
+        path: Final name; an existing file is replaced atomically.
 
     Yields:
         The file, open for writing bytes.
@@ -33,10 +33,10 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 
 def atomic_write_file(path: Path, content: bytes | str) -> Path:
-    """Write a file so that it is either the old one or the whole new one, whatever happens.
+    """Write a whole file atomically.
 
     Args:
-        path: The file; missing folders are made.
+        path: The file; missing folders are created.
         content: Bytes, or text to be stored as UTF-8.
 
     Returns:
@@ -50,18 +50,18 @@ def atomic_write_file(path: Path, content: bytes | str) -> Path:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Fill a folder under a temporary name; it gets its own when the block ends well.
+    """Fill a folder under a temporary name and rename it when the block succeeds.
 
-    After an exception nothing is left, after a crash a hidden `.tmp` folder. A folder that bears the name is
-    moved aside before and deleted after. Should the process die between, `restore_folder` puts it back.
+    An exception leaves nothing, a crash a hidden `.tmp` folder. An existing folder is backed up first and
+    deleted afterwards; if the process dies in between, `restore_folder` puts it back.
 
     Args:
-        path: Final name; missing parents are made.
+        path: Final name; missing parents are created.
 
     Yields:
         The folder to fill.
     """
-    path = path.resolve()  # what a link leads to
+    path = path.resolve()  # follow links
     restore_folder(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -70,31 +70,28 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         _sync_files(temporary)
-        aside = _aside(path)
+        backup = _backup_path(path)
         if path.exists():
-            shutil.rmtree(aside, ignore_errors=True)
-            os.replace(path, aside)
+            shutil.rmtree(backup, ignore_errors=True)
+            os.replace(path, backup)
         os.replace(temporary, path)
         _sync_folder(path.parent)
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(backup, ignore_errors=True)
     finally:
         restore_folder(path)
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 def restore_folder(path: Path) -> None:
-    """Put back a folder that was moved aside to be replaced, if its replacement never came."""
+    """Restore the backup of a folder whose replacement was never completed."""
     path = path.resolve()
-    aside = _aside(path)
-    if not path.exists() and aside.is_dir():
-        os.replace(aside, path)
+    backup = _backup_path(path)
+    if not path.exists() and backup.is_dir():
+        os.replace(backup, path)
 
 
 def remove_stale(folder: Path) -> None:
-    """Delete what writers have left in a folder that were killed; those that still run keep their files.
-
-    Where the system does not tell which processes run, nothing is deleted.
-    """
+    """Delete the temporary files that killed writers left in a folder; on POSIX systems only."""
     if os.name != "posix":
         return
     for file in folder.glob(".*.tmp"):
@@ -108,12 +105,12 @@ def _runs(process_id: int) -> bool:
         os.kill(process_id, 0)  # sends nothing
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:  # it is somebody else's
-        return True
+    except PermissionError:  # another user's process
+        pass
     return True
 
 
-def _aside(path: Path) -> Path:
+def _backup_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.old")
 
 
@@ -125,7 +122,7 @@ def _sync_files(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename last through a power cut, where the system can."""
+    """Make a rename durable, on POSIX systems."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

@@ -5,11 +5,11 @@ from collections.abc import Iterable
 
 
 class OpenVimaError(Exception):
-    """Base of all errors that the package raises on purpose."""
+    """Base class of all exceptions of the package."""
 
 
 class UnknownNameError(OpenVimaError, KeyError):
-    """A name that no catalogue, registry or preset holds."""
+    """An unknown name."""
 
     def __str__(self) -> str:  # KeyError would print the repr of the message
         return str(self.args[0]) if self.args else ""
@@ -36,7 +36,7 @@ class LevelError(OpenVimaError, ValueError):
 
 
 class SamplingError(OpenVimaError, ValueError):
-    """A task could not place its objects in the tries it allows; another draw usually can."""
+    """A task could not place its objects; another seed usually can."""
 
 
 class ShapeError(OpenVimaError, ValueError):
@@ -44,7 +44,7 @@ class ShapeError(OpenVimaError, ValueError):
 
 
 class CameraError(OpenVimaError, ValueError):
-    """Something lies where the camera cannot see it, such as behind it."""
+    """A point that the camera cannot project, such as one behind it."""
 
 
 class AssetError(OpenVimaError, ValueError):
@@ -56,7 +56,7 @@ class SceneError(OpenVimaError, ValueError):
 
 
 class ReachError(OpenVimaError, ValueError):
-    """The arm cannot reach the asked tool pose."""
+    """The arm cannot reach a tool pose."""
 
 
 class ActionError(OpenVimaError, ValueError):
@@ -68,15 +68,15 @@ class EpisodeError(OpenVimaError, RuntimeError):
 
 
 class OracleError(OpenVimaError, RuntimeError):
-    """The scripted oracle has no action for the present scene."""
+    """The oracle has no action for the current scene."""
 
 
 class WorkerError(OpenVimaError, RuntimeError):
-    """A process that worked for this one died."""
+    """A worker process died."""
 
 
 class StorageError(OpenVimaError, OSError):
-    """A folder cannot be written to, for example because its disk is full; whole files were kept."""
+    """A folder cannot be written to, for example because the disk is full; complete files were kept."""
 
 
 class ShardError(OpenVimaError, ValueError):
@@ -84,11 +84,11 @@ class ShardError(OpenVimaError, ValueError):
 
 
 class DatasetError(OpenVimaError, ValueError):
-    """A data folder is incomplete, of another version or does not fit the command."""
+    """A data folder is incomplete, of another version or unsuitable for the command."""
 
 
 class MemberError(OpenVimaError, ValueError):
-    """An episode of the published data set is damaged, incomplete, or holds what it must not."""
+    """An episode of the published data set is damaged, incomplete or unsafe to unpickle."""
 
 
 class PromptError(OpenVimaError, ValueError):
@@ -96,23 +96,23 @@ class PromptError(OpenVimaError, ValueError):
 
 
 class PolicyError(OpenVimaError, ValueError):
-    """A policy was given inputs that it cannot take."""
+    """Invalid inputs of a policy."""
 
 
 class DetectionError(OpenVimaError, ValueError):
-    """What a detector found cannot be: a box outside the image, or a score that is no number."""
+    """An invalid detection: a box outside the image, or a score that is not a number."""
 
 
 class CheckpointError(OpenVimaError, ValueError):
-    """A checkpoint is damaged or does not fit the model."""
+    """A checkpoint is damaged or does not match the model."""
 
 
 class ConfigError(OpenVimaError, ValueError):
-    """A setting outside its allowed range, or settings that contradict each other."""
+    """An option out of range, or options that contradict each other."""
 
 
 class MessageError(OpenVimaError, ValueError):
-    """A message between a policy server and a client cannot be read, or comes in the wrong order."""
+    """A message between policy server and client is malformed or out of order."""
 
 
 class ServerError(OpenVimaError, ConnectionError):
@@ -124,13 +124,13 @@ class MissingExtraError(OpenVimaError, ImportError):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") -> str:
-    """Compose the message for a name that is not known, with the nearest known one as a suggestion.
+    """Compose the message for an unknown name, with the nearest known one as a suggestion.
 
     Args:
-        kind: What the name should have named, such as "task".
+        kind: Kind of thing, such as "task".
         name: The name as given.
         known: All names that are allowed.
-        hint: A sentence to end with; by default the known names, if they are few.
+        hint: Last sentence; by default the known names, if there are at most 20.
 
     Returns:
         One line for an `UnknownNameError`.

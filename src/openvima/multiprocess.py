@@ -1,4 +1,4 @@
-"""Running jobs in several processes of one machine, each on one thread."""
+"""Parallel jobs in worker processes with one thread each."""
 
 import contextlib
 import multiprocessing
@@ -15,41 +15,41 @@ from typing import Any, Protocol
 from openvima.errors import ConfigError, WorkerError
 
 POLL_S = 0.2
-PARENT_END_S = 5.0  # from the end of its pipes to the end of a process
+PARENT_END_S = 5.0  # grace period for the parent to exit
 MAX_WORKERS = 1024
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # In a worker: the shared array of counts. Any: multiprocessing has no public type for it.
 _counters: Any = None
 
 Counts = Sequence[Sequence[int]]
-"""The numbers that each job has last told to its `count`, one row a job; zeros before it begins."""
+"""The numbers last passed to `count`, one row per job; zeros before it starts."""
 
 
 class Job(Protocol):
-    """Work on one item, which calls `count` with the number of things done so far, or several such."""
+    """A function of one item that calls `count` with the number of things done so far."""
 
-    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:  # Any: as the caller likes
-        """Do it."""
+    def __call__(self, item: Any, count: Callable[..., None], /) -> Any:  # Any: up to the caller
+        """Run the job."""
 
 
 def imap_unordered(
     job: Job, items: Sequence[Any], num_workers: int, *, report: Callable[[int], None] | None = None
 ) -> Iterator[tuple[Any, Any]]:
-    """Apply a job to every item.
+    """Apply a job to every item and yield the results as they finish.
 
     Args:
         job: A function of a module (workers import it).
         items: Its arguments; they and the results are pickled.
-        num_workers: Number of processes; with one, everything happens in this process.
-        report: Called now and then with the sum of all counts.
+        num_workers: Number of processes; 1 runs everything in this process.
+        report: Called repeatedly with the sum of all counts.
 
     Yields:
         An item and its result, as they finish.
 
     Raises:
-        ConfigError: There cannot be so many processes.
-        WorkerError: A worker was killed from outside.
-        Exception: Whatever a job raised; the other jobs are stopped.
+        ConfigError: `num_workers` is out of range.
+        WorkerError: A worker was killed.
+        Exception: Any exception of a job; the other jobs are stopped.
     """
     watch = None if report is None else (lambda counts: report(sum(row[0] for row in counts)))
     yield from imap_with_progress(job, items, num_workers, watch=watch)
@@ -63,30 +63,25 @@ def imap_with_progress(
     num_counts: int = 1,
     watch: Callable[[Counts], None] | None = None,
 ) -> Iterator[tuple[Any, Any]]:
-    """Apply a job to every item, and follow each of them.
+    """Like `imap_unordered`, with separate counts for each job.
 
     Args:
-        job: As for `imap_unordered`; it calls `count` with `num_counts` numbers.
-        items: As for `imap_unordered`.
-        num_workers: As for `imap_unordered`.
-        num_counts: Numbers that a job tells.
-        watch: Called now and then with the numbers of all jobs, in the order of the items.
+        job: Calls `count` with `num_counts` numbers.
+        items: Its arguments.
+        num_workers: Number of processes.
+        num_counts: Numbers that a job counts.
+        watch: Called repeatedly with the counts of all jobs, in the order of the items.
 
     Yields:
         An item and its result, as they finish.
-
-    Raises:
-        ConfigError: There cannot be so many processes.
-        WorkerError: A worker was killed from outside.
-        Exception: Whatever a job raised; the other jobs are stopped.
     """
     check_workers(num_workers)
     watch = watch or (lambda counts: None)
     if num_workers == 1 or len(items) <= 1:
-        yield from _one_after_the_other(job, items, num_counts, watch)
+        yield from _run_serially(job, items, num_counts, watch)
         return
     context = multiprocessing.get_context("spawn")
-    # One row a job: no lock that a killed worker could keep.
+    # One row per job: no lock that a killed worker could hold.
     counters = context.RawArray("q", len(items) * num_counts)
     others = set(multiprocessing.active_children())
     with single_threaded_workers():
@@ -107,7 +102,7 @@ def imap_with_progress(
                 "a worker process was killed (often for lack of memory; --workers lowers the need). "
                 "Whole files were kept, and the same command continues."
             ) from None
-        except BaseException:  # a job's own error, or Ctrl-C: the rest would work in vain
+        except BaseException:  # a job's own error, or Ctrl-C
             for process in set(multiprocessing.active_children()) - others:
                 process.terminate()
             raise
@@ -116,7 +111,7 @@ def imap_with_progress(
 
 
 def check_workers(num_workers: int) -> None:
-    """Refuse a number of processes that cannot be.
+    """Check the number of processes.
 
     Raises:
         ConfigError: It is out of range.
@@ -125,7 +120,7 @@ def check_workers(num_workers: int) -> None:
         raise ConfigError(f"workers is {num_workers}; it must lie within 1 … {MAX_WORKERS}.")
 
 
-def _one_after_the_other(
+def _run_serially(
     job: Job, items: Sequence[Any], num_counts: int, watch: Callable[[Counts], None]
 ) -> Iterator[tuple[Any, Any]]:
     counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
@@ -140,7 +135,7 @@ def _one_after_the_other(
 
 @contextlib.contextmanager
 def single_threaded_workers() -> Iterator[None]:
-    """Let processes that start inside the block use one thread each; it is read before our code is."""
+    """Set the thread variables of processes that start inside the block to 1."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
@@ -155,20 +150,20 @@ def single_threaded_workers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def defer_sigint() -> Iterator[None]:
-    """Put off Ctrl-C until the end of the block; processes that start inside never receive it.
+    """Defer SIGINT to the end of the block; processes that start inside never receive it.
 
-    It reaches every process of a terminal at once, so a worker that is still importing would print a
-    traceback. On Windows nothing is put off.
+    Ctrl-C reaches every process of a terminal, so a worker that is still importing would print a traceback.
+    No effect on Windows.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    resource_tracker.ensure_running()  # it would be started later, and its start lets signals through again
-    held: list[int] = []
-    # Blocking holds for this thread and for processes that it starts; another thread (of a matrix library,
-    # say) may still take the signal, whose handler Python then runs here.
+    resource_tracker.ensure_running()  # its start unblocks signals
+    pending: list[int] = []
+    # Blocking covers this thread and the processes that it starts. Another thread, such as one of a BLAS
+    # library, may still receive the signal; Python then runs the handler here.
     in_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number)) if in_main else None
+    handler = signal.signal(signal.SIGINT, lambda number, frame: pending.append(number)) if in_main else None
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -176,25 +171,25 @@ def defer_sigint() -> Iterator[None]:
         if in_main:
             signal.signal(signal.SIGINT, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if held:
+        if pending:
             signal.raise_signal(signal.SIGINT)
 
 
 def init_worker() -> None:
-    """Make this process a worker: it leaves Ctrl-C to its parent, and ends when the parent does."""
+    """Initialise a worker: ignore SIGINT, and exit with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, args=(None,), daemon=True).start()
 
 
-def exit_with_parent(patience_s: float | None = PARENT_END_S) -> None:
-    """End this worker at once when its parent has ended.
+def exit_with_parent(timeout_s: float | None = PARENT_END_S) -> None:
+    """Exit this worker once its parent has exited.
 
     Args:
-        patience_s: How long to wait for that; None waits for ever.
+        timeout_s: How long to wait for that; None waits for ever.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # this only runs in workers
-    if wait_for([parent.sentinel], patience_s):
+    if wait_for([parent.sentinel], timeout_s):
         os._exit(1)
 
 

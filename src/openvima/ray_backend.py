@@ -1,6 +1,6 @@
-"""Running jobs on a Ray cluster, each on one thread; the counterpart of `openvima.multiprocess`.
+"""Parallel jobs on a Ray cluster with one thread each; the counterpart of `openvima.multiprocess`.
 
-Only here is Ray imported, and only when it was asked for: `pip install openvima[scale]`.
+The only module that imports Ray: `pip install openvima[scale]`.
 """
 
 import contextlib
@@ -15,10 +15,10 @@ from openvima.errors import ConfigError, MissingExtraError, WorkerError
 from openvima.multiprocess import THREAD_VARIABLES, Counts, Job
 
 POLL_S = 0.5
-COUNT_INTERVAL_S = 1.0  # a message a job and second, whatever the number of jobs
-CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C; they notice between two steps of Python
+COUNT_INTERVAL_S = 1.0  # one message per job and second
+CANCEL_S = 20.0  # for jobs to end after an error or Ctrl-C
 CONNECT_S = 10.0
-OBJECT_STORE_BYTES = 100 * 2**20  # by default Ray takes 30 % of the memory; results are files here
+OBJECT_STORE_BYTES = 100 * 2**20  # Ray's default is 30 % of the memory; results are files here
 AUTO = "auto"  # the cluster that this machine belongs to
 
 
@@ -31,16 +31,16 @@ def ray_imap_unordered(
     num_counts: int = 1,
     watch: Callable[[Counts], None] | None = None,
 ) -> Iterator[tuple[Any, Any]]:
-    """Apply a job to every item on a Ray cluster.
+    """Apply a job to every item on a Ray cluster and yield the results as they finish.
 
     Args:
-        job: A function of a module that all machines have.
+        job: A function of a module that every machine can import.
         items: Its arguments, taken in order; they and the results are pickled.
-        num_workers: Jobs that run at the same time; None means as many as the cluster has processors.
-        address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses Ray as it runs in
-            this process, or starts it on this machine and stops it in the end.
-        num_counts: Numbers that a job tells.
-        watch: Called now and then with the numbers of all jobs, in the order of the items.
+        num_workers: Concurrent jobs; None: one per CPU of the cluster.
+        address: "HOST:PORT" of the cluster's head, "ray://HOST:PORT", or "auto". None uses the Ray
+            session of this process, or starts one on this machine and stops it at the end.
+        num_counts: Numbers that a job counts.
+        watch: Called repeatedly with the counts of all jobs, in the order of the items.
 
     Yields:
         An item and its result, as they finish.
@@ -50,7 +50,7 @@ def ray_imap_unordered(
         ConfigError: No cluster answers at the address, it has another version of Ray or Python, or it lacks
             the job's module.
         WorkerError: A worker died.
-        Exception: Whatever a job raised; the other jobs are stopped.
+        Exception: Any exception of a job; the other jobs are stopped.
     """
     ray = _import_ray()
     with _connected(ray, address, num_workers):
@@ -58,7 +58,7 @@ def ray_imap_unordered(
 
 
 def _import_ray() -> ModuleType:
-    # Read when Ray is imported. It would report its use to its makers, and warn of its own future.
+    # Read when Ray is imported: no usage statistics, no deprecation warnings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
@@ -66,14 +66,14 @@ def _import_ray() -> ModuleType:
     except ImportError:
         raise MissingExtraError(
             "running on a Ray cluster needs ray: pip install openvima[scale]. "
-            "Without it, --engine processes uses the processors of this machine."
+            "Without it, --engine processes uses the CPUs of this machine."
         ) from None
     return ray
 
 
 @contextlib.contextmanager
 def _connected(ray: ModuleType, address: str | None, num_workers: int | None) -> Iterator[None]:
-    """Connect to a cluster, or start one on this machine; leave Ray as it was found."""
+    """Connect to a cluster, or start one on this machine and stop it afterwards."""
     if address is None and ray.is_initialized():
         yield
         return
@@ -102,7 +102,7 @@ def _connected(ray: ModuleType, address: str | None, num_workers: int | None) ->
 
 
 def _check_answers(address: str) -> None:
-    """Knock at a HOST:PORT: Ray itself would wait for minutes, then end the process without an exception."""
+    """Probe a HOST:PORT: Ray itself waits for minutes, then ends the process without an exception."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if address == AUTO:
         return
@@ -125,14 +125,14 @@ def _run_all(
     watch: Callable[[Counts], None],
 ) -> Iterator[tuple[Any, Any]]:
     counts: list[tuple[int, ...]] = [(0,) * num_counts] * len(items)
-    board = ray.remote(num_cpus=0)(_Board).remote()
-    # A job that died is not tried again: the same command continues, and says why it has to.
+    progress = ray.remote(num_cpus=0)(_ProgressActor).remote()
+    # No retries: the same command resumes, and the error says what happened.
     remote = ray.remote(num_cpus=1, max_retries=0, runtime_env={"env_vars": _environment()})(_run_one)
     waiting, running = iter(enumerate(items)), {}
     try:
         while True:
             while len(running) < num_workers and (entry := next(waiting, None)) is not None:
-                running[remote.remote(job, entry[1], entry[0], board)] = entry[0]
+                running[remote.remote(job, entry[1], entry[0], progress)] = entry[0]
             if not running:
                 return
             done, _ = ray.wait(list(running), timeout=POLL_S)
@@ -141,12 +141,12 @@ def _run_all(
                 slot = running.pop(reference)
                 counts[slot] = numbers or counts[slot]
                 yield items[slot], result
-            for slot, numbers in ray.get(board.read.remote()).items():
+            for slot, numbers in ray.get(progress.read.remote()).items():
                 if slot in running.values():
                     counts[slot] = numbers
             watch(counts)
     except ray.exceptions.RayTaskError as error:
-        if isinstance(error.cause, ray.exceptions.RayError):  # of reading the job, before it could begin
+        if isinstance(error.cause, ray.exceptions.RayError):  # the job could not be unpickled
             raise ConfigError(
                 f"a machine of the Ray cluster cannot do the work ({_first_line(error.cause)}). "
                 "All of them need this version of openvima, with what its extras and your tasks import."
@@ -162,7 +162,7 @@ def _run_all(
 
 
 def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's references
-    """Interrupt jobs and wait until they have tidied up behind them."""
+    """Cancel jobs and wait for their clean-up."""
     if not references:
         return
     with contextlib.suppress(ray.exceptions.RayError):
@@ -172,7 +172,7 @@ def _stop(ray: ModuleType, references: list[Any]) -> None:  # Any: Ray's referen
 
 
 def _environment() -> dict[str, str]:
-    """Variables of the workers: one thread each, and those that this package reads."""
+    """Environment of the workers: one thread each, and this package's variables."""
     own = {name: value for name, value in os.environ.items() if name.startswith("OPENVIMA_")}
     return {**own, **dict.fromkeys(THREAD_VARIABLES, "1")}
 
@@ -182,8 +182,8 @@ def _first_line(error: Exception) -> str:
     return lines[0].strip().rstrip(".")
 
 
-class _Board:
-    """What running jobs have last counted; an actor."""
+class _ProgressActor:
+    """Actor that holds the counts of running jobs."""
 
     def __init__(self) -> None:
         self._counts: dict[int, tuple[int, ...]] = {}
@@ -195,8 +195,8 @@ class _Board:
         return self._counts
 
 
-def _run_one(job: Job, item: Any, slot: int, board: Any) -> tuple[Any, tuple[int, ...]]:  # Any: see `Job`
-    """Do a job in a worker; return its result and its last counts."""
+def _run_one(job: Job, item: Any, slot: int, progress: Any) -> tuple[Any, tuple[int, ...]]:  # Any: see `Job`
+    """Run a job in a worker; return its result and its last counts."""
     last: tuple[int, ...] = ()
     next_s = 0.0
 
@@ -205,6 +205,6 @@ def _run_one(job: Job, item: Any, slot: int, board: Any) -> tuple[Any, tuple[int
         last = numbers
         if time.monotonic() >= next_s:
             next_s = time.monotonic() + COUNT_INTERVAL_S
-            board.write.remote(slot, numbers)
+            progress.write.remote(slot, numbers)
 
     return job(item, count), last

@@ -38,8 +38,8 @@ def main():
 GUARD = 'if __name__ == "__main__":\n    '
 
 
-def build(recipe: Callable[[], gymnasium.Env] = Faulty) -> AsyncTabletopEnvs:
-    return AsyncTabletopEnvs([recipe, recipe], AutoresetMode.NEXT_STEP)
+def build(env_fn: Callable[[], gymnasium.Env] = Faulty) -> AsyncTabletopEnvs:
+    return AsyncTabletopEnvs([env_fn, env_fn], AutoresetMode.NEXT_STEP)
 
 
 def start(folder: Path, script: str) -> subprocess.Popen:
@@ -87,9 +87,9 @@ def test_an_error_in_a_worker_reaches_the_caller_and_ends_all() -> None:
 
 
 def test_an_error_that_cannot_be_sent_ends_all_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("openvima.env.workers._PATIENCE_S", 0.5)
+    monkeypatch.setattr("openvima.env.workers._TIMEOUT_S", 0.5)
     envs = build()
-    with pytest.raises(WorkerError, match="cannot be sent"):
+    with pytest.raises(WorkerError, match="cannot be pickled"):
         envs.reset(seed=[14, 1])
     assert not any(process.is_alive() for process in envs.processes)
 
@@ -103,7 +103,7 @@ def test_a_killed_worker_is_reported_and_ends_all(is_stepping: bool) -> None:
     victim = envs.processes[1]
     os.kill(victim.pid, signal.SIGKILL)
     victim.join()
-    with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) ended by itself"):
+    with pytest.raises(WorkerError, match=r"sub-environment 1 \(exit code -9\) died"):
         envs.step_wait() if is_stepping else envs.step(IDLE)
     assert not any(process.is_alive() for process in envs.processes)
     envs.close()

@@ -1,7 +1,7 @@
 """Recorded actions of the public benchmark, replayed with our physics and the original asset pack.
 
 The recordings and the pack are no part of the project; OPENVIMA_GOLDEN and OPENVIMA_REFERENCE_ASSETS name
-their folders. Tolerances: the benchmark's arm stops up to 2 mm beside its targets and its blade 2 to 4 mm
+their folders. Tolerances: the benchmark's arm stops up to 2 mm beside its targets and its spatula 2 to 4 mm
 early; stacks and pushed crowds are chaotic, hence medians.
 """
 

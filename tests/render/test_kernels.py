@@ -15,7 +15,7 @@ from openvima.catalog import TriangleMesh
 from openvima.catalog.boxes import block
 from openvima.render import FRONT, TOP
 from openvima.render.camera import Camera
-from openvima.render.indexed import Scratch, indexed, matrix_3x4
+from openvima.render.indexed import KernelBuffers, indexed, matrix_3x4
 from openvima.render.kernels import draw_triangles, light_intensity, stamp_triangles, texel_index
 from openvima.render.labels import CEILING_M, empty_labels
 from openvima.scene import Pose
@@ -45,7 +45,7 @@ def draw(bodies: list[Body], camera: Camera) -> tuple[np.ndarray, np.ndarray, np
             camera.matrix(),
             texture,
             object_id,
-            *Scratch().arrays(mesh),
+            *KernelBuffers().arrays(mesh),
             depth,
             rgb,
             segm,
@@ -78,7 +78,7 @@ def stamped(bodies: list[tuple[TriangleMesh, Pose, int]]) -> tuple[np.ndarray, n
             -0.5 + half,
             cell,
             CEILING_M,
-            *Scratch().arrays(mesh),
+            *KernelBuffers().arrays(mesh),
             labels,
             heights,
         )

@@ -8,8 +8,8 @@ import pytest
 from openvima.scene import Pose, Scene
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import body_shape
+from openvima.sim.primitive_state import is_at_rest
 from openvima.sim.settling import SETTLE_LIMIT_TICKS, settle
-from openvima.sim.stage import is_at_rest
 from sim_tables import ALL_OBJECTS, ASSETS, table
 
 

@@ -8,7 +8,7 @@ import pytest
 from openvima.scene import Action, Pose
 from openvima.sim import World
 from openvima.sim.bodies import Bodies
-from openvima.sim.primitives import body_under_needle
+from openvima.sim.primitives import body_under_probe
 from sim_tables import ASSETS, table
 
 
@@ -54,7 +54,7 @@ def test_a_ring_is_picked_in_its_hole() -> None:
 @pytest.mark.parametrize(("beside_m", "is_caught"), [(-0.002, True), (0.002, True), (0.006, False)])
 def test_the_cup_catches_what_is_a_little_beside_it(beside_m, is_caught) -> None:
     bodies = Bodies(table(("block", 0.5, 0.0, 0.0)), ASSETS)
-    index, z = body_under_needle(bodies, 0.5 + 0.035 + beside_m, 0.0)
+    index, z = body_under_probe(bodies, 0.5 + 0.035 + beside_m, 0.0)
     assert index == (0 if is_caught else None)
     assert z == pytest.approx(0.069 if is_caught else -0.001, abs=1e-3)
 
@@ -67,7 +67,7 @@ def test_a_block_above_the_floor_is_caught_at_any_height_and_tilt() -> None:
         pose = scene[5].pose.moved(dz=rng.uniform(0.001, 0.05)) @ tilt
         bodies = Bodies(scene.with_poses({5: pose}), ASSETS)
         x, y = rng.uniform(-0.025, 0.025, size=2).tolist()
-        index, z = body_under_needle(bodies, 0.5 + x, y)
+        index, z = body_under_probe(bodies, 0.5 + x, y)
         assert index == 0 and z == pytest.approx(pose.z + 0.035, abs=0.02)
 
 
@@ -86,7 +86,7 @@ def test_a_body_falls_as_soon_as_the_one_below_it_is_taken() -> None:
     world = World(scene, ASSETS)
     seen = []
     execution = world.execute(  # the pan is taken by its handle and put back: now it stands on the block
-        Action.planar((0.62, 0.0), (0.62, 0.0)), watch=seen.append
+        Action.planar((0.62, 0.0), (0.62, 0.0)), monitor=seen.append
     )
     assert execution.grasped == 5
     assert any(now[5].pose.z > 0.2 and now[6].pose.z < 0.03 for now in seen)

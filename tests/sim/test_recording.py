@@ -27,7 +27,7 @@ CASES = [
 def test_recording_and_watching_change_nothing(scene, action) -> None:
     plain, filmed = World(scene, ASSETS), World(scene, ASSETS)
     one = plain.execute(action)
-    other = filmed.execute(action, record=lambda *_: None, watch=lambda _: None)
+    other = filmed.execute(action, record=lambda *_: None, monitor=lambda _: None)
     assert plain.scene == filmed.scene
     assert one.num_ticks == other.num_ticks
     np.testing.assert_array_equal(one.joint_path, other.joint_path)

@@ -1,4 +1,4 @@
-"""Sweeping with the blade."""
+"""Sweeping with the spatula."""
 
 import math
 
@@ -8,9 +8,9 @@ import pytest
 from openvima.scene import Action, Scene
 from openvima.sim import World
 from openvima.sim.end_effectors import COMPAT_SHORTFALL_M
-from openvima.sim.settling import WATCH_TICKS
-from openvima.sim.spatula import SWEEP_M_S, Blade
-from openvima.sim.stage import Stage
+from openvima.sim.primitive_state import PrimitiveState
+from openvima.sim.settling import MONITOR_TICKS
+from openvima.sim.spatula import SWEEP_M_S, Spatula
 from sim_tables import ASSETS, Body, table
 
 
@@ -29,7 +29,7 @@ def test_a_block_is_pushed_to_just_before_the_end_and_lies_flat_against_the_blad
     pose = world.scene[4].pose
     along = (np.array([pose.x, pose.y]) - (end - 0.05 * v)) @ v
     across = (np.array([pose.x, pose.y]) - end) @ np.array([-v[1], v[0]])
-    assert 0.0155 < along < 0.022  # measured on the benchmark: 17–22 mm ahead of the blade's end
+    assert 0.0155 < along < 0.022  # measured on the benchmark: 17–22 mm ahead of the spatula's end
     assert abs(across) < 0.015
     assert abs((pose.yaw_rad - heading_rad + math.pi / 4) % (math.pi / 2) - math.pi / 4) < 0.1
     assert pose.z == pytest.approx(0.014, abs=1e-4)
@@ -82,7 +82,7 @@ def test_compat_ends_three_millimetres_earlier() -> None:
 
 @pytest.mark.parametrize("y", [0.0, 0.02])
 def test_a_blade_that_comes_down_on_a_block_nudges_it_forward_and_pushes_it_on(y) -> None:
-    world = blocks((0.614, y, 0.8))  # the blade comes down at 0.62
+    world = blocks((0.614, y, 0.8))  # the spatula comes down at 0.62
     execution = world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
     assert execution.completed
     pose = world.scene[4].pose
@@ -99,7 +99,7 @@ def test_a_blade_that_comes_down_on_the_side_of_a_block_nudges_it_sideways() -> 
 
 
 def test_a_block_just_behind_the_blade_is_left_alone() -> None:
-    behind = 0.02 + 0.0025 + 0.015 + 0.002  # run-up, half a blade, half a block, 2 mm of air
+    behind = 0.02 + 0.0025 + 0.015 + 0.002  # run-up, half a spatula, half a block, 2 mm of air
     world = blocks((0.6 + behind, 0.0, 0.0))
     before = world.scene
     world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
@@ -110,33 +110,33 @@ def test_watching_sees_the_blocks_on_their_way() -> None:
     world = blocks((0.6, 0.0, 0.0))
     seen = []
     num_ticks = world.execute(
-        Action.planar((0.6, 0.0), (0.35, 0.0)), watch=lambda scene: seen.append(scene[4].pose.x)
+        Action.planar((0.6, 0.0), (0.35, 0.0)), monitor=lambda scene: seen.append(scene[4].pose.x)
     ).num_ticks
-    assert len(seen) >= num_ticks // WATCH_TICKS
+    assert len(seen) >= num_ticks // MONITOR_TICKS
     assert np.abs(np.diff([0.6, *seen])).max() < 0.025  # 0.5 mm a tick, 25 ticks, and catching up
     assert seen[-1] == world.scene[4].pose.x
 
 
 def test_no_stretch_of_motion_without_a_look_is_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
     unwatched, stretches = 0, []
-    count_ticks = Stage.count_ticks
+    count_ticks = PrimitiveState.count_ticks
 
-    def note(stage: Stage, num_ticks: int, *args: object) -> None:
+    def note(state: PrimitiveState, num_ticks: int, *args: object) -> None:
         nonlocal unwatched
         unwatched += num_ticks
         stretches.append(unwatched)
-        count_ticks(stage, num_ticks, *args)  # type: ignore[arg-type]
+        count_ticks(state, num_ticks, *args)  # type: ignore[arg-type]
 
-    def look(_: Scene) -> None:
+    def observe(_: Scene) -> None:
         nonlocal unwatched
         unwatched = 0
 
-    monkeypatch.setattr(Stage, "count_ticks", note)
+    monkeypatch.setattr(PrimitiveState, "count_ticks", note)
     world = blocks((0.6, 0.0, 0.3), (0.55, 0.02, 1.0), (0.47, -0.02, 0.0))
     for x, y in ((0.4, 0.013), (0.43, -0.1), (0.5, 0.1)):
         pose = world.scene[4].pose
-        world.execute(Action.planar((pose.x, pose.y), (x, y)), watch=look)
-    assert max(stretches) == WATCH_TICKS
+        world.execute(Action.planar((pose.x, pose.y), (x, y)), monitor=observe)
+    assert max(stretches) == MONITOR_TICKS
 
 
 def test_fixed_bodies_are_not_pushed() -> None:
@@ -165,7 +165,7 @@ def test_a_block_that_rides_along_ends_where_physics_alone_pushes_it(monkeypatch
     action = Action.planar((0.7, 0.0), (0.35, 0.0))
     riding = World(scene, ASSETS)
     num_ticks = riding.execute(action).num_ticks
-    monkeypatch.setattr(Blade, "_riders", lambda _: None)
+    monkeypatch.setattr(Spatula, "_carried_bodies", lambda _: None)
     pushed = World(scene, ASSETS)
     assert pushed.execute(action).num_ticks > 1.5 * num_ticks
     for ours, theirs in zip(riding.scene.placements, pushed.scene.placements, strict=True):
@@ -177,15 +177,15 @@ def test_riding_bodies_are_watched_on_their_way() -> None:
     world = blocks((0.68, 0.0, 0.0))
     seen = []
     action = Action.planar((0.7, 0.0), (0.35, 0.0))
-    world.execute(action, watch=lambda scene: seen.append(scene[4].pose.x))
+    world.execute(action, monitor=lambda scene: seen.append(scene[4].pose.x))
     steps = -np.diff(seen[:-1])
-    assert steps.max() <= WATCH_TICKS * SWEEP_M_S / 240 + 2e-3
+    assert steps.max() <= MONITOR_TICKS * SWEEP_M_S / 240 + 2e-3
     assert len(seen) > 20
 
 
 def test_compat_moves_the_blade_in_a_bow() -> None:
     # The straight way passes 35 mm beside the block's nearer side; the arm's bow leads 33 mm towards it, and
-    # half the blade's width more.
+    # half the spatula's width more.
     scene = table(("small block", 0.65, 0.1, 0.0), end_effector="spatula")
     action = Action.planar((0.6, 0.3), (0.6, -0.15))
     ways = []

@@ -25,7 +25,7 @@ def problems() -> list[Problem]:
     return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
 
 
-def cast(problem: Problem) -> tuple[Placement, Placement]:
+def roles(problem: Problem) -> tuple[Placement, Placement]:
     """The object to move and the distractor."""
     (moved_id,) = {goal.object_id for goal in problem.goals}
     (distractor,) = (p for p in problem.scene.placements if p.id != moved_id)
@@ -34,7 +34,7 @@ def cast(problem: Problem) -> tuple[Placement, Placement]:
 
 def frames(problem: Problem) -> list[tuple[Placement, Placement]]:
     """For each frame the object to move and the distractor that is shown instead of the real one."""
-    moved, _ = cast(problem)
+    moved, _ = roles(problem)
     shown = []
     for _, fill in problem.prompt.images[1:]:
         assert isinstance(fill, SceneImage)
@@ -56,7 +56,7 @@ def point_of(pose: Pose) -> int:
 def test_walks_are_uniform(problems: list[Problem]) -> None:
     walks = []
     for problem in problems:
-        points = [point_of(pose) for pose in (cast(problem)[0].pose, *targets(problem))]
+        points = [point_of(pose) for pose in (roles(problem)[0].pose, *targets(problem))]
         walks.append((points[0], *((after - before) % 5 for before, after in itertools.pairwise(points))))
     assert_uniform(walks, [(start, a, b) for start in range(5) for a in (1, 4) for b in (1, 4)])
 
@@ -65,15 +65,15 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "L4")
     assert len(drawn_from.dragged_objects) == 19 and len(drawn_from.dragged_textures) == 49
     for role in (0, 1):
-        assert_uniform((cast(problem)[role].object for problem in problems), drawn_from.dragged_objects)
-        assert_uniform((cast(problem)[role].texture for problem in problems), drawn_from.dragged_textures)
+        assert_uniform((roles(problem)[role].object for problem in problems), drawn_from.dragged_objects)
+        assert_uniform((roles(problem)[role].texture for problem in problems), drawn_from.dragged_textures)
     assert_uniform((frames(problem)[0][1].object for problem in problems), drawn_from.dragged_objects)
 
 
 def test_the_distractors_of_table_and_frames_are_drawn_apart(problems: list[Problem]) -> None:
     num_alike = num_same_shape = num_same_texture = 0
     for problem in problems:
-        moved, distractor = cast(problem)
+        moved, distractor = roles(problem)
         shown = frames(problem)[0][1]
         for other in (distractor, shown):
             assert (other.object, other.texture) != (moved.object, moved.texture)
@@ -87,7 +87,7 @@ def test_the_distractors_of_table_and_frames_are_drawn_apart(problems: list[Prob
 
 def test_everything_lies_straight_on_the_table(problems: list[Problem]) -> None:
     for problem in problems[:300]:
-        moved, distractor = cast(problem)
+        moved, distractor = roles(problem)
         assert not moved.fixed and not distractor.fixed
         assert (distractor.pose.x, distractor.pose.y) == (0.5, 0.0)
         for placement in (moved, distractor, *(p for frame in frames(problem) for p in frame)):
@@ -98,7 +98,7 @@ def test_everything_lies_straight_on_the_table(problems: list[Problem]) -> None:
 
 def test_the_frames_show_the_start_and_the_target_of_each_move(problems: list[Problem]) -> None:
     for problem in problems[:300]:
-        moved, _ = cast(problem)
+        moved, _ = roles(problem)
         (_, picture), *_ = problem.prompt.images
         assert isinstance(picture, ObjectImage) and picture.placement == moved
         shown = frames(problem)
@@ -110,7 +110,7 @@ def test_the_frames_show_the_start_and_the_target_of_each_move(problems: list[Pr
 
 
 def test_ids_say_nothing_about_the_role(problems: list[Problem]) -> None:
-    assert_uniform((cast(problem)[0].id for problem in problems), (5, 6))
+    assert_uniform((roles(problem)[0].id for problem in problems), (5, 6))
     assert_uniform((frames(problem)[0][0].id for problem in problems), (2, 3))
 
 
@@ -152,7 +152,7 @@ def test_each_step_must_bring_the_object_near_the_next_place(
     problems: list[Problem], distance: float, is_near: bool
 ) -> None:
     for problem in problems[:5]:
-        moved, _ = cast(problem)
+        moved, _ = roles(problem)
         first, last = ({moved.id: place.moved(dy=distance)} for place in targets(problem))
         outcomes = played(problem, first, last)
         assert outcomes[0].failure is not is_near
@@ -161,14 +161,14 @@ def test_each_step_must_bring_the_object_near_the_next_place(
 
 
 def test_heading_and_height_do_not_count(problems: list[Problem]) -> None:
-    moved, _ = cast(problems[0])
+    moved, _ = roles(problems[0])
     moves = [{moved.id: place.moved(dz=0.2).rotated(2.0)} for place in targets(problems[0])]
     assert played(problems[0], *moves)[-1].success
 
 
 def test_a_step_that_does_not_count_ends_the_episode(problems: list[Problem]) -> None:
     for problem in problems[:20]:
-        moved, distractor = cast(problem)
+        moved, distractor = roles(problem)
         first, last = targets(problem)
         assert played(problem, {})[0].failure
         assert played(problem, {distractor.id: first})[0].failure
@@ -178,15 +178,15 @@ def test_a_step_that_does_not_count_ends_the_episode(problems: list[Problem]) ->
 
 
 def test_no_place_may_be_skipped(problems: list[Problem]) -> None:
-    ahead = [p for p in problems[:50] if targets(p)[1].planar_distance(cast(p)[0].pose) > 0.1]
+    ahead = [p for p in problems[:50] if targets(p)[1].planar_distance(roles(p)[0].pose) > 0.1]
     assert len(ahead) > 10
     for problem in ahead:
-        assert played(problem, {cast(problem)[0].id: targets(problem)[1]})[0].failure
+        assert played(problem, {roles(problem)[0].id: targets(problem)[1]})[0].failure
 
 
 def test_the_way_back_has_to_be_walked_too(problems: list[Problem]) -> None:
-    back = next(p for p in problems if targets(p)[1].planar_distance(cast(p)[0].pose) < 1e-9)
-    moved, _ = cast(back)
+    back = next(p for p in problems if targets(p)[1].planar_distance(roles(p)[0].pose) < 1e-9)
+    moved, _ = roles(back)
     assert played(back, {})[0].failure  # it is where it ends, but has not been away
     assert [o.success for o in played(back, {moved.id: targets(back)[0]}, {moved.id: moved.pose})] == [
         False,
@@ -195,7 +195,7 @@ def test_the_way_back_has_to_be_walked_too(problems: list[Problem]) -> None:
 
 
 def test_the_distractor_may_go_anywhere(problems: list[Problem]) -> None:
-    moved, distractor = cast(problems[0])
+    moved, distractor = roles(problems[0])
     first, last = targets(problems[0])
     moves = ({moved.id: first, distractor.id: first}, {moved.id: last, distractor.id: Pose.planar(0.9, 0.0)})
     assert played(problems[0], *moves)[-1].success
@@ -205,7 +205,7 @@ def test_with_compat_objects_hover_a_nominal_height_above_the_table() -> None:
     for seed in range(50):
         problem = sample_episode(TASK, seed=seed, compat=True).problem
         moved, distractor = problem.scene.placements
-        assert cast(problem) == (moved, distractor)
+        assert roles(problem) == (moved, distractor)
         spec = object_spec(moved.object)
         assert spec.size_min[2] <= moved.pose.z <= spec.size_max[2]
         for placement in (moved, distractor, *(p for frame in frames(problem) for p in frame)):

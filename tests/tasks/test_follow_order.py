@@ -25,7 +25,7 @@ def problems() -> list[Problem]:
     return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
 
 
-def cast(problem: Problem) -> tuple[list[Placement], list[Placement]]:
+def roles(problem: Problem) -> tuple[list[Placement], list[Placement]]:
     """The blocks along the row, and the distractors."""
     shown = {(p.object, p.texture) for p in frames(problem)[0]}
     blocks = [p for p in problem.scene.placements if (p.object, p.texture) in shown]
@@ -67,7 +67,7 @@ def test_all_ways_to_stack_are_known(num_blocks: int, num_moves: int, num_ways: 
 def test_ways_to_stack_are_uniform(problems: list[Problem]) -> None:
     drawn = []
     for problem in problems:
-        blocks, _ = cast(problem)
+        blocks, _ = roles(problem)
         number = {block.texture: n for n, block in enumerate(blocks)}
         shown = [stacks(frame, ROW_OF_THREE) for frame in frames(problem)]
         drawn.append(tuple(tuple(tuple(number[t] for t in stack) for stack in frame) for frame in shown))
@@ -76,19 +76,19 @@ def test_ways_to_stack_are_uniform(problems: list[Problem]) -> None:
 
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
-    casts = [cast(problem) for problem in problems]
-    assert_uniform((blocks[0].object for blocks, _ in casts), drawn_from.dragged_objects)
+    all_roles = [roles(problem) for problem in problems]
+    assert_uniform((blocks[0].object for blocks, _ in all_roles), drawn_from.dragged_objects)
     for place in range(3):
-        assert_uniform((blocks[place].texture for blocks, _ in casts), drawn_from.dragged_textures)
-    assert_uniform((distractor.texture for _, (distractor,) in casts), drawn_from.dragged_textures)
-    assert_uniform((distractor.object for _, (distractor,) in casts), drawn_from.dragged_objects)
-    same_texture = [d.texture in {b.texture for b in blocks} for blocks, (d,) in casts]
+        assert_uniform((blocks[place].texture for blocks, _ in all_roles), drawn_from.dragged_textures)
+    assert_uniform((distractor.texture for _, (distractor,) in all_roles), drawn_from.dragged_textures)
+    assert_uniform((distractor.object for _, (distractor,) in all_roles), drawn_from.dragged_objects)
+    same_texture = [d.texture in {b.texture for b in blocks} for blocks, (d,) in all_roles]
     assert_frequencies(same_texture, {True: 3 / 19, False: 16 / 19})
 
 
 def test_blocks_share_the_shape_and_no_other_object_has_it(problems: list[Problem]) -> None:
     for problem in problems:
-        blocks, (distractor,) = cast(problem)
+        blocks, (distractor,) = roles(problem)
         assert len({block.texture for block in blocks}) == 3
         assert len({(block.object, block.size) for block in blocks}) == 1
         assert distractor.object != blocks[0].object
@@ -108,13 +108,13 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
 
 def test_blocks_lie_in_a_row_away_from_the_distractor(problems: list[Problem], assets: Assets) -> None:
     for problem in problems:
-        blocks, (distractor,) = cast(problem)
+        blocks, (distractor,) = roles(problem)
         for block, y in zip(blocks, ROW_OF_THREE, strict=True):
             assert (block.pose.x, block.pose.y) == pytest.approx((0.5, y))
             assert block.pose.quaternion == (0.0, 0.0, 0.0, 1.0)
             assert block.pose.z == assets.geometry(block.object, block.size).rest_z_m
             assert block.pose.planar_distance(distractor.pose) > 0.08
-    headings = [cast(problem)[1][0].pose.yaw_rad // (np.pi / 4) for problem in problems]
+    headings = [roles(problem)[1][0].pose.yaw_rad // (np.pi / 4) for problem in problems]
     assert_uniform(headings, range(-4, 4))
 
 
@@ -124,7 +124,7 @@ def test_frames_show_blocks_resting_on_those_below(difficulty: str, assets: Asse
         problem = sample_episode(
             TASK, level="L3" if seed % 2 else "train", seed=seed, difficulty=difficulty
         ).problem
-        blocks, _ = cast(problem)
+        blocks, _ = roles(problem)
         geometry = assets.geometry(blocks[0].object, blocks[0].size)
         height_m = float(np.ptp(geometry.visual.vertices[..., 2]))
         for frame in frames(problem):
@@ -140,7 +140,7 @@ def test_the_first_frame_is_the_start_and_the_others_are_what_the_goals_ask_for(
     problems: list[Problem],
 ) -> None:
     for problem in problems[:300]:
-        blocks, _ = cast(problem)
+        blocks, _ = roles(problem)
         id_of = {block.texture: block.id for block in blocks}
         poses = {block.id: block.pose for block in blocks}
         for frame, move in zip(frames(problem), [{}, *moves(problem)], strict=True):
@@ -155,7 +155,7 @@ def test_a_block_keeps_its_id_over_all_frames(problems: list[Problem]) -> None:
 
 
 def test_ids_say_nothing_about_the_place(problems: list[Problem]) -> None:
-    assert_uniform((cast(problem)[0][0].id for problem in problems), (5, 6, 7, 8))
+    assert_uniform((roles(problem)[0][0].id for problem in problems), (5, 6, 7, 8))
     first = [min(frames(problem)[0], key=lambda p: p.pose.y).id for problem in problems]
     assert_uniform(first, (2, 3, 4))
 
@@ -173,7 +173,7 @@ def test_difficulty_adds_blocks_and_frames(difficulty: str, row: tuple[float, ..
         episode = sample_episode(TASK, seed=seed, difficulty=difficulty)
         slots = " ".join(f"{{frame_{n}}}" for n in range(num_frames))
         assert episode.problem.prompt.text == f"Stack objects in this order {slots}."
-        blocks, distractors = cast(episode.problem)
+        blocks, distractors = roles(episode.problem)
         assert [block.pose.y for block in blocks] == pytest.approx(row) and len(distractors) == 1
         assert len(episode.problem.goals) == num_frames - 1
         assert episode.oracle_max_steps == num_frames + 1
@@ -185,9 +185,9 @@ def test_the_list_of_tasks_shows_the_easy_prompt() -> None:
 
 def test_all_numbers_can_be_chosen() -> None:
     problem = sample_episode(TASK, seed=3, num_blocks=2, num_frames=5, num_distractors=3).problem
-    blocks, distractors = cast(problem)
+    blocks, distractors = roles(problem)
     assert (len(blocks), len(frames(problem)), len(distractors)) == (2, 5, 3)
-    assert len(cast(sample_episode(TASK, seed=3, num_distractors=0).problem)[1]) == 0
+    assert len(roles(sample_episode(TASK, seed=3, num_distractors=0).problem)[1]) == 0
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_a_block_that_fell_beside_its_stack_counts(problems: list[Problem]) -> N
 
 def test_other_objects_and_other_orders_are_failures(problems: list[Problem]) -> None:
     for problem in problems[:100]:
-        blocks, (distractor,) = cast(problem)
+        blocks, (distractor,) = roles(problem)
         first, last = moves(problem)
         (awaited, target), *_ = first.items()
         assert played(problem, {})[0].failure
@@ -266,7 +266,7 @@ def test_stacks_of_every_shape_hold() -> None:
             env.step(env.oracle_decision().action)
         assert env.outcome.success, (seed, env.outcome)
         last = {p.texture: p.pose for p in frames(env.episode.problem)[-1]}
-        blocks, _ = cast(env.episode.problem)
+        blocks, _ = roles(env.episode.problem)
         for block in blocks:
             found, shown = env.scene[block.id].pose, last[block.texture]
             assert found.planar_distance(shown) < 1e-3
@@ -278,7 +278,7 @@ def test_stacks_of_every_shape_hold() -> None:
 def test_with_compat_blocks_are_numbered_by_place_and_stacked_by_nominal_height() -> None:
     for seed in range(50):
         problem = sample_episode(TASK, seed=seed, difficulty="hard", compat=True).problem
-        blocks, _ = cast(problem)
+        blocks, _ = roles(problem)
         half_m = blocks[0].size[2] / 2
         assert [block.id for block in blocks] == [5, 6, 7, 8]
         assert {block.pose.z for block in blocks} == {half_m}

@@ -3,7 +3,7 @@
 import pytest
 
 from base_cases import beside, judged
-from gathering_cases import cast, tolerance_m
+from gathering_cases import roles, tolerance_m
 from openvima.errors import ConfigError
 from openvima.scene import Outcome, Pose, Problem
 from openvima.tasks import advance, begin, sample_episode
@@ -22,7 +22,7 @@ def problem_of(task: str, seed: int = 0, **options: object) -> Problem:
 def problem_with(task: str, *, bowl: bool, **options: object) -> Problem:
     """The first problem whose base is a bowl, or is none."""
     problems = (problem_of(task, seed, **options) for seed in range(100))
-    return next(problem for problem in problems if (cast(problem)[0].object == "bowl") is bowl)
+    return next(problem for problem in problems if (roles(problem)[0].object == "bowl") is bowl)
 
 
 @both_tasks
@@ -34,7 +34,7 @@ def test_difficulty_sets_the_counts_and_the_steps(
 ) -> None:
     for seed in range(20):
         episode = sample_episode(task, level=LEVELS[task], seed=seed, difficulty=difficulty)
-        base, dragged, distractors = cast(episode.problem)
+        base, dragged, distractors = roles(episode.problem)
         assert (len(dragged), len(distractors)) == (num_dragged, num_distractors)
         assert len(episode.problem.scene.placements) == 1 + num_dragged + num_distractors
         assert base.fixed and not any(p.fixed for p in (*dragged, *distractors))
@@ -45,7 +45,7 @@ def test_difficulty_sets_the_counts_and_the_steps(
 def test_counts_can_be_chosen(task: str) -> None:
     for num_dragged, num_distractors in ((1, 0), (3, 1), (1, 3)):
         options = {"num_dragged": num_dragged, "num_distractors": num_distractors}
-        _, dragged, distractors = cast(problem_of(task, **options))
+        _, dragged, distractors = roles(problem_of(task, **options))
         assert (len(dragged), len(distractors)) == (num_dragged, num_distractors)
     for name, count, low in (("num_dragged", 0, 1), ("num_distractors", 4, 0), ("num_dragged", 4, 1)):
         with pytest.raises(ConfigError, match=f"{name} is {count}; give an integer from {low} to 3"):
@@ -58,7 +58,7 @@ def test_counts_can_be_chosen(task: str) -> None:
 def test_nothing_is_decided_at_the_start(task: str) -> None:
     for seed in range(200):
         problem = problem_of(task, seed, difficulty="hard" if seed % 2 else "easy")
-        base, dragged, distractors = cast(problem)
+        base, dragged, distractors = roles(problem)
         limit = tolerance_m(problem)
         assert all(not is_in_the_way(p, base) for p in (*dragged, *distractors))
         assert all(p.pose.planar_distance(base.pose) >= limit for p in (*dragged, *distractors))
@@ -79,7 +79,7 @@ def test_an_object_may_be_laid_near_another_of_its_kind(task: str) -> None:
     """Only what would decide the episode is kept apart."""
     distances = []
     for seed in range(200):
-        _, (first, second), _ = cast(problem_of(task, seed))
+        _, (first, second), _ = roles(problem_of(task, seed))
         distances.append(first.pose.planar_distance(second.pose))
     assert min(distances) < 0.125
 
@@ -88,7 +88,7 @@ def test_an_object_may_be_laid_near_another_of_its_kind(task: str) -> None:
 @pytest.mark.parametrize(("bowl", "limit"), [(True, 0.0875), (False, 0.125)])
 def test_all_objects_have_to_be_near_the_base(task: str, bowl: bool, limit: float) -> None:
     problem = problem_with(task, bowl=bowl)
-    base, (first, second), _ = cast(problem)
+    base, (first, second), _ = roles(problem)
     assert tolerance_m(problem) == limit
     near, far = (beside(problem, base.pose, d, moved_id=second.id) for d in (limit - 1e-3, limit + 1e-3))
     assert judged(problem, {first.id: base.pose, second.id: near}).success
@@ -101,7 +101,7 @@ def test_all_objects_have_to_be_near_the_base(task: str, bowl: bool, limit: floa
 @pytest.mark.parametrize("first_index", [0, 1])
 def test_objects_count_in_any_order_and_may_leave_once_counted(task: str, first_index: int) -> None:
     problem = problem_of(task)
-    base, dragged, _ = cast(problem)
+    base, dragged, _ = roles(problem)
     first, second = dragged[first_index], dragged[1 - first_index]
     progress, outcome = advance(problem, begin(problem), problem.scene.with_poses({first.id: base.pose}))
     assert outcome == Outcome() and progress.open_goals == (1 - first_index,)
@@ -112,7 +112,7 @@ def test_objects_count_in_any_order_and_may_leave_once_counted(task: str, first_
 @both_tasks
 def test_an_object_that_is_not_counted_yet_must_stay_on_the_table(task: str) -> None:
     problem = problem_of(task)
-    base, (first, second), (distractor,) = cast(problem)
+    base, (first, second), (distractor,) = roles(problem)
     lost = judged(problem, {first.id: base.pose, second.id: FAR_AWAY})
     assert lost.failure and "left the workspace" in lost.reason
     assert judged(problem, {distractor.id: FAR_AWAY}) == Outcome()
@@ -122,7 +122,7 @@ def test_an_object_that_is_not_counted_yet_must_stay_on_the_table(task: str) -> 
 @pytest.mark.parametrize("bowl", [True, False])
 def test_a_distractor_near_the_base_is_a_failure(task: str, bowl: bool) -> None:
     problem = problem_with(task, bowl=bowl)
-    base, (first, second), (distractor,) = cast(problem)
+    base, (first, second), (distractor,) = roles(problem)
     limit = tolerance_m(problem)
     near, far = (beside(problem, base.pose, d, moved_id=distractor.id) for d in (limit - 1e-3, limit + 1e-3))
     assert "of the target of" in judged(problem, {distractor.id: near}).reason
@@ -135,7 +135,7 @@ def test_a_distractor_near_the_base_is_a_failure(task: str, bowl: bool) -> None:
 @both_tasks
 def test_an_object_near_a_distractor_is_a_failure_wherever_that_is(task: str) -> None:
     problem = problem_of(task)
-    base, (first, second), (distractor,) = cast(problem)
+    base, (first, second), (distractor,) = roles(problem)
     limit = tolerance_m(problem)
     near, far = (beside(problem, distractor.pose, d, moved_id=first.id) for d in (limit - 1e-3, limit + 1e-3))
     assert judged(problem, {first.id: near}).failure
@@ -162,7 +162,7 @@ def test_compat_keeps_the_wide_tolerance_where_no_bowl_can_occur() -> None:
 @both_tasks
 def test_compat_places_base_then_objects_then_distractors(task: str) -> None:
     for seed in range(10):
-        base, dragged, distractors = cast(problem_of(task, seed, compat=True, difficulty="medium"))
+        base, dragged, distractors = roles(problem_of(task, seed, compat=True, difficulty="medium"))
         assert [p.id for p in (base, *dragged, *distractors)] == [5, 6, 7, 8, 9]
 
 
@@ -182,4 +182,4 @@ def test_sampling_hardly_ever_has_to_start_anew(task: str) -> None:
 def test_the_prompt_shows_the_base_and_nothing_else(task: str) -> None:
     problem = problem_of(task)
     ((name, image),) = problem.prompt.images
-    assert name == "base_obj" and image.placement == cast(problem)[0]
+    assert name == "base_obj" and image.placement == roles(problem)[0]

@@ -23,7 +23,7 @@ from openvima.scene import (
     Zone,
     ZoneKeptClear,
 )
-from openvima.tasks import Progress, advance, begin, watch
+from openvima.tasks import Progress, advance, begin, monitor
 
 BASE, TARGET, DISTRACTOR, SECOND = 5, 6, 7, 8
 BASE_POSE = Pose.planar(0.5, 0.2)
@@ -259,10 +259,10 @@ def test_one_too_many_is_told_with_both_numbers() -> None:
 
 def test_touching_the_line_for_a_moment_is_a_failure_for_good() -> None:
     problem = sweep_problem(1)
-    progress = watch(problem, begin(problem), problem.scene.with_poses({4: Pose.planar(0.42, 0, z=0.014)}))
+    progress = monitor(problem, begin(problem), problem.scene.with_poses({4: Pose.planar(0.42, 0, z=0.014)}))
     assert progress.violation == "object 4 (red small block) touched the line"
     back = problem.scene.with_poses(in_zone(4))
-    progress = watch(problem, progress, back)
+    progress = monitor(problem, progress, back)
     progress, outcome = advance(problem, progress, back)
     assert outcome.failure and outcome.reason == "object 4 (red small block) touched the line"
 

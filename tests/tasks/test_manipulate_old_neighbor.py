@@ -19,11 +19,11 @@ STEPS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # 
 TEXTURES = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1"), "L3": ("T_first", "T_second")}
 FAR_AWAY = Pose.planar(0.9, 0.0)
 
-Cast = tuple[Placement, Placement, Placement, list[Placement]]
+Roles = tuple[Placement, Placement, Placement, list[Placement]]
 Cell = tuple[int, int]
 
 
-def cast(problem: Problem) -> Cast:
+def roles(problem: Problem) -> Roles:
     """Dragged object, old neighbour, base, distractors."""
     goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
     order, apart = problem.constraints
@@ -66,7 +66,7 @@ def test_objects_stand_on_a_grid_with_the_base_at_its_right(
     difficulty: str, num_columns: int, num_empty: int, num_distractors: int
 ) -> None:
     for problem in problems(difficulty=difficulty, num=50):
-        dragged, neighbour, base, distractors = cast(problem)
+        dragged, neighbour, base, distractors = roles(problem)
         assert len(distractors) == num_distractors == 3 * num_columns - num_empty - 2
         cells = [cell_of(p, num_columns) for p in (dragged, neighbour, *distractors)]
         assert len(set(cells)) == len(cells)
@@ -79,23 +79,23 @@ def test_objects_stand_on_a_grid_with_the_base_at_its_right(
 def test_the_neighbour_stands_in_the_named_direction() -> None:
     for difficulty, num_columns in (("easy", 2), ("hard", 4)):
         for problem in problems(difficulty=difficulty, num=50):
-            dragged, neighbour, *_ = cast(problem)
+            dragged, neighbour, *_ = roles(problem)
             (row, column), (down, right) = cell_of(dragged, num_columns), STEPS[direction_of(problem)]
             assert cell_of(neighbour, num_columns) == (row + down, column + right)
 
 
 def test_cells_directions_and_gaps_are_drawn_evenly() -> None:
     cells = [(row, column) for row in range(3) for column in range(2)]
-    assert_uniform([cell_of(cast(problem)[0]) for problem in problems()], cells)
+    assert_uniform([cell_of(roles(problem)[0]) for problem in problems()], cells)
     shares: dict[tuple[Cell, str], float] = {}
     for row, column in cells:
         names = [name for name, (down, right) in STEPS.items() if (row + down, column + right) in cells]
         shares |= {((row, column), name): 1 / 6 / len(names) for name in names}
-    drawn = [(cell_of(cast(problem)[0]), direction_of(problem)) for problem in problems()]
+    drawn = [(cell_of(roles(problem)[0]), direction_of(problem)) for problem in problems()]
     assert_frequencies(drawn, shares)
     gaps = []
     for problem in problems():
-        dragged, neighbour, _, distractors = cast(problem)
+        dragged, neighbour, _, distractors = roles(problem)
         others = sorted(set(cells) - {cell_of(dragged), cell_of(neighbour)})
         (gap,) = set(others) - {cell_of(p) for p in distractors}
         gaps.append(others.index(gap))
@@ -104,20 +104,20 @@ def test_cells_directions_and_gaps_are_drawn_evenly() -> None:
 
 @pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 200), ("L2", 300), ("L3", 500)])
 def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
-    casts = [cast(problem) for problem in problems(level, num=num)]
+    all_roles = [roles(problem) for problem in problems(level, num=num)]
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])
     shapes = OBJECT_SETS["D_novel" if level == "L3" else "D_train"]
     for index in (0, 1):  # no two of a table are alike, but the tables are independent
-        assert_uniform([c[index].object for c in casts], shapes)
-        assert_uniform([c[index].texture for c in casts], dragged_textures)
-    assert_uniform([c[2].object for c in casts], OBJECT_SETS["B_novel" if level == "L3" else "B_train"])
-    assert_uniform([c[2].texture for c in casts], base_textures)
+        assert_uniform([c[index].object for c in all_roles], shapes)
+        assert_uniform([c[index].texture for c in all_roles], dragged_textures)
+    assert_uniform([c[2].object for c in all_roles], OBJECT_SETS["B_novel" if level == "L3" else "B_train"])
+    assert_uniform([c[2].texture for c in all_roles], base_textures)
 
 
 def test_no_two_objects_are_alike_but_shapes_and_textures_recur() -> None:
     recurring = {"shape": 0, "texture": 0}
     for problem in problems():
-        dragged, neighbour, _, distractors = cast(problem)
+        dragged, neighbour, _, distractors = roles(problem)
         movable = [dragged, neighbour, *distractors]
         assert len({(p.object, p.texture) for p in movable}) == len(movable)
         recurring["shape"] += len({p.object for p in movable}) < len(movable)
@@ -129,7 +129,7 @@ def test_no_two_objects_are_alike_but_shapes_and_textures_recur() -> None:
 
 def test_the_prompt_shows_object_and_base_but_not_the_neighbour() -> None:
     problem = problems()[0]
-    dragged, _, base, _ = cast(problem)
+    dragged, _, base, _ = roles(problem)
     shown = {name: fill.placement for name, fill in problem.prompt.images if isinstance(fill, ObjectImage)}
     assert shown == {"dragged_obj": dragged, "base_obj": base}
     assert list(shown) == ["dragged_obj", "base_obj"]
@@ -146,7 +146,7 @@ def test_nothing_overlaps_and_nothing_is_decided_at_the_start(level: str, assets
 
 def test_object_then_neighbour_is_a_success() -> None:
     for problem in problems()[:30]:
-        dragged, neighbour, base, _ = cast(problem)
+        dragged, neighbour, base, _ = roles(problem)
         for distance, is_met in ((0.0, True), (0.099, True), (0.101, False)):
             place = beside(problem, base.pose, distance, moved_id=dragged.id) if distance else base.pose
             scene = problem.scene.with_poses({dragged.id: place.rotated(1.0)})
@@ -162,7 +162,7 @@ def test_object_then_neighbour_is_a_success() -> None:
 
 def test_the_neighbour_must_not_come_first() -> None:
     problem = problems()[0]
-    dragged, neighbour, base, distractors = cast(problem)
+    dragged, neighbour, base, distractors = roles(problem)
     outcome = judged(problem, {neighbour.id: base.pose})
     assert outcome.failure and "came before" in outcome.reason
     assert judged(problem, {neighbour.id: base.pose, dragged.id: base.pose}).success  # both at once
@@ -174,7 +174,7 @@ def test_the_neighbour_must_not_come_first() -> None:
 
 def test_the_object_may_be_taken_out_again() -> None:
     problem = problems()[0]
-    dragged, neighbour, base, _ = cast(problem)
+    dragged, neighbour, base, _ = roles(problem)
     progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
     end = problem.scene.with_poses({dragged.id: FAR_AWAY, neighbour.id: base.pose})
     assert advance(problem, progress, end)[1].success
@@ -182,7 +182,7 @@ def test_the_object_may_be_taken_out_again() -> None:
 
 def test_a_wrong_object_in_the_base_is_a_failure() -> None:
     problem = problems()[0]
-    dragged, _, base, distractors = cast(problem)
+    dragged, _, base, distractors = roles(problem)
     progress, _ = advance(problem, begin(problem), problem.scene.with_poses({dragged.id: base.pose}))
     for distractor in distractors:
         near, far = (beside(problem, base.pose, d, moved_id=distractor.id) for d in (0.099, 0.101))
@@ -195,7 +195,7 @@ def test_a_wrong_object_in_the_base_is_a_failure() -> None:
 
 def test_an_object_pushed_against_a_distractor_is_a_failure() -> None:
     problem = problems()[0]
-    dragged, neighbour, _, distractors = cast(problem)
+    dragged, neighbour, _, distractors = roles(problem)
     for moved in (dragged, neighbour):
         near, far = (beside(problem, distractors[0].pose, d, moved_id=moved.id) for d in (0.099, 0.101))
         assert judged(problem, {moved.id: near}).failure
@@ -204,7 +204,7 @@ def test_an_object_pushed_against_a_distractor_is_a_failure() -> None:
 
 def test_both_objects_have_to_stay_on_the_table() -> None:
     problem = problems()[0]
-    dragged, neighbour, base, _ = cast(problem)
+    dragged, neighbour, base, _ = roles(problem)
     for lost in ({dragged.id: FAR_AWAY}, {neighbour.id: FAR_AWAY, dragged.id: base.pose}):
         outcome = judged(problem, lost)
         assert outcome.failure and "left the workspace" in outcome.reason
@@ -215,7 +215,7 @@ def test_compat_places_row_by_row_and_the_base_last() -> None:
         problem = sample_episode(TASK, seed=seed, compat=True).problem
         *movable, base = problem.scene.placements
         assert [cell_of(p) for p in movable] == sorted(cell_of(p) for p in movable)
-        assert base.id == cast(problem)[2].id == 5 + len(movable)
+        assert base.id == roles(problem)[2].id == 5 + len(movable)
         assert all(p.pose.z == p.size[2] / 2 for p in problem.scene.placements)
 
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from base_cases import assert_judged_at_its_limits, cast, cast_of_twins
+from base_cases import assert_judged_at_its_limits, roles, roles_with_twins
 from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import pool
 from openvima.errors import ConfigError
@@ -60,7 +60,7 @@ def test_gray_pictures_introduce_target_and_base_once_each(problems: list[Proble
     for problem in problems:
         images = dict(problem.prompt.images)
         assert len(images) == 8
-        target, base, _ = cast(problem)
+        target, base, _ = roles(problem)
         for name, original in (("dragged_obj", target), ("base_obj", base)):
             image = images[name]
             assert problem.prompt.text.count("{" + name + "}") == 1
@@ -75,7 +75,7 @@ def test_five_bodies_stand_apart_and_only_bases_are_fixed(problems: list[Problem
         placements = problem.scene.placements
         assert len(placements) == 5
         assert all(placement.fixed is (placement.object in base_shapes) for placement in placements)
-        target, base, twin, others = cast_of_twins(problem)
+        target, base, twin, others = roles_with_twins(problem)
         assert (twin.object, twin.size) == (target.object, target.size)
         assert not {other.object for other in others} & {base.object, target.object}
         assert all(
@@ -89,17 +89,17 @@ def test_textures_of_distractors_come_from_both_lists_put_together(problems: lis
     drawn_from = pool(TASK, "L4")
     entries = collections.Counter((*drawn_from.dragged_textures, *drawn_from.base_textures))
     assert entries.total() == 91 and collections.Counter(entries.values()) == {1: 53, 2: 19}
-    drawn = [d.texture for problem in problems for d in cast_of_twins(problem)[3]]
+    drawn = [d.texture for problem in problems for d in roles_with_twins(problem)[3]]
     assert_frequencies(drawn, {texture: count / 91 for texture, count in entries.items()})
 
 
 def test_shapes_and_textures_of_twins_and_bases_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "L4")
-    casts = [cast(problem) for problem in problems]
-    assert_uniform([target.object for target, _, _ in casts], drawn_from.dragged_objects)
-    assert_uniform([target.texture for target, _, _ in casts], drawn_from.dragged_textures)
-    assert_uniform([base.object for _, base, _ in casts], drawn_from.base_objects)
-    assert_uniform([base.texture for _, base, _ in casts], drawn_from.base_textures)
+    all_roles = [roles(problem) for problem in problems]
+    assert_uniform([target.object for target, _, _ in all_roles], drawn_from.dragged_objects)
+    assert_uniform([target.texture for target, _, _ in all_roles], drawn_from.dragged_textures)
+    assert_uniform([base.object for _, base, _ in all_roles], drawn_from.base_objects)
+    assert_uniform([base.texture for _, base, _ in all_roles], drawn_from.base_textures)
 
 
 def test_outcomes_change_at_the_limits() -> None:
@@ -113,7 +113,7 @@ def test_beyond_easy_another_shape_is_like_one_of_the_twins(difficulty: str) -> 
     for seed in range(60):
         episode = sample_episode(TASK, level="L4", seed=seed, difficulty=difficulty, compat=True)
         num_redraws += episode.num_redraws
-        target, _, (twin, extra, *others) = cast(episode.problem)
+        target, _, (twin, extra, *others) = roles(episode.problem)
         like = target if difficulty == "hard" else twin
         assert len(others) == 2
         assert extra.object != target.object

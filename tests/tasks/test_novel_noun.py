@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from base_cases import assert_judged_at_its_limits, cast
+from base_cases import assert_judged_at_its_limits, roles
 from frequencies import assert_frequencies, assert_uniform
 from openvima.catalog import TEXTURE_SETS, pool
 from openvima.errors import ConfigError
@@ -42,7 +42,7 @@ def test_two_different_nouns_are_introduced_in_either_order(problems: list[Probl
 
 def test_the_pictures_are_gray_and_of_target_and_base(problems: list[Problem]) -> None:
     for problem in problems[:200]:
-        target, base, _ = cast(problem)
+        target, base, _ = roles(problem)
         images = dict(problem.prompt.images)
         assert set(images) == {"dragged_obj_1", "base_obj"}
         for image, shown in ((images["dragged_obj_1"], target), (images["base_obj"], base)):
@@ -53,19 +53,19 @@ def test_the_pictures_are_gray_and_of_target_and_base(problems: list[Problem]) -
 
 def test_textures_and_bases_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
-    casts = [cast(problem) for problem in problems]
-    assert_uniform([target.texture for target, _, _ in casts], drawn_from.dragged_textures)
-    assert_uniform([base.texture for _, base, _ in casts], drawn_from.base_textures)
-    assert_uniform([base.object for _, base, _ in casts], drawn_from.base_objects)
+    all_roles = [roles(problem) for problem in problems]
+    assert_uniform([target.texture for target, _, _ in all_roles], drawn_from.dragged_textures)
+    assert_uniform([base.texture for _, base, _ in all_roles], drawn_from.base_textures)
+    assert_uniform([base.object for _, base, _ in all_roles], drawn_from.base_objects)
     textures = (*drawn_from.dragged_textures, *drawn_from.base_textures)
-    assert_uniform([distractors[0].texture for _, _, distractors in casts], textures)
+    assert_uniform([distractors[0].texture for _, _, distractors in all_roles], textures)
 
 
 def test_a_distractor_has_a_third_shape_and_is_fixed_if_a_base(problems: list[Problem]) -> None:
     base_shapes = pool(TASK, "train").base_objects
     num_bases = 0
     for problem in problems:
-        target, base, (distractor,) = cast(problem)
+        target, base, (distractor,) = roles(problem)
         assert distractor.object not in (target.object, base.object)
         assert base.fixed and not target.fixed
         assert distractor.fixed is (distractor.object in base_shapes)
@@ -77,7 +77,7 @@ def test_a_distractor_has_a_third_shape_and_is_fixed_if_a_base(problems: list[Pr
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool(TASK, level)
     for seed in range(150):
-        target, base, (distractor,) = cast(sample_episode(TASK, level=level, seed=seed).problem)
+        target, base, (distractor,) = roles(sample_episode(TASK, level=level, seed=seed).problem)
         assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
         assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
         assert distractor.object in (*drawn_from.dragged_objects, *drawn_from.base_objects)
@@ -108,7 +108,7 @@ def test_the_difficulty_says_who_gets_which_textures(
 ) -> None:
     drawn = []
     for seed in range(100):
-        target, base, _ = cast(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
+        target, base, _ = roles(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
         drawn.append(tuple("C1" if p.texture in TEXTURE_SETS["C1"] else "C2" for p in (target, base)))
     if len(options) == 1:
         assert set(drawn) == set(options)
@@ -121,7 +121,7 @@ def test_words_and_number_of_distractors_can_be_chosen() -> None:
         problem = sample_episode(
             TASK, seed=1, nouns=["tove", "rath"], num_distractors=num_distractors
         ).problem
-        assert len(cast(problem)[2]) == num_distractors
+        assert len(roles(problem)[2]) == num_distractors
         _, match = matched(problem)
         assert {match["target"], match["base"]} == {"tove", "rath"}
 
@@ -150,6 +150,6 @@ def test_other_unfit_options_are_refused() -> None:
 
 def test_compat_starts_hover_and_have_ids_in_order_of_roles() -> None:
     for seed in range(30):
-        target, base, (distractor,) = cast(sample_episode(TASK, seed=seed, compat=True).problem)
+        target, base, (distractor,) = roles(sample_episode(TASK, seed=seed, compat=True).problem)
         assert (base.id, target.id, distractor.id) == (5, 6, 7)
         assert target.pose.z == target.size[2] / 2

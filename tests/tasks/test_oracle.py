@@ -48,7 +48,7 @@ def test_the_pick_avoids_the_part_that_is_covered(assets: Assets) -> None:
 def test_a_hidden_object_is_an_error_that_names_it(assets: Assets) -> None:
     lower = Placement(5, "shorter block", "red", (0.07, 0.07, 0.03), Pose.planar(0.5, 0.0, z=0.014))
     upper = Placement(6, "block", "red", (0.07, 0.07, 0.07), Pose.planar(0.5, 0.0, z=0.064))
-    with pytest.raises(OracleError, match=r"nothing of object 5 \(red shorter block\)"):
+    with pytest.raises(OracleError, match=r"object 5 \(red shorter block\) is not visible"):
         visible_point(Scene((lower, upper)), 5, assets=assets)
 
 

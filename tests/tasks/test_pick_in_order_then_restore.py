@@ -29,10 +29,10 @@ CELLS = [(x, y) for x in (0.375, 0.625) for y in (-0.25, 0.0, 0.25)]
 TEXTURES = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1"), "L3": ("T_first", "T_second")}
 BARE_TABLE = Action.planar((0.26, -0.49), (0.26, -0.49))
 
-Cast = tuple[Placement, Placement, list[Placement], list[Placement]]
+Roles = tuple[Placement, Placement, list[Placement], list[Placement]]
 
 
-def cast(problem: Problem) -> Cast:
+def roles(problem: Problem) -> Roles:
     """Object, the base that it starts in, the bases to visit in order, the other bases."""
     goals = [goal for goal in problem.goals if isinstance(goal, AtPose)]
     (object_id,) = {goal.object_id for goal in goals}
@@ -64,14 +64,16 @@ def after(problem: Problem, *places: Pose) -> tuple[Progress, Outcome]:
     progress, outcome = begin(problem), Outcome()
     for place in places:
         assert not outcome.is_over, outcome
-        progress, outcome = advance(problem, progress, problem.scene.with_poses({cast(problem)[0].id: place}))
+        progress, outcome = advance(
+            problem, progress, problem.scene.with_poses({roles(problem)[0].id: place})
+        )
     return progress, outcome
 
 
 @pytest.mark.parametrize(("difficulty", "num_targets"), [("easy", 2), ("medium", 2), ("hard", 3)])
 def test_six_bases_stand_in_two_rows(difficulty: str, num_targets: int) -> None:
     for problem in problems(difficulty=difficulty, num=50):
-        dragged, source, targets, others = cast(problem)
+        dragged, source, targets, others = roles(problem)
         bases = [source, *targets, *others]
         assert (len(targets), len(others)) == (num_targets, 5 - num_targets)
         assert sorted(cell_of(base) for base in bases) == CELLS
@@ -87,24 +89,24 @@ def test_six_bases_stand_in_two_rows(difficulty: str, num_targets: int) -> None:
 def test_source_and_targets_are_drawn_evenly() -> None:
     drawn = []
     for problem in problems():
-        _, source, targets, _ = cast(problem)
+        _, source, targets, _ = roles(problem)
         drawn.append(tuple(cell_of(base) for base in (source, *targets)))
     assert_uniform(drawn, itertools.permutations(CELLS, 3))
 
 
 @pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 300)])
 def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
-    casts = [cast(problem) for problem in problems(level, num=num)]
+    all_roles = [roles(problem) for problem in problems(level, num=num)]
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])
-    assert_uniform([c[0].object for c in casts], OBJECT_SETS["D_novel" if level == "L3" else "D_train"])
-    assert_uniform([c[0].texture for c in casts], dragged_textures)
-    shapes = [c[1].object for c in casts]
+    assert_uniform([c[0].object for c in all_roles], OBJECT_SETS["D_novel" if level == "L3" else "D_train"])
+    assert_uniform([c[0].texture for c in all_roles], dragged_textures)
+    shapes = [c[1].object for c in all_roles]
     if level == "L3":
         assert set(shapes) == {"pallet"}
     else:
         assert_uniform(shapes, OBJECT_SETS["B_train"])
-    assert_uniform([c[1].texture for c in casts], base_textures)
-    assert_uniform([c[2][0].texture for c in casts], base_textures)
+    assert_uniform([c[1].texture for c in all_roles], base_textures)
+    assert_uniform([c[2][0].texture for c in all_roles], base_textures)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +126,7 @@ def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
 )
 def test_the_prompt_shows_object_and_targets_but_not_the_source(difficulty: str, sentence: str) -> None:
     for problem in problems(difficulty=difficulty, num=50):
-        dragged, _, targets, _ = cast(problem)
+        dragged, _, targets, _ = roles(problem)
         assert problem.prompt.text == sentence
         shown = {
             name: fill.placement for name, fill in problem.prompt.images if isinstance(fill, ObjectImage)
@@ -135,7 +137,7 @@ def test_the_prompt_shows_object_and_targets_but_not_the_source(difficulty: str,
 
 def test_bases_of_different_shapes_keep_their_own_sizes() -> None:
     for seed in range(30):
-        _, source, targets, others = cast(sample_episode(TASK, seed=seed, same_bases=False).problem)
+        _, source, targets, others = roles(sample_episode(TASK, seed=seed, same_bases=False).problem)
         bases = [source, *targets, *others]
         assert len({base.texture for base in bases}) == 6
         for base in bases:
@@ -143,7 +145,7 @@ def test_bases_of_different_shapes_keep_their_own_sizes() -> None:
             assert all(
                 low <= s <= high for low, s, high in zip(spec.size_min, base.size, spec.size_max, strict=True)
             )
-    shapes = [cast(sample_episode(TASK, seed=s, same_bases=False).problem)[3][0].object for s in range(300)]
+    shapes = [roles(sample_episode(TASK, seed=s, same_bases=False).problem)[3][0].object for s in range(300)]
     assert_uniform(shapes, OBJECT_SETS["B_train"])
 
 
@@ -158,7 +160,7 @@ def laid(assets: Assets, base: str, dragged: str) -> Problem:
 def test_the_object_lies_in_its_base_and_stays_there(base: str, assets: Assets) -> None:
     for name in (*OBJECT_SETS["D_train"], *OBJECT_SETS["D_novel"]):
         problem = laid(assets, base, name)
-        dragged, source, _, _ = cast(problem)
+        dragged, source, _, _ = roles(problem)
         before = dragged.pose
         assert before.planar_distance(source.pose) < (0.015 if base == "bowl" else 1e-9)
         world = World(problem.scene, assets)
@@ -171,7 +173,7 @@ def test_the_object_lies_in_its_base_and_stays_there(base: str, assets: Assets) 
 
 def test_there_and_back_in_order_is_a_success() -> None:
     for problem in problems(difficulty="hard", num=30):
-        _, source, (one, two, three), _ = cast(problem)
+        _, source, (one, two, three), _ = roles(problem)
         assert judged(problem, {}) == Outcome()
         progress, outcome = after(problem, one.pose, two.pose, three.pose)
         assert progress.open_goals == (3,) and outcome == Outcome()
@@ -181,7 +183,7 @@ def test_there_and_back_in_order_is_a_success() -> None:
 @pytest.mark.parametrize("goal_index", [0, 1, 2])
 def test_each_place_counts_within_5_cm(goal_index: int) -> None:
     for problem in problems()[:20]:
-        _, source, (one, two), _ = cast(problem)
+        _, source, (one, two), _ = roles(problem)
         places = [one.pose, two.pose, source.pose]
         for distance, is_met in ((0.049, True), (0.051, False)):
             near = places[goal_index].moved(distance * 0.6, distance * 0.8).rotated(2.0)
@@ -191,7 +193,7 @@ def test_each_place_counts_within_5_cm(goal_index: int) -> None:
 
 def test_a_later_target_must_not_be_visited_before_its_turn() -> None:
     problem = problems(difficulty="hard", num=30)[0]
-    _, _, (one, two, three), _ = cast(problem)
+    _, _, (one, two, three), _ = roles(problem)
     for places in ((two,), (three,), (one, three)):
         *before, last = [place.pose for place in places]
         outcome = after(problem, *before, last.moved(dy=0.049))[1]
@@ -201,7 +203,7 @@ def test_a_later_target_must_not_be_visited_before_its_turn() -> None:
 
 def test_other_places_only_cost_a_step() -> None:
     for problem in problems()[:20]:
-        _, source, (one, two), (other, *_) = cast(problem)
+        _, source, (one, two), (other, *_) = roles(problem)
         home, beside_all = source.pose, Pose.planar(0.5, 0.125)
         way = (
             other.pose,
@@ -221,14 +223,14 @@ def test_other_places_only_cost_a_step() -> None:
 
 def test_the_last_place_is_the_base_it_came_from() -> None:
     problem = problems()[0]
-    _, _, (one, two), others = cast(problem)
+    _, _, (one, two), others = roles(problem)
     for other in others:
         assert after(problem, one.pose, two.pose, other.pose)[1] == Outcome()
 
 
 def test_the_object_must_stay_on_the_table() -> None:
     problem = problems()[0]
-    _, _, (one, _), _ = cast(problem)
+    _, _, (one, _), _ = roles(problem)
     outcome = after(problem, one.pose, Pose.planar(0.76, 0.0))[1]
     assert outcome.failure and "left the workspace" in outcome.reason
 
@@ -237,7 +239,7 @@ def test_compat_hovers_the_object_over_its_base_and_places_it_first() -> None:
     for level in ("train", "L3"):
         for seed in range(30):
             problem = sample_episode(TASK, level=level, seed=seed, compat=True).problem
-            dragged, source, targets, others = cast(problem)
+            dragged, source, targets, others = roles(problem)
             assert [p.id for p in (dragged, source, *targets, *others)] == list(range(5, 12))
             factor = 2 if source.object in ("bowl", "pallet") else 0.5
             assert dragged.pose.z == factor * dragged.size[2]

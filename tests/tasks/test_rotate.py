@@ -88,7 +88,7 @@ def test_other_angles_can_be_asked_for() -> None:
 
 @pytest.mark.parametrize("angles_deg", [(15,), (30, 0), (360,), (-350,), ()])
 def test_angles_within_the_tolerance_are_refused(angles_deg: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match="must turn by more than 15 degrees"):
+    with pytest.raises(ConfigError, match="must be larger than 15 degrees"):
         sample_episode("rotate", seed=0, angles_deg=angles_deg)
 
 

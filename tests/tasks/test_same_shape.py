@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from frequencies import assert_frequencies, assert_uniform
-from gathering_cases import cast
+from gathering_cases import roles
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, Assets, object_spec, pool
 from openvima.errors import ConfigError
 from openvima.scene import Placement
@@ -24,17 +24,17 @@ ALIKE = {
 }
 TEXTURES = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1"), "L3": ("T_first", "T_second")}
 
-Cast = tuple[Placement, list[Placement], list[Placement]]
+Roles = tuple[Placement, list[Placement], list[Placement]]
 
 
 @functools.cache
-def casts(level: str, num_episodes: int) -> list[Cast]:
-    return [cast(sample_episode(TASK, level=level, seed=seed).problem) for seed in range(num_episodes)]
+def all_roles(level: str, num_episodes: int) -> list[Roles]:
+    return [roles(sample_episode(TASK, level=level, seed=seed).problem) for seed in range(num_episodes)]
 
 
 @pytest.mark.parametrize(("level", "num_episodes"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 500)])
 def test_each_level_has_its_shapes_and_textures(level: str, num_episodes: int) -> None:
-    episodes = casts(level, num_episodes)
+    episodes = all_roles(level, num_episodes)
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])
     bases = OBJECT_SETS["B_novel" if level == "L3" else "B_train"]
     candidates = OBJECT_SETS["D_shape_novel" if level == "L3" else "D_shape"]
@@ -49,14 +49,14 @@ def test_each_level_has_its_shapes_and_textures(level: str, num_episodes: int) -
 
 
 def test_distractors_of_a_round_base_are_all_that_is_not_round() -> None:
-    shapes = [others[0].object for base, _, others in casts("train", 2000) if base.object == "bowl"]
+    shapes = [others[0].object for base, _, others in all_roles("train", 2000) if base.object == "bowl"]
     counts = {name: shapes.count(name) * 13 / len(shapes) for name in set(shapes)}
     assert set(counts) == set(OBJECT_SETS["D_shape"]) - {"ring"}
     assert all(0.6 < share < 1.6 for share in counts.values()), counts
 
 
 def test_objects_to_gather_may_share_a_texture_but_not_with_a_distractor() -> None:
-    episodes = casts("train", 2000)
+    episodes = all_roles("train", 2000)
     same = [first.texture == second.texture for _, (first, second), _ in episodes]
     assert_frequencies(same, {True: 1 / 19, False: 18 / 19})
     for _, dragged, distractors in episodes:

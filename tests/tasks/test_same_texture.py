@@ -3,7 +3,7 @@
 import pytest
 
 from frequencies import assert_uniform
-from gathering_cases import cast
+from gathering_cases import roles
 from openvima.catalog import TEXTURE_SETS
 from openvima.catalog.objects import OBJECTS
 from openvima.scene import Placement
@@ -12,32 +12,34 @@ from openvima.tasks import sample_episode, task_spec
 BASES = ("pan", "bowl", "container", "frame", "pallet", "square")
 KIT = tuple(name for name, spec in OBJECTS.items() if spec.kind == "kit")
 
-Cast = tuple[Placement, list[Placement], list[Placement]]
+Roles = tuple[Placement, list[Placement], list[Placement]]
 
 
 @pytest.fixture(scope="module")
-def casts() -> list[Cast]:
-    return [cast(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)]
+def all_roles() -> list[Roles]:
+    return [roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)]
 
 
-def test_bases_and_textures_are_uniform(casts: list[Cast]) -> None:
+def test_bases_and_textures_are_uniform(all_roles: list[Roles]) -> None:
     assert len(TEXTURE_SETS["T_first"]) == 24 and len(TEXTURE_SETS["T_second"]) == 25
-    assert_uniform([base.object for base, _, _ in casts], BASES)
-    assert_uniform([base.texture for base, _, _ in casts], TEXTURE_SETS["T_second"])
-    assert_uniform([d.texture for _, _, distractors in casts for d in distractors], TEXTURE_SETS["T_first"])
+    assert_uniform([base.object for base, _, _ in all_roles], BASES)
+    assert_uniform([base.texture for base, _, _ in all_roles], TEXTURE_SETS["T_second"])
+    assert_uniform(
+        [d.texture for _, _, distractors in all_roles for d in distractors], TEXTURE_SETS["T_first"]
+    )
 
 
-def test_the_objects_to_gather_have_the_bases_texture_and_distractors_another(casts: list[Cast]) -> None:
-    for base, dragged, distractors in casts:
+def test_the_objects_to_gather_have_the_bases_texture_and_distractors_another(all_roles: list[Roles]) -> None:
+    for base, dragged, distractors in all_roles:
         assert {p.texture for p in dragged} == {base.texture}
         assert base.texture not in {p.texture for p in distractors}
 
 
-def test_shapes_are_the_19_of_the_task_nearly_equally_often(casts: list[Cast]) -> None:
+def test_shapes_are_the_19_of_the_task_nearly_equally_often(all_roles: list[Roles]) -> None:
     assert len(KIT) == 18
     for shapes in (
-        [p.object for _, dragged, _ in casts for p in dragged],
-        [p.object for _, _, distractors in casts for p in distractors],
+        [p.object for _, dragged, _ in all_roles for p in dragged],
+        [p.object for _, _, distractors in all_roles for p in distractors],
     ):
         counts = {name: shapes.count(name) * 19 / len(shapes) for name in set(shapes)}
         assert set(counts) == {*KIT, "shorter block"}
@@ -45,9 +47,9 @@ def test_shapes_are_the_19_of_the_task_nearly_equally_often(casts: list[Cast]) -
         assert all(0.7 < share < 1.4 for share in counts.values()), counts
 
 
-def test_shapes_do_not_tell_who_belongs_together(casts: list[Cast]) -> None:
-    same = sum(first.object == second.object for _, (first, second), _ in casts)
-    alike = sum(dragged[0].object == distractor.object for _, dragged, (distractor,) in casts)
+def test_shapes_do_not_tell_who_belongs_together(all_roles: list[Roles]) -> None:
+    same = sum(first.object == second.object for _, (first, second), _ in all_roles)
+    alike = sum(dragged[0].object == distractor.object for _, dragged, (distractor,) in all_roles)
     assert 60 < same < 160 and 60 < alike < 160  # 1 in 19 is 105
 
 

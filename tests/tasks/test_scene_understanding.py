@@ -18,7 +18,7 @@ NUM_EPISODES = 2000
 SENTENCE = r"Put the ([\w ]+) object in \{scene\} into the ([\w ]+) object\."
 
 
-def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
+def roles(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     """Target, base and distractors."""
     (goal,) = problem.goals
     (constraint,) = problem.constraints
@@ -35,12 +35,12 @@ def problems() -> list[Problem]:
 
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = task_spec(TASK).pool("train")
-    casts = [cast(problem) for problem in problems]
-    assert_uniform((target.texture for target, _, _ in casts), drawn_from.dragged_textures)
-    assert_uniform((base.texture for _, base, _ in casts), drawn_from.base_textures)
-    assert_uniform((base.object for _, base, _ in casts), drawn_from.base_objects)
+    all_roles = [roles(problem) for problem in problems]
+    assert_uniform((target.texture for target, _, _ in all_roles), drawn_from.dragged_textures)
+    assert_uniform((base.texture for _, base, _ in all_roles), drawn_from.base_textures)
+    assert_uniform((base.object for _, base, _ in all_roles), drawn_from.base_objects)
     # Narrow shapes fit beside a hollow base more often, so targets are uniform only roughly.
-    counts = collections.Counter(target.object for target, _, _ in casts)
+    counts = collections.Counter(target.object for target, _, _ in all_roles)
     assert set(counts) == set(drawn_from.dragged_objects)
     assert all(0.6 < count * 14 / NUM_EPISODES < 1.5 for count in counts.values())
 
@@ -49,7 +49,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool(TASK, level)
     for seed in range(150):
-        target, base, distractors = cast(sample_episode(TASK, level=level, seed=seed).problem)
+        target, base, distractors = roles(sample_episode(TASK, level=level, seed=seed).problem)
         assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
         assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
         for distractor in distractors:
@@ -58,7 +58,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
 
 def test_a_distractor_looks_like_the_base_or_has_the_texture_of_the_target(problems: list[Problem]) -> None:
     kinds = []
-    for target, base, (distractor,) in map(cast, problems):
+    for target, base, (distractor,) in map(roles, problems):
         is_base = distractor.object == base.object
         assert target.texture != base.texture
         assert distractor.fixed is is_base and base.fixed and not target.fixed
@@ -71,14 +71,14 @@ def test_a_distractor_looks_like_the_base_or_has_the_texture_of_the_target(probl
 
 
 def test_a_base_as_distractor_may_have_any_other_texture(problems: list[Problem]) -> None:
-    seen = {d.texture for _, base, (d,) in map(cast, problems) if d.object == base.object}
+    seen = {d.texture for _, base, (d,) in map(roles, problems) if d.object == base.object}
     assert seen == {*TEXTURE_SETS["C1"], *TEXTURE_SETS["C2"]}
 
 
 def test_the_picture_shows_the_target_among_things_of_other_textures(problems: list[Problem]) -> None:
     num_same_shape = num_same_place = 0
     for problem in problems:
-        target, _, _ = cast(problem)
+        target, _, _ = roles(problem)
         first, second = pictured(problem)
         shown, other = (first, second) if first.texture == target.texture else (second, first)
         assert (shown.object, shown.size, shown.texture) == (target.object, target.size, target.texture)
@@ -91,7 +91,7 @@ def test_the_picture_shows_the_target_among_things_of_other_textures(problems: l
 
 
 def test_ids_in_the_picture_do_not_tell_the_target(problems: list[Problem]) -> None:
-    ids = (p.id for problem in problems for p in pictured(problem) if p.texture == cast(problem)[0].texture)
+    ids = (p.id for problem in problems for p in pictured(problem) if p.texture == roles(problem)[0].texture)
     assert_uniform(ids, (2, 3))
 
 
@@ -100,7 +100,7 @@ def test_the_prompt_names_both_textures(problems: list[Problem]) -> None:
         "Put the {dragged_texture} object in {scene} into the {base_texture} object."
     )
     for problem in problems:
-        target, base, _ = cast(problem)
+        target, base, _ = roles(problem)
         match = re.fullmatch(SENTENCE, problem.prompt.text)
         assert match and match.groups() == (target.texture, base.texture)
 
@@ -126,7 +126,7 @@ def test_distances_decide(
     target_at: float | None, distractor_at: float | None, success: bool, failure: bool
 ) -> None:
     problem = sample_episode(TASK, seed=1).problem
-    target, base, (distractor,) = cast(problem)
+    target, base, (distractor,) = roles(problem)
     inward = 1.0 if base.pose.y < 0 else -1.0
     moved = {}
     for object_id, distance in ((target.id, target_at), (distractor.id, distractor_at)):
@@ -138,7 +138,7 @@ def test_distances_decide(
 
 def test_a_lost_target_is_a_failure_and_a_lost_distractor_is_none() -> None:
     problem = sample_episode(TASK, seed=1).problem
-    target, _, (distractor,) = cast(problem)
+    target, _, (distractor,) = roles(problem)
     for object_id, failure in ((target.id, True), (distractor.id, False)):
         scene = problem.scene.with_poses({object_id: Pose.planar(0.76, 0.0)})
         outcome = advance(problem, begin(problem), scene)[1]
@@ -148,14 +148,14 @@ def test_a_lost_target_is_a_failure_and_a_lost_distractor_is_none() -> None:
 @pytest.mark.parametrize(("difficulty", "dragged", "base"), [("easy", "C1", "C2"), ("hard", "C2", "C1")])
 def test_hard_exchanges_the_textures(difficulty: str, dragged: str, base: str) -> None:
     for seed in range(40):
-        target, container, _ = cast(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
+        target, container, _ = roles(sample_episode(TASK, seed=seed, difficulty=difficulty).problem)
         assert target.texture in TEXTURE_SETS[dragged] and container.texture in TEXTURE_SETS[base]
 
 
 def test_medium_draws_two_different_textures_of_one_set() -> None:
     sets = []
     for seed in range(400):
-        target, base, _ = cast(sample_episode(TASK, seed=seed, difficulty="medium").problem)
+        target, base, _ = roles(sample_episode(TASK, seed=seed, difficulty="medium").problem)
         assert target.texture != base.texture
         sets.append(target.texture in TEXTURE_SETS["C1"])
         assert (base.texture in TEXTURE_SETS["C1"]) is sets[-1]
@@ -166,9 +166,9 @@ def test_medium_draws_two_different_textures_of_one_set() -> None:
 def test_the_numbers_of_distractors_can_be_chosen(num_distractors: int, num_pictured: int) -> None:
     for seed in range(20):
         problem = sample_episode(
-            TASK, seed=seed, num_distractors=num_distractors, num_pictured_distractors=num_pictured
+            TASK, seed=seed, num_distractors=num_distractors, num_prompt_distractors=num_pictured
         ).problem
-        assert len(cast(problem)[2]) == num_distractors
+        assert len(roles(problem)[2]) == num_distractors
         assert len(pictured(problem)) == 1 + num_pictured
 
 
@@ -176,7 +176,7 @@ def test_the_numbers_of_distractors_can_be_chosen(num_distractors: int, num_pict
     ("option", "value", "message"),
     [
         ("num_distractors", 4, "num_distractors is 4; give an integer from 0 to 3"),
-        ("num_pictured_distractors", -1, "num_pictured_distractors is -1"),
+        ("num_prompt_distractors", -1, "num_prompt_distractors is -1"),
         ("difficulty", "hardest", "no difficulty 'hardest'. Did you mean 'hard'"),
     ],
 )
@@ -196,7 +196,7 @@ def test_in_a_picture_hollow_bases_are_things_like_any_other(assets: Assets) -> 
 def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
     for seed in range(20):
         problem = sample_episode(TASK, seed=seed, compat=True).problem
-        target, base, (distractor,) = cast(problem)
+        target, base, (distractor,) = roles(problem)
         assert (base.id, target.id, distractor.id) == (5, 6, 7)
         assert target.pose.z == pytest.approx(target.size[2] / 2)
         assert [p.texture == target.texture for p in pictured(problem)] == [True, False]

@@ -5,7 +5,7 @@ import pytest
 
 from openvima.env import TabletopEnv
 from openvima.scene import InZone, NeverTouches, Outcome, Pose, Problem, ZoneKeptClear
-from openvima.tasks import advance, begin, sample_episode, watch
+from openvima.tasks import advance, begin, monitor, sample_episode
 
 LENGTHS = {"easy": 0.1875, "medium": 0.3375, "hard": 0.4625}
 Z = 0.014  # m, height of a block's centre on the table
@@ -93,7 +93,7 @@ def test_the_line_must_not_be_touched_on_the_way() -> None:
     problem = problem_with(1)
     block = groups(problem)[0][0]
     crossing = problem.scene.with_poses({block: Pose.planar(0.5, 0.02, z=Z)})
-    progress = watch(problem, begin(problem), crossing)
+    progress = monitor(problem, begin(problem), crossing)
     _, outcome = advance(problem, progress, problem.scene.with_poses({block: Pose.planar(*IN_ZONE, z=Z)}))
     assert outcome.failure and outcome.reason.endswith("touched the line")
 

@@ -8,8 +8,8 @@ from openvima.env import TabletopEnv
 from openvima.scene import InZone, NeverTouches, Placement, Pose, Problem, Prompt, Scene, Zone, ZoneKeptClear
 from openvima.tasks import sample_episode
 from openvima.tasks.footprints import Rectangle
-from openvima.tasks.parting import parting_sweeps
 from openvima.tasks.pushes import SHORTFALL_M, STANDOFF_M, Sweep
+from openvima.tasks.separation import separating_sweeps
 from openvima.tasks.sweep_view import View
 from openvima.tasks.sweeping import plan_sweep
 
@@ -180,10 +180,10 @@ def test_first_sweeps_around_a_line_touch_nothing(difficulty: str) -> None:
 def test_a_group_is_parted_without_pushing_a_block_along_the_edge() -> None:
     problem = problem_with({4: (0.713, 0.107), 5: (0.748, 0.113)}, {})
     goals = [goal for goal in problem.goals if isinstance(goal, InZone)]
-    parting = next(parting_sweeps(View.of(goals, problem.scene, problem)))
+    parting = next(separating_sweeps(View.of(goals, problem.scene, problem)))
     assert parting.goal.object_id == 5
     inwards = problem_with({4: (0.643, 0.107), 5: (0.678, 0.113)}, {})
-    assert next(parting_sweeps(View.of(goals, inwards.scene, inwards))).goal.object_id == 4
+    assert next(separating_sweeps(View.of(goals, inwards.scene, inwards))).goal.object_id == 4
 
 
 def test_sweeps_of_blocks_at_the_edge_start_within_reach_of_an_action() -> None:

@@ -36,7 +36,7 @@ def problems() -> list[Problem]:
     return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
 
 
-def cast(problem: Problem) -> tuple[list[Placement], list[Placement]]:
+def roles(problem: Problem) -> tuple[list[Placement], list[Placement]]:
     """Objects to turn, and distractors."""
     (constraint,) = problem.constraints
     assert isinstance(constraint, DistractorsApart)
@@ -80,7 +80,7 @@ def with_targets(problems: list[Problem], num_targets: int) -> Problem:
     return next(problem for problem in problems if len(problem.goals) == num_targets)
 
 
-def turned(placement: Placement, problem: Problem, *, off_deg: float = 0.0) -> Pose:
+def rotated_clockwise(placement: Placement, problem: Problem, *, off_deg: float = 0.0) -> Pose:
     return placement.pose.rotated(-math.radians(asked_deg(problem) + off_deg))
 
 
@@ -88,15 +88,15 @@ def test_angle_texture_and_number_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     assert_uniform(map(asked_deg, problems), (30, 60, 90, 120, 150))
     assert_uniform((len(problem.goals) for problem in problems), (1, 2))
-    assert_uniform((cast(problem)[0][0].texture for problem in problems), drawn_from.dragged_textures)
-    assert_uniform((cast(problem)[0][0].object for problem in problems), drawn_from.dragged_objects)
-    assert_uniform((cast(problem)[1][0].object for problem in problems), drawn_from.dragged_objects)
-    assert_uniform((cast(problem)[1][0].texture for problem in problems), drawn_from.dragged_textures)
+    assert_uniform((roles(problem)[0][0].texture for problem in problems), drawn_from.dragged_textures)
+    assert_uniform((roles(problem)[0][0].object for problem in problems), drawn_from.dragged_objects)
+    assert_uniform((roles(problem)[1][0].object for problem in problems), drawn_from.dragged_objects)
+    assert_uniform((roles(problem)[1][0].texture for problem in problems), drawn_from.dragged_textures)
 
 
 def test_exactly_the_objects_to_turn_have_the_texture_named(problems: list[Problem]) -> None:
     for problem in problems:
-        targets, distractors = cast(problem)
+        targets, distractors = roles(problem)
         assert len(targets) + len(distractors) == len(problem.scene.placements) == 3
         (texture,) = {target.texture for target in targets}
         assert problem.prompt.text == PROMPT.replace("TEXTURE", texture)
@@ -104,15 +104,15 @@ def test_exactly_the_objects_to_turn_have_the_texture_named(problems: list[Probl
 
 
 def test_distractors_may_look_like_each_other_or_share_the_shape(problems: list[Problem]) -> None:
-    shared = [cast(p)[1][0].object == cast(p)[0][0].object for p in problems]
+    shared = [roles(p)[1][0].object == roles(p)[0][0].object for p in problems]
     assert_frequencies(shared, {True: 1 / 8, False: 7 / 8})
-    pairs = [cast(p)[1] for p in problems if len(p.goals) == 1]
+    pairs = [roles(p)[1] for p in problems if len(p.goals) == 1]
     assert_frequencies((a.texture == b.texture for a, b in pairs), {True: 1 / 18, False: 17 / 18})
 
 
 def test_every_example_shows_the_angle_on_another_texture(problems: list[Problem]) -> None:
     for problem in problems[:500]:
-        targets, _ = cast(problem)
+        targets, _ = roles(problem)
         angle_deg = asked_deg(problem)
         for before, after in examples(problem):
             assert clockwise_deg(before.pose, after.pose) == angle_deg
@@ -132,7 +132,7 @@ def test_examples_lie_near_the_middle_at_any_heading(problems: list[Problem]) ->
 def test_the_examples_of_two_shapes_show_both(problems: list[Problem]) -> None:
     firsts = []
     for problem in problems:
-        targets, _ = cast(problem)
+        targets, _ = roles(problem)
         if len({target.object for target in targets}) == 2:
             firsts.append(examples(problem)[0][0].object == targets[0].object)
     assert_uniform(firsts, (True, False))
@@ -163,7 +163,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
 
 
 def test_ids_say_nothing_about_the_role(problems: list[Problem]) -> None:
-    assert_uniform((cast(problem)[0][0].id for problem in problems), (5, 6, 7))
+    assert_uniform((roles(problem)[0][0].id for problem in problems), (5, 6, 7))
 
 
 def test_no_draw_is_thrown_away() -> None:
@@ -201,7 +201,7 @@ def test_other_angles_can_be_asked_for() -> None:
 
 @pytest.mark.parametrize("angles_deg", [(15,), (30, 0), (-350,), (), (math.nan,), ("30",), "30", 30])
 def test_angles_within_the_tolerance_are_refused(angles_deg: object) -> None:
-    with pytest.raises(ConfigError, match=r"must turn by more than 15 degrees|give a list of degrees"):
+    with pytest.raises(ConfigError, match=r"must be larger than 15 degrees|give a list of degrees"):
         sample_episode(TASK, seed=0, angles_deg=angles_deg)
 
 
@@ -218,7 +218,7 @@ def test_numbers_out_of_range_are_refused(name: str, value: int, allowed: str) -
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dragged_objects": ("letter A", "ring", "star")}, "ring, star may look the same after a turn"),
+        ({"dragged_objects": ("letter A", "ring", "star")}, "ring, star have a rotational symmetry"),
         ({"dragged_textures": ("red",)}, "distractors need a second one"),
     ],
 )
@@ -234,8 +234,8 @@ def test_pools_that_cannot_work_are_refused(
 @pytest.mark.parametrize("off_deg", [0, 14.5, -14.5, 15.5, -15.5, 180])
 def test_an_object_has_to_be_turned_by_the_angle_shown(problems: list[Problem], off_deg: float) -> None:
     for problem in [p for p in problems[:60] if len(p.goals) == 1]:
-        ((target,), _) = cast(problem)
-        outcome = judged(problem, {target.id: turned(target, problem, off_deg=off_deg)})
+        ((target,), _) = roles(problem)
+        outcome = judged(problem, {target.id: rotated_clockwise(target, problem, off_deg=off_deg)})
         assert outcome == (
             Outcome(success=True, reason="all goals are met") if abs(off_deg) < 15 else Outcome()
         )
@@ -243,15 +243,15 @@ def test_an_object_has_to_be_turned_by_the_angle_shown(problems: list[Problem], 
 
 def test_the_other_direction_is_wrong(problems: list[Problem]) -> None:
     problem = next(p for p in problems if len(p.goals) == 1 and asked_deg(p) == 120)
-    ((target,), _) = cast(problem)
+    ((target,), _) = roles(problem)
     assert judged(problem, {target.id: target.pose.rotated(math.radians(120))}) == Outcome()
 
 
 @pytest.mark.parametrize(("distance", "success"), [(0.049, True), (0.051, False)])
 def test_an_object_has_to_stay_where_it_was(problems: list[Problem], distance: float, success: bool) -> None:
     problem = with_targets(problems, 1)
-    ((target,), _) = cast(problem)
-    pose = turned(target, problem).moved(dx=0.6 * distance, dy=-0.8 * distance)
+    ((target,), _) = roles(problem)
+    pose = rotated_clockwise(target, problem).moved(dx=0.6 * distance, dy=-0.8 * distance)
     assert judged(problem, {target.id: pose}) == (
         Outcome(success=True, reason="all goals are met") if success else Outcome()
     )
@@ -259,11 +259,11 @@ def test_an_object_has_to_stay_where_it_was(problems: list[Problem], distance: f
 
 def test_objects_count_in_any_order_and_once_and_for_all(problems: list[Problem]) -> None:
     problem = with_targets(problems, 2)
-    (one, two), _ = cast(problem)
-    first, second = ({target.id: turned(target, problem)} for target in (one, two))
+    (one, two), _ = roles(problem)
+    first, second = ({target.id: rotated_clockwise(target, problem)} for target in (one, two))
     assert judged(problem, first) == judged(problem, second) == Outcome()
     assert judged(problem, first, second).success and judged(problem, second, first).success
-    further = {one.id: turned(one, problem, off_deg=90)}
+    further = {one.id: rotated_clockwise(one, problem, off_deg=90)}
     assert judged(problem, first, further) == Outcome()
     assert judged(problem, first, further, second).success
     gone = {one.id: Pose.planar(0.9, 0.0)}
@@ -273,10 +273,10 @@ def test_objects_count_in_any_order_and_once_and_for_all(problems: list[Problem]
 
 def test_turning_a_distractor_only_costs_a_step(problems: list[Problem]) -> None:
     problem = with_targets(problems, 1)
-    (target,), (distractor, _) = cast(problem)
-    assert judged(problem, {distractor.id: turned(distractor, problem)}) == Outcome()
-    right = {target.id: turned(target, problem)}
-    assert judged(problem, {distractor.id: turned(distractor, problem)}, right).success
+    (target,), (distractor, _) = roles(problem)
+    assert judged(problem, {distractor.id: rotated_clockwise(distractor, problem)}) == Outcome()
+    right = {target.id: rotated_clockwise(target, problem)}
+    assert judged(problem, {distractor.id: rotated_clockwise(distractor, problem)}, right).success
     assert judged(problem, {distractor.id: Pose.planar(0.9, 0.0)}, right).success
 
 
@@ -285,7 +285,7 @@ def test_a_distractor_must_not_take_the_place(
     problems: list[Problem], distance: float, failure: bool
 ) -> None:
     problem = with_targets(problems, 1)
-    (target,), (distractor, _) = cast(problem)
+    (target,), (distractor, _) = roles(problem)
     assert judged(problem, {distractor.id: target.pose.moved(dy=distance)}).failure is failure
 
 
@@ -294,7 +294,7 @@ def test_an_object_must_not_match_a_distractor(
     problems: list[Problem], off_deg: float, failure: bool
 ) -> None:
     problem = with_targets(problems, 1)
-    (target,), (distractor, _) = cast(problem)
+    (target,), (distractor, _) = roles(problem)
     pose = distractor.pose.rotated(math.radians(off_deg)).moved(dx=0.04)
     assert angle_difference(pose.yaw_rad, distractor.pose.yaw_rad) == pytest.approx(math.radians(off_deg))
     assert judged(problem, {target.id: pose}).failure is failure
@@ -303,7 +303,7 @@ def test_an_object_must_not_match_a_distractor(
 def test_with_compat_objects_hover_and_examples_rest() -> None:
     for seed in range(30):
         problem = sample_episode(TASK, seed=seed, compat=True).problem
-        targets, distractors = cast(problem)
+        targets, distractors = roles(problem)
         assert [p.id for p in (*targets, *distractors)] == [5, 6, 7]
         assert all(p.pose.z == p.size[2] / 2 for p in problem.scene.placements)
         assert all(p.pose.z == 0.0 for pair in examples(problem) for p in pair)

@@ -13,7 +13,7 @@ from openvima.tasks import advance, begin, sample_episode, task_spec
 NUM_EPISODES = 2000
 
 
-def cast(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
+def roles(problem: Problem) -> tuple[Placement, Placement, list[Placement]]:
     """Target, base and distractors."""
     (goal,) = problem.goals
     (constraint,) = problem.constraints
@@ -33,7 +33,7 @@ def problems() -> list[Problem]:
 
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     pool = task_spec("visual_manipulation").pool("train")
-    targets, bases = [cast(p)[0] for p in problems], [cast(p)[1] for p in problems]
+    targets, bases = [roles(p)[0] for p in problems], [roles(p)[1] for p in problems]
     assert_uniform([t.texture for t in targets], pool.dragged_textures)
     assert_uniform([b.texture for b in bases], pool.base_textures)
     assert_uniform([b.object for b in bases], pool.base_objects)
@@ -46,7 +46,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
 def test_a_distractor_shares_shape_or_texture_but_never_both(problems: list[Problem]) -> None:
     shared = collections.Counter()
     for problem in problems:
-        target, base, (distractor,) = cast(problem)
+        target, base, (distractor,) = roles(problem)
         for name, other in (("target", target), ("base", base)):
             same_shape, same_texture = distractor.object == other.object, distractor.texture == other.texture
             assert not (same_shape and same_texture)
@@ -59,7 +59,7 @@ def test_distractors_that_look_like_bases_are_fixed(problems: list[Problem]) -> 
     pool = task_spec("visual_manipulation").pool("train")
     num_bases = 0
     for problem in problems:
-        target, base, (distractor,) = cast(problem)
+        target, base, (distractor,) = roles(problem)
         assert base.fixed and not target.fixed
         assert distractor.fixed is (distractor.object in pool.base_objects)
         num_bases += distractor.fixed
@@ -81,7 +81,7 @@ def test_the_prompt_is_the_published_sentence(problems: list[Problem]) -> None:
 
 def test_the_goal_is_the_place_of_the_base(problems: list[Problem]) -> None:
     (goal,) = problems[0].goals
-    _, base, _ = cast(problems[0])
+    _, base, _ = roles(problems[0])
     assert isinstance(goal, AtPose)
     assert goal.target == base.pose and goal.tolerance.position_m == 0.1 and goal.tolerance.yaw_rad is None
 
@@ -90,14 +90,14 @@ def test_the_goal_is_the_place_of_the_base(problems: list[Problem]) -> None:
 def test_hard_exchanges_the_textures(difficulty: str, dragged: str, base: str) -> None:
     for seed in range(40):
         problem = sample_episode("visual_manipulation", seed=seed, difficulty=difficulty).problem
-        assert cast(problem)[0].texture in TEXTURE_SETS[dragged]
-        assert cast(problem)[1].texture in TEXTURE_SETS[base]
+        assert roles(problem)[0].texture in TEXTURE_SETS[dragged]
+        assert roles(problem)[1].texture in TEXTURE_SETS[base]
 
 
 def test_medium_draws_both_roles_from_one_of_the_sets() -> None:
     sets = []
     for seed in range(200):
-        target, base, _ = cast(sample_episode("visual_manipulation", seed=seed, difficulty="medium").problem)
+        target, base, _ = roles(sample_episode("visual_manipulation", seed=seed, difficulty="medium").problem)
         sets.append(target.texture in TEXTURE_SETS["C1"])
         assert (base.texture in TEXTURE_SETS["C1"]) is sets[-1]
     assert_frequencies(sets, {True: 0.5, False: 0.5})
@@ -107,7 +107,7 @@ def test_medium_draws_both_roles_from_one_of_the_sets() -> None:
 def test_the_number_of_distractors_can_be_chosen(num_distractors: int) -> None:
     for seed in range(20):
         problem = sample_episode("visual_manipulation", seed=seed, num_distractors=num_distractors).problem
-        assert len(cast(problem)[2]) == num_distractors
+        assert len(roles(problem)[2]) == num_distractors
         assert len(problem.scene.placements) == 2 + num_distractors
 
 
@@ -115,7 +115,7 @@ def test_the_number_of_distractors_can_be_chosen(num_distractors: int) -> None:
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool("visual_manipulation", level)
     for seed in range(100):
-        target, base, _ = cast(sample_episode("visual_manipulation", level=level, seed=seed).problem)
+        target, base, _ = roles(sample_episode("visual_manipulation", level=level, seed=seed).problem)
         assert target.object in drawn_from.dragged_objects and target.texture in drawn_from.dragged_textures
         assert base.object in drawn_from.base_objects and base.texture in drawn_from.base_textures
 
@@ -134,7 +134,7 @@ def test_distances_decide(
     target_at: float | None, distractor_at: float | None, success: bool, failure: bool
 ) -> None:
     problem = sample_episode("visual_manipulation", seed=1).problem
-    target, base, (distractor,) = cast(problem)
+    target, base, (distractor,) = roles(problem)
     inward = 1.0 if base.pose.y < 0 else -1.0
     moved = {
         object_id: base.pose.moved(dy=inward * distance)
@@ -147,7 +147,7 @@ def test_distances_decide(
 
 def test_a_lost_target_is_a_failure() -> None:
     problem = sample_episode("visual_manipulation", seed=1).problem
-    lost = problem.scene.with_poses({cast(problem)[0].id: Pose.planar(0.76, 0.0)})
+    lost = problem.scene.with_poses({roles(problem)[0].id: Pose.planar(0.76, 0.0)})
     assert advance(problem, begin(problem), lost)[1].failure
 
 
@@ -162,6 +162,6 @@ def test_bad_options_are_refused(options: dict[str, object]) -> None:
 def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
     for seed in range(20):
         problem = sample_episode("visual_manipulation", seed=seed, compat=True).problem
-        target, base, (distractor,) = cast(problem)
+        target, base, (distractor,) = roles(problem)
         assert (base.id, target.id, distractor.id) == (5, 6, 7)
         assert target.pose.z == pytest.approx(target.size[2] / 2)

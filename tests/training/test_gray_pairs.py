@@ -1,4 +1,4 @@
-"""Gray prompt images, which match by shape alone; and random vessels that only textures tell apart."""
+"""Gray prompt images, which match by shape alone; and random containers that only textures tell apart."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.catalog.packs import load_assets  # noqa: E402
-from openvima.catalog.random_pack import RandomLooks, is_random  # noqa: E402
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
 from openvima.catalog.textures import NEUTRAL_COLOUR  # noqa: E402
 from openvima.perception.objects import observe_prompt_image  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
@@ -176,7 +176,7 @@ def vessels_of(seed: int, share: float = 1.0) -> list[str]:
         )
     )
     changed = with_random_looks(
-        scene, share, RandomLooks(load_assets("procedural")), np.random.default_rng(seed)
+        scene, share, RandomAppearanceAssets(load_assets("procedural")), np.random.default_rng(seed)
     )
     return [placement.object for placement in changed.placements]
 

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.partitions import pool  # noqa: E402
-from openvima.catalog.random_pack import RandomLooks, is_random  # noqa: E402
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
@@ -79,7 +79,7 @@ def test_without_variety_scenes_are_as_they_always_were():
 
 
 def test_twins_differ_in_one_respect():
-    assets = RandomLooks(load_assets("procedural"))
+    assets = RandomAppearanceAssets(load_assets("procedural"))
     rng = np.random.default_rng(0)
     originals = tuple(
         Placement(5 + k, name, texture, (0.144, 0.144, 0.036), Pose.planar(0.4 + 0.1 * k, 0.2 * k, z=0.0))

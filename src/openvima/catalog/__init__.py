@@ -1,4 +1,4 @@
-"""Objects, textures, partitions, and the asset packs that give them shape."""
+"""Objects, textures, partitions and asset packs."""
 
 from openvima.catalog.geometry import (
     Assets,

@@ -1,7 +1,7 @@
-"""Procedural geometry of each object: what is drawn, what collides, and how high it rests.
+"""Procedural geometry of each object: visual mesh, collision shapes and rest height.
 
-Objects have the measures of the benchmark's. Two differ in place: the bowl stands on its origin instead of
-beside it, and the letter T is upright.
+Dimensions are those of VIMA-Bench. Two poses differ: the bowl is centred on its origin, and the letter T is
+upright.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def has_fixed_size(object_name: str) -> bool:
     return object_spec(object_name).kind == "kit" or object_name in _FIXED_SIZE
 
 
-@cache  # tasks stretch these few shapes by factors that are new in each episode
+@cache  # tasks scale these few shapes by new factors in each episode
 def _kit(spec: ObjectSpec) -> Geometry:
     loops = outline(spec.name)
     height = spec.size_max[2] / boxes.HEIGHT_DIVISOR
@@ -95,7 +95,7 @@ def _bowl() -> Geometry:
 def _pan() -> Geometry:
     visual = pan_mesh()
     hull = CollisionHull(np.unique(visual.vertices.reshape(-1, 3), axis=0))
-    # Of dish and handle at once: things put into the pan lie on its lid, as in the benchmark.
+    # One hull for dish and handle: objects put into the pan rest on its lid, as in VIMA-Bench.
     return Geometry(visual, (hull,), rest_z_m=float(-visual.vertices[..., 2].min()))
 
 
@@ -116,4 +116,4 @@ _BOXES: dict[str, tuple[Callable[[Vector3], Geometry], int]] = {
     "square": (boxes.square, 2),
     "container": (boxes.container, 3),
 }
-"""Builders from size times scale, and how many of its lengths matter."""
+"""Builders from size times scale, and the number of lengths that they use."""

@@ -1,4 +1,4 @@
-"""Boxes, and the bodies that consist of them: blocks, line, container, square and three-sided rectangle.
+"""Boxes, and bodies made of boxes: blocks, line, container, square and three-sided rectangle.
 
 Source: the body descriptions of VIMA-Bench, whose textures fold onto a box as a 4 × 4 atlas.
 """
@@ -12,7 +12,7 @@ from openvima.catalog.geometry import CollisionBox, Geometry, TriangleMesh, Vect
 
 SHEET_THICKNESS_M = 0.001  # of flat marks on the table, whatever their nominal height
 WALL_M = 0.002
-HEIGHT_DIVISOR = 1.1  # VIMA-Bench makes the container lower by this than its nominal size
+HEIGHT_DIVISOR = 1.1  # nominal over true height of the container in VIMA-Bench
 FLOOR_Z_M = -0.001  # height of the surface on which bodies rest
 
 
@@ -29,7 +29,7 @@ class Box:
     centre: Vector3 = (0.0, 0.0, 0.0)
 
     def to_collision(self) -> CollisionBox:
-        """Return the same box as a shape to collide with."""
+        """Return the box as a collision shape."""
         x, y, z = self.size
         return CollisionBox((x / 2, y / 2, z / 2), self.centre)
 
@@ -54,7 +54,7 @@ def _unit_faces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _atlas_uv(normal: tuple[int, int, int], corner: tuple[int, int, int]) -> tuple[float, float]:
-    """Texture coordinates of one corner of the unit cube: every face shows a sixteenth of the image."""
+    """Texture coordinates of one corner of the unit cube: every face gets a sixteenth of the image."""
     a, b, c = ((coordinate + 1) / 2 for coordinate in corner)
     return {
         (0, 0, 1): (0.75 + a / 4, 0.25 - b / 4),
@@ -84,13 +84,13 @@ def block(size: Vector3) -> Geometry:
 
 
 def line(size: Vector3) -> Geometry:
-    """Return a strip on the table that nothing collides with; its thickness is fixed."""
+    """Return a strip on the table without collision; its thickness is fixed."""
     strip = Box((size[0], size[1], SHEET_THICKNESS_M))
     return Geometry(box_mesh([strip]), (), SHEET_THICKNESS_M / 2)
 
 
 def container(size: Vector3) -> Geometry:
-    """Return an open box, origin at its centre; the middle planes of its walls lie on the borders."""
+    """Return an open box, origin at its centre; the middle planes of its walls are on the borders."""
     x, y, height = size[0], size[1], size[2] / HEIGHT_DIVISOR
     boxes = [
         Box((x, y, WALL_M), (0.0, 0.0, -height / 2)),
@@ -106,7 +106,7 @@ def container(size: Vector3) -> Geometry:
 def square(size: Vector3) -> Geometry:
     """Return four flat bars, `size[0]` long and `size[1]` wide, around an opening.
 
-    What collides is a single strip through the middle, as in VIMA-Bench, not the bars.
+    Its collision shape is a single strip through the middle, as in VIMA-Bench.
     """
     length, width, half = size[0], size[1], size[0] / 2
     boxes = [

@@ -1,4 +1,4 @@
-"""Decoded and drawn images on disk, so that each is made once per machine."""
+"""Disk cache of decoded and procedural arrays."""
 
 import io
 import logging
@@ -13,7 +13,7 @@ from openvima.atomic_io import atomic_write
 
 _logger = logging.getLogger(__name__)
 
-_CHECKSUM_BYTES = 4  # CRC-32 of all before it; at the end of a file, readers of .npy do not mind it
+_CHECKSUM_BYTES = 4  # CRC-32 of all before it; at the end of a file, where readers of .npy ignore it
 
 
 def cache_dir() -> Path:
@@ -30,12 +30,12 @@ def cache_dir() -> Path:
 def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.ndarray:
     """Read an array from the cache, or build and store it.
 
-    A damaged file is replaced. Where the cache cannot be written the array is built each time.
+    A damaged file is replaced. Without write access the array is built each time.
 
     Args:
-        group: Folder within the cache; it names the kind and version of its files.
+        group: Folder in the cache, with the kind and version of its files.
         key: File name without extension, unique in the group.
-        build: Makes the array.
+        build: Builds the array.
     """
     path = cache_dir() / group / f"{key}.npy"
     try:
@@ -43,7 +43,7 @@ def cached_array(group: str, key: str, build: Callable[[], np.ndarray]) -> np.nd
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError, EOFError) as error:
-        _logger.warning("%s cannot be read (%s); it will be made anew", path, error)
+        _logger.warning("%s cannot be read (%s); it will be rebuilt", path, error)
     array = build()
     try:
         _write(path, array)
@@ -61,7 +61,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _write(path: Path, array: np.ndarray) -> None:
-    """Write under another name, then rename: readers see a whole file or none."""
+    """Write atomically, with a checksum."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     body = buffer.getvalue()

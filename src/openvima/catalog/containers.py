@@ -1,4 +1,4 @@
-"""The two round vessels, bowl and pan, with real hollows, smooth normals, and what things collide with."""
+"""The two round containers, bowl and pan: visual meshes and collision shapes."""
 
 import math
 
@@ -50,7 +50,7 @@ _PAN_TEXTURE_PER_M = 2.3  # the tip of the handle is just inside the image
 
 
 def bowl_mesh() -> TriangleMesh:
-    """Draw the bowl; its axis is the z axis (in the original pack it stands beside it)."""
+    """Return the mesh of the bowl; its axis is the z axis (beside it in the original pack)."""
     outside = [_rim_distance(radius, z) for radius, z in _BOWL_WALL[:5]]
     inside = [radius for radius, _ in _BOWL_WALL[5:]]
     wall_radii = [_BOWL_TEXTURE_PER_M * distance for distance in (*outside, *inside)]
@@ -92,7 +92,7 @@ def bowl_collision() -> tuple[CollisionShape, ...]:
 
 
 def pan_mesh() -> TriangleMesh:
-    """Draw the pan: a dish about the z axis with a handle along +x that has a hole at its end."""
+    """Return the mesh of the pan: a dish about the z axis and a handle along +x with a hole at its end."""
     dish_radii = [_PAN_TEXTURE_PER_M * radius for radius, _ in _PAN_DISH]
     bottom_radii = [_PAN_TEXTURE_PER_M * radius for radius, _ in _PAN_BOTTOM]
     (x_low, z_low), (x_high, z_high) = _PAN_HANDLE_LOW, _PAN_HANDLE_HIGH

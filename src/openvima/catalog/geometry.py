@@ -1,4 +1,4 @@
-"""Shapes as every asset pack delivers them: triangles to draw and convex parts to collide with."""
+"""Shapes of asset packs: triangle meshes and convex collision shapes."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,7 +10,7 @@ Vector3 = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMesh:
-    """Triangles in the link frame, ready to draw.
+    """Triangles in the link frame.
 
     Args:
         vertices: Corner positions in metres, shape (F, 3, 3): triangle, corner, xyz; float64.
@@ -57,8 +57,8 @@ class Geometry:
 
     Args:
         visual: Triangles to draw.
-        collision: Convex parts; empty for objects that nothing touches (line, three-sided rectangle).
-        rest_z_m: Height of the link frame when the object lies on the table.
+        collision: Convex parts; empty for objects without collision (line, three-sided rectangle).
+        rest_z_m: Height of the link frame of the object at rest on the table.
     """
 
     visual: TriangleMesh
@@ -67,7 +67,7 @@ class Geometry:
 
 
 def protect(geometry: Geometry) -> Geometry:
-    """Make the arrays of a shape that is shared read-only, and return it."""
+    """Make the arrays of a shared shape read-only, and return it."""
     mesh = geometry.visual
     points = [shape.points for shape in geometry.collision if isinstance(shape, CollisionHull)]
     for array in (mesh.vertices, mesh.normals, mesh.uvs, *points):
@@ -78,7 +78,7 @@ def protect(geometry: Geometry) -> Geometry:
 class Assets(Protocol):
     """A pack of shapes and textures.
 
-    Results are cached: equal arguments give the same arrays. They cannot be written to; copy them first.
+    Results are cached and read-only.
     """
 
     @property

@@ -1,6 +1,6 @@
-"""The two bodies of the towers of Hanoi: a stand with three rods, and a disk with a hole to put on them.
+"""The two bodies of the towers of Hanoi: a stand with three rods, and a disk with a hole.
 
-No released task uses them; they are there for own tasks.
+No task of the benchmark uses them.
 """
 
 import math

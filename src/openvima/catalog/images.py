@@ -1,4 +1,4 @@
-"""The picture of each texture of the procedural pack."""
+"""Images of the procedural textures."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Importing the original asset pack: from a checkout into one archive in the cache, decoded once."""
+"""Import of the original asset pack from a checkout into the cache."""
 
 import json
 import zipfile
@@ -20,12 +20,12 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # the same checkout gives the same archive
 
 @dataclass(frozen=True, slots=True)
 class ImportedPack:
-    """What an import found.
+    """Result of an import.
 
     Args:
         archive: The archive in the cache.
-        files: Paths in the pack of the files that it holds.
-        problems: One sentence for each file that it lacks, with the reason.
+        files: Imported files, as paths in the pack.
+        problems: One sentence for each missing file.
     """
 
     archive: Path
@@ -39,20 +39,19 @@ class ImportedPack:
 
 
 def import_pack(checkout: str | Path, report: Report | None = None) -> ImportedPack:
-    """Import the original asset pack; from then on `load_assets("original")` gives it.
+    """Import the original asset pack for `load_assets("original")`.
 
-    Files that are missing or damaged are left out and reported. An earlier import is replaced in one move,
-    once the new one is whole.
+    Missing or damaged files are reported. An earlier import is replaced atomically.
 
     Args:
         checkout: Folder of a checkout of the original benchmark, or its assets folder.
-        report: Is told how many files of how many are done, and the name of the last one.
+        report: Called with the number of files done, the total, and the last name.
 
     Returns:
-        What was imported and what was not.
+        Imported files and problems.
 
     Raises:
-        AssetError: The folder holds no asset pack, or not one sound file of it.
+        AssetError: The folder contains no asset pack, or only damaged files.
         OSError: The cache cannot be written to.
     """
     source = CheckoutFiles.within(checkout)
@@ -74,7 +73,7 @@ def import_pack(checkout: str | Path, report: Report | None = None) -> ImportedP
 
 
 def imported_pack() -> ImportedPack | None:
-    """Return what the last import found, or None if there was none.
+    """Return the result of the last import, or None.
 
     Raises:
         AssetError: The archive is damaged.

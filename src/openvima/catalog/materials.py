@@ -1,4 +1,4 @@
-"""Pictures of materials: brick, tiles, wood, granite, plastic, tiger fur and magma."""
+"""Textures of materials: brick, tiles, wood, granite, plastic, tiger fur and magma."""
 
 import numpy as np
 
@@ -63,8 +63,8 @@ def granite() -> np.ndarray:
         (43, (58, 54, 72), (72, 60), 0.70, 0.12, 1.0),
     ):
         specks = layered_noise(shape, cells, seed=seed, num_layers=2) + 0.25 * cloud
-        share = strength * np.clip((specks - start) / fade, 0, 1)
-        stone += (np.array(colour, dtype=np.float64) - stone) * share[..., None]
+        weight = strength * np.clip((specks - start) / fade, 0, 1)
+        stone += (np.array(colour, dtype=np.float64) - stone) * weight[..., None]
     return _to_image(stone + 12 * hashed(*np.indices(shape), seed=44)[..., None] - 6)
 
 
@@ -113,10 +113,10 @@ def magma() -> np.ndarray:
     return _to_image(np.stack(channels, axis=-1))
 
 
-def _blend(first: tuple[int, int, int], second: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
-    """Mix two colours; a share of 1 gives the second."""
+def _blend(first: tuple[int, int, int], second: tuple[int, int, int], weight: np.ndarray) -> np.ndarray:
+    """Mix two colours; a weight of 1 gives the second."""
     start, end = np.array(first, dtype=np.float64), np.array(second, dtype=np.float64)
-    return start + (end - start) * share[..., None]
+    return start + (end - start) * weight[..., None]
 
 
 def _to_image(colours: np.ndarray) -> np.ndarray:

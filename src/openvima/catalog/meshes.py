@@ -1,7 +1,7 @@
 """Building blocks of procedural shapes: prisms, bodies of revolution, and their collision hulls.
 
-All textures are laid on as if the image were draped over the shape from above: a top face shows it
-undistorted, a side face continues it downwards from its upper edge.
+Textures are draped over a shape from above: top faces are undistorted, side faces continue the image
+downwards from their upper edge.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from openvima.catalog.triangulation import triangulate
 TEXTURE_PER_M = 3.5
 """Texture widths per metre of surface, much as on the kit objects of the original pack."""
 
-_SMALLEST_SHARE = 0.25  # of the texture's width; a 3 cm block shows this much instead of a tenth
+_MIN_TEXTURE_FRACTION = 0.25  # of the texture's width; a 3 cm block shows this much instead of a tenth
 _TRIANGLES_PER_BOX = 12
 
 
@@ -27,7 +27,7 @@ def prism(
         loops: Outer loop counter-clockwise, then holes clockwise; each shape (N, 2), metres.
         z_low: Height of the lower face.
         z_high: Height of the upper face.
-        texture_per_m: Texture widths per metre; the middle of the image lies over the origin.
+        texture_per_m: Texture widths per metre; the middle of the image is at the origin.
     """
     points = np.concatenate(loops)
     corners = triangulate(loops)
@@ -49,8 +49,8 @@ def revolved(
     """Turn a profile about the z axis, with normals that blend smoothly along and around it.
 
     Args:
-        profile: Radius and height of successive points, metres; the outside is on the right-hand side of the
-            way, so an outer wall runs upwards and a floor seen from above runs inwards.
+        profile: Radius and height of successive points, metres; the outside is on the right, so
+            an outer wall runs upwards and a floor inwards.
         num_sides: Number of flat sides around.
         texture_radii: Distance from the middle of the image, in texture widths, at each point of the profile.
     """
@@ -100,7 +100,7 @@ def scaled_geometry(geometry: Geometry, scale: Vector3) -> Geometry:
 
 
 def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
-    """Raise each point by `slope` metres per metre that it lies beyond `from_x`."""
+    """Raise each point by `slope` metres per metre beyond `from_x`."""
     vertices = mesh.vertices.copy()
     vertices[..., 2] += slope * (vertices[..., 0] - from_x)
     normals = mesh.normals.copy()
@@ -110,7 +110,7 @@ def sheared_up(mesh: TriangleMesh, slope: float, from_x: float) -> TriangleMesh:
 
 
 def draped(mesh: TriangleMesh) -> TriangleMesh:
-    """Lay one texture over a group of boxes from above, finer on small ones, never beyond its borders.
+    """Drape one texture over a group of boxes from above, finer on small ones, within its borders.
 
     Args:
         mesh: Boxes of 12 triangles each, as `box_mesh` builds them.
@@ -119,7 +119,7 @@ def draped(mesh: TriangleMesh) -> TriangleMesh:
     drop = np.repeat(tops, _TRIANGLES_PER_BOX)[:, None] - mesh.vertices[..., 2]
     flat = mesh.vertices[..., :2] + drop[..., None] * mesh.normals[..., :2]
     extents = np.ptp(mesh.vertices[..., :2].reshape(-1, 2), axis=0)
-    density = min(max(TEXTURE_PER_M, _SMALLEST_SHARE / extents.max()), 0.5 / np.abs(flat).max())
+    density = min(max(TEXTURE_PER_M, _MIN_TEXTURE_FRACTION / extents.max()), 0.5 / np.abs(flat).max())
     return TriangleMesh(mesh.vertices, mesh.normals, 0.5 + density * flat)
 
 
@@ -172,7 +172,7 @@ def _planar_uvs(points: np.ndarray, texture_per_m: float) -> np.ndarray:
 
 
 def _side_walls(loop: np.ndarray, z_low: float, z_high: float, texture_per_m: float) -> TriangleMesh:
-    """Two triangles for each edge; the solid lies on the left of the loop."""
+    """Two triangles for each edge; the solid is on the left of the loop."""
     start, end = loop, np.roll(loop, -1, axis=0)
     outward = np.stack([end[:, 1] - start[:, 1], start[:, 0] - end[:, 0]], axis=1)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)

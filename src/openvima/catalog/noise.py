@@ -1,7 +1,4 @@
-"""Random-looking numbers for textures, from integer hashing alone: the same bits on every machine.
-
-The random generators of numerical libraries may change their streams with the version; pictures must not.
-"""
+"""Noise for textures from integer hashing: bit-identical on every machine and with every NumPy version."""
 
 import numpy as np
 
@@ -11,7 +8,7 @@ def hashed(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
 
     Args:
         *coordinates: Arrays of non-negative integers, broadcast against each other.
-        seed: Changes all numbers.
+        seed: Seed of the hash.
 
     Returns:
         float64, multiples of 2⁻³².
@@ -19,7 +16,7 @@ def hashed(*coordinates: np.ndarray | int, seed: int) -> np.ndarray:
     Source: the mixing steps of SplitMix64 (Steele, Lea and Flood, 2014).
     """
     state = np.asarray(seed, dtype=np.uint64)
-    with np.errstate(over="ignore"):  # wrapping around is what a hash is about
+    with np.errstate(over="ignore"):  # overflow is intended
         for coordinate in coordinates:
             state = _mixed(state * np.uint64(31) + np.asarray(coordinate).astype(np.uint64) + np.uint64(1))
     return (state >> np.uint64(32)).astype(np.float64) / 2.0**32
@@ -38,7 +35,7 @@ def value_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int) -> np
     Args:
         shape: Rows and columns of the image.
         cells: Number of random values down and across, between which the noise changes smoothly.
-        seed: Changes the noise.
+        seed: Seed of the noise.
     """
     rows, columns = (np.arange(n) * c / n for n, c in zip(shape, cells, strict=True))
     top, left = rows.astype(np.int64), columns.astype(np.int64)
@@ -54,7 +51,7 @@ def value_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int) -> np
 
 
 def layered_noise(shape: tuple[int, int], cells: tuple[int, int], seed: int, num_layers: int) -> np.ndarray:
-    """Return value noises in [0, 1) added up, each twice as fine and half as strong as the one before."""
+    """Return fractal noise in [0, 1): layers of doubled frequency and halved amplitude."""
     total, weight_sum = np.zeros(shape), 0.0
     for layer in range(num_layers):
         weight = 0.5**layer

@@ -10,7 +10,7 @@ from openvima.errors import AssetError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjMesh:
-    """The faces of a file, cut into triangles, in the file's order.
+    """The faces of a file as triangles, in the file's order.
 
     Args:
         vertices: Shape (F, 3, 3), float64: triangle, corner, xyz.
@@ -31,7 +31,7 @@ class ObjMesh:
 
     @classmethod
     def from_array(cls, array: np.ndarray) -> "ObjMesh":
-        """Undo `to_array`, bit for bit."""
+        """Invert `to_array`."""
         vertices, normals, uvs, parts = np.split(array, (9, 18, 24), axis=1)
         return cls(
             np.ascontiguousarray(vertices).reshape(-1, 3, 3),
@@ -46,7 +46,7 @@ def parse_obj(text: str, name: str) -> ObjMesh:
 
     Args:
         text: The file's content.
-        name: What to call it in errors.
+        name: Name for errors.
 
     Raises:
         AssetError: A line cannot be understood, an index has no target, or there is no face.

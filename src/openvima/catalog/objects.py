@@ -16,7 +16,7 @@ ObjectKind = Literal["kit", "box", "compound", "mesh"]
 Profile = Literal["square", "circle"]
 
 NO_SYMMETRY = 2 * math.pi
-LOOKS_SAME_AT_ANY_ANGLE = 0.0
+FULL_SYMMETRY = 0.0
 
 # Bowl and frame: poses that the benchmark reads back are those of a centre of mass beside the link frame.
 _SHIFTED_COM = (-0.01, 0.0, 0.02)
@@ -25,16 +25,16 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class ObjectSpec:
-    """What the catalogue knows about one object.
+    """Catalogue record of one object.
 
     Args:
         name: Display name, by which everything refers to the object, such as "letter A".
         id: Identifier in upper case, such as "CAPITAL_LETTER_A".
         kind: "kit" (flat prism of fixed size, origin at its bottom), "box" (of the sampled size), "compound"
             (boxes placed from the sampled size) or "mesh" (fixed size).
-        size_min: Smallest nominal size (x, y, z) in metres. Sampling and spacing use it; what is drawn may be
+        size_min: Smallest nominal size (x, y, z) in metres. Sampling and spacing use it; the mesh may be
             smaller or larger.
-        size_max: Largest nominal size; each axis is drawn uniformly in between.
+        size_max: Largest nominal size; each axis is sampled uniformly in between.
         symmetry_rad: Angle of rotational symmetry as the benchmark stores it: 2π none, 0 any angle, None
             unset. Stored and true values differ for block (true: π/2), cross (π/2) and triangle (2π); no
             task tests the rotation of these.
@@ -45,7 +45,7 @@ class ObjectSpec:
         com_offset: Centre of mass in the link frame, metres.
         inertia_diag: Principal moments at the smallest size, kg m².
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
-        aliases: Other names for paraphrased instructions; never used for look-up.
+        aliases: Other names for paraphrased instructions; not valid names.
         novel_names: Further names that no task uses yet.
     """
 
@@ -142,7 +142,7 @@ _SPECS = (
         "bowl",
         "mesh",
         (0.17, 0.17, 0.0),
-        symmetry_rad=LOOKS_SAME_AT_ANY_ANGLE,
+        symmetry_rad=FULL_SYMMETRY,
         profile="circle",
         rolling_friction=0.0,
         com_offset=_SHIFTED_COM,
@@ -246,14 +246,14 @@ _SPECS = (
         id="L_BLOCK",
         aliases=("L-shape",),
     ),
-    _kit("ring", 1.6, (0.000290884, 0.000290884, 0.0005202), LOOKS_SAME_AT_ANY_ANGLE, profile="circle"),
+    _kit("ring", 1.6, (0.000290884, 0.000290884, 0.0005202), FULL_SYMMETRY, profile="circle"),
     _kit("round", 1.6, (0.000290884, 0.000290884, 0.0005202), None, profile="circle"),
     _kit("star", 1.8, (0.000367587, 0.000337646, 0.000630242), _FIFTH, smallest_scale=1.6),
     _fixed_size(
         "pan",
         "mesh",
         (0.16, 0.24, 0.03),
-        symmetry_rad=LOOKS_SAME_AT_ANY_ANGLE,
+        symmetry_rad=FULL_SYMMETRY,
         profile="circle",
         inertia_diag=(0.000817844, 0.00229857, 0.00300472),
     ),

@@ -1,7 +1,4 @@
-"""The original asset pack: meshes, textures and body shapes of VIMA-Bench, from a checkout or an import.
-
-With it, images are those of the benchmark.
-"""
+"""The original asset pack: meshes, textures and collision shapes of VIMA-Bench."""
 
 import io
 from collections.abc import Callable
@@ -71,7 +68,7 @@ _SPECIAL_IMAGES = {
     "magma": "magma.jpg",
     "rainbow": "rainbow.jpg",
 }
-# Decoders of JPEG files differ by a level or two: what was decoded once stays.
+# Decoded once and cached: JPEG decoders differ by a level or two.
 _IMAGE_GROUP, _MESH_GROUP = "original-images-2", "original-meshes-1"
 _PATTERN_FOLDERS = {
     "stripe": ("stripes", "stripe"),
@@ -85,11 +82,10 @@ class OriginalAssets:
     """The shapes and textures of VIMA-Bench; implements `Assets`.
 
     Args:
-        source: Folder of a checkout of VIMA-Bench (it holds `vima_bench/tasks/assets`), or that assets folder
-            itself, or the files of a pack.
+        source: Folder of a checkout of VIMA-Bench, its assets folder, or the files of a pack.
 
     Raises:
-        AssetError: The folder holds no asset pack.
+        AssetError: The folder contains no asset pack.
     """
 
     name = "original"

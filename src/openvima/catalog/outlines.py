@@ -1,7 +1,7 @@
 """Outlines of the 18 kit objects, seen from above: x to the right, y up, in metres at the size in use.
 
 Letters stand upright (+y up). Unlike in the original pack this holds for the T, too: rotations are always
-relative, so nothing but the look depends on it.
+relative, so it only affects the appearance.
 """
 
 import math

@@ -1,7 +1,6 @@
-"""Where the files of the original asset pack lie: in a checkout, or in the archive that an import made.
+"""Files of the original asset pack, in a checkout or in the archive of an import.
 
-Every file is compared with a known hash, so that a pack which is incomplete or differs is reported instead of
-giving other pixels.
+Every file is compared with a known hash, so that an incomplete or different pack is reported.
 """
 
 import hashlib
@@ -24,7 +23,7 @@ _TEXT_SUFFIXES = (".obj", ".urdf")
 
 
 class PackFiles(Protocol):
-    """The files of an original pack; equal ones hold the same files."""
+    """The files of an original pack; instances with the same files are equal."""
 
     def read(self, relative_path: str) -> bytes:
         """Return a file's content, as in the original benchmark.
@@ -33,8 +32,7 @@ class PackFiles(Protocol):
             relative_path: One of `known_hashes`.
 
         Raises:
-            AssetError: The file is missing, unreadable, damaged or of another version; the message names it
-                and says what to do.
+            AssetError: The file is missing, unreadable, damaged or of another version.
         """
         ...
 
@@ -92,7 +90,7 @@ class ImportedFiles:
 
     Args:
         archive: The archive.
-        stamp: Tells an archive from the one that replaces it.
+        stamp: Identifies the version of the archive.
     """
 
     archive: Path

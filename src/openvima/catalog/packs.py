@@ -1,4 +1,4 @@
-"""Choosing an asset pack by name or folder."""
+"""Loading of asset packs by name or folder."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -12,19 +12,18 @@ if TYPE_CHECKING:
     from openvima.catalog.pack_files import PackFiles
 
 ASSET_PACKS = ("procedural", "original")
-"""Packs that have a name; any other is the path of a checkout of the original benchmark."""
+"""Named packs; anything else is the path of a checkout of VIMA-Bench."""
 
 
 def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
     """Return an asset pack; each is loaded once per process.
 
     Args:
-        assets: "procedural" for the shapes and textures made by code; "original" for those of the original
-            benchmark, once `openvima assets import` has read them, or the path of a checkout of it; or a
-            pack, which is returned as it is.
+        assets: "procedural"; "original" after `openvima assets import`, or the path of a checkout of
+            VIMA-Bench; or a pack, which is returned unchanged.
 
     Raises:
-        AssetError: The name is unknown, the folder holds no original pack, or none was imported.
+        AssetError: The name is unknown, the folder contains no original pack, or none was imported.
 
     Example:
         >>> load_assets("procedural").texture("blue")

@@ -1,7 +1,7 @@
-"""Which objects and textures each task may use at each level of generalisation.
+"""Objects and textures of each task at each generalization level.
 
-Training and L1 share their pools. L2 exchanges the textures of the two roles, L3 brings new shapes and all
-textures, L4 new tasks.
+Training and L1 share their pools. L2 swaps the textures of the two roles, L3 has novel shapes and all
+textures, L4 novel tasks.
 
 Source: the partition files of VIMA-Bench, with its constructor defaults filled in where they pass nothing.
 """
@@ -157,7 +157,7 @@ TEXTURE_SETS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Pool:
-    """What one task may draw from at one level; all entries are display names.
+    """Objects and textures of one task at one level, as display names.
 
     Args:
         dragged_objects: Objects to be moved (for sweeps: the small block), also used for distractors.
@@ -239,7 +239,7 @@ _ALL_TASKS = (*_TRAIN, *_L4)
 
 
 def tasks_at(level: str) -> tuple[str, ...]:
-    """Return the names of the tasks that a level holds, in the benchmark's order.
+    """Return the tasks of a level, in the benchmark's order.
 
     Raises:
         LevelError: There is no such level.
@@ -263,7 +263,7 @@ def levels_of(task: str) -> tuple[Level, ...]:
 
 
 def pool(task: str, level: str) -> Pool:
-    """Return what a task may draw from at a level.
+    """Return the objects and textures of a task at a level.
 
     Args:
         task: Name of one of the 17 tasks.

@@ -1,7 +1,7 @@
 """Pictures of the parametric textures: stripes, polka dots, swirls, paisleys, checkerboard and rainbow.
 
 Layouts follow those of the original images at a fraction of their size. Wherever it is easy, pixels come from
-whole numbers, and else from comparisons far from a tie, so that pictures are the same bits on every machine.
+whole numbers, and else from comparisons far from a tie, so that images are bit-identical on every machine.
 """
 
 import numpy as np

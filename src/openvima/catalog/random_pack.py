@@ -1,4 +1,4 @@
-"""An asset pack with endlessly many further looks; the name of each holds the seed that it is drawn from."""
+"""An asset pack with random shapes and textures, whose names contain their seeds."""
 
 import re
 from functools import lru_cache
@@ -8,22 +8,21 @@ import numpy as np
 from openvima.catalog.geometry import Assets, Geometry, Vector3, protect
 from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
-from openvima.catalog.random_shapes import has_heading, random_outline, random_shape, random_vessel
+from openvima.catalog.random_shapes import has_heading, random_container, random_outline, random_shape
 from openvima.catalog.random_textures import darkened_texture, random_texture
 
-_NAME = re.compile(r"(dark )?random (texture|shape|vessel) (\d+)")
+_NAME = re.compile(r"(dark )?random (texture|shape|container) (\d+)")
 _NUM_SEEDS = 1 << 31
-_KEPT = 64  # shapes and textures that are remembered: those of a few scenes
+_KEPT = 64  # cached shapes and textures: those of a few scenes
 
 
-class RandomLooks:
-    """A pack that also knows "random texture 7", "dark random texture 7", "random shape 7" and the like.
+class RandomAppearanceAssets:
+    """A pack that adds "random texture 7", "dark random texture 7", "random shape 7" and so on to another.
 
-    What another pack holds goes through unchanged. Random looks are for images only: nothing collides with
-    them, and no task knows them.
+    Random shapes are for images only: they have no collision, and no task uses them.
 
     Args:
-        base: Where shapes and textures of the catalogue come from.
+        base: Pack of the catalogue's shapes and textures.
     """
 
     def __init__(self, base: Assets) -> None:
@@ -34,7 +33,7 @@ class RandomLooks:
     @property
     def name(self) -> str:
         """Name of the pack."""
-        return f"{self.base.name} and random looks"
+        return f"{self.base.name} and random appearance"
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return a shape; see `Assets.geometry`. Random shapes have one size and ignore `size`."""
@@ -48,18 +47,18 @@ class RandomLooks:
 
 
 def random_name(kind: str, rng: np.random.Generator) -> str:
-    """Draw the name of a "texture", "shape" or "vessel"."""
+    """Draw the name of a "texture", "shape" or "container"."""
     return f"random {kind} {int(rng.integers(_NUM_SEEDS))}"
 
 
 def is_random(name: str) -> bool:
-    """Whether a name is that of a random look."""
+    """Whether a name is that of a random shape or texture."""
     return _NAME.fullmatch(name) is not None
 
 
 @lru_cache(1024)
-def shows_heading(object_name: str) -> bool:
-    """Whether a shape looks different at every yaw, so that two images of it tell how it was turned."""
+def has_visible_heading(object_name: str) -> bool:
+    """Whether the yaw of a shape is visible: it has no rotational symmetry."""
     if not is_random(object_name):
         return object_spec(object_name).symmetry_rad == NO_SYMMETRY
     kind, rng = _read(object_name)
@@ -74,7 +73,7 @@ def _read(name: str) -> tuple[str, np.random.Generator]:
 
 def _drawn_shape(name: str, scale: Vector3) -> Geometry:
     kind, rng = _read(name)
-    drawn = random_shape(rng) if kind == "shape" else random_vessel(rng)
+    drawn = random_shape(rng) if kind == "shape" else random_container(rng)
     return protect(scaled_geometry(drawn, scale))
 
 

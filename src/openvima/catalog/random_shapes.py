@@ -1,8 +1,4 @@
-"""Shapes of no catalogue: flat prisms with random outlines, and random vessels.
-
-Outlines are irregular throughout: each corner, bulge and stroke has a random place of its own. They know
-nothing of the catalogue's objects.
-"""
+"""Random shapes: flat prisms with irregular outlines, and containers, independent of the catalogue."""
 
 from collections.abc import Callable
 from typing import cast
@@ -18,28 +14,28 @@ from openvima.catalog.triangulation import signed_area
 _WIDTHS_M = (0.07, 0.125)  # smallest and largest extent of an outline, much as of the kit objects
 _HEIGHTS_M = (0.02, 0.036)
 _MICROMETRES = 6
-_NUM_RADII, _NUM_ANGLES = 14, 72  # where a shape is compared with itself turned
-_SMALLEST_TURN = 5  # of these angles; below 25 degrees every shape looks like itself
-_LEAST_DIFFERENCE = 0.15  # share of the area; 0.18 for the heart, 0.05 for the star
+_NUM_RADII, _NUM_ANGLES = 14, 72  # grid on which a shape is compared with its rotations
+_SMALLEST_TURN = 5  # of these angles; smaller rotations are never distinguishable
+_LEAST_DIFFERENCE = 0.15  # fraction of the area; 0.18 for the heart, 0.05 for the star
 
 Cell = tuple[int, int]
 
 
 def random_shape(rng: np.random.Generator) -> Geometry:
-    """Draw a flat prism, origin at its bottom, to be drawn; nothing collides with it."""
+    """Sample a flat prism, origin at its bottom, without collision."""
     return Geometry(prism(random_outline(rng), 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
 
 
-def random_vessel(rng: np.random.Generator) -> Geometry:
-    """Draw an open box, a tray, a bowl, a frame or a flat square, to be drawn; nothing collides with it."""
-    return _VESSELS[int(rng.integers(len(_VESSELS)))](rng)
+def random_container(rng: np.random.Generator) -> Geometry:
+    """Sample an open box, a tray, a bowl, a frame or a flat square, without collision."""
+    return _CONTAINERS[int(rng.integers(len(_CONTAINERS)))](rng)
 
 
 def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Draw an outline: a star, a polygon, a blob, a ring, or strokes like those of a letter.
 
     Args:
-        rng: Every draw comes from here.
+        rng: Generator of all draws.
 
     Returns:
         Loops of shape (N, 2), float64, metres: the outer one counter-clockwise, then holes clockwise.
@@ -56,7 +52,7 @@ def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 
 
 def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
-    """Whether an outline looks clearly different at every other angle, so that its yaw can be seen.
+    """Whether an outline differs clearly from its rotations, so that its yaw is visible.
 
     Args:
         loops: As `random_outline` returns them.
@@ -76,7 +72,7 @@ def has_heading(loops: tuple[np.ndarray, ...]) -> bool:
 
 
 def _centroid(loops: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Middle of the area inside an outline, about which symmetric shapes look the same, shape (2,)."""
+    """Centroid of the area inside an outline, shape (2,)."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
     parts = start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]  # of triangles with the origin, holes negative
@@ -84,7 +80,7 @@ def _centroid(loops: tuple[np.ndarray, ...]) -> np.ndarray:
 
 
 def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Whether points lie inside an outline and in none of its holes, shape (N,), bool; by crossings."""
+    """Whether points are inside an outline and in none of its holes, shape (N,), bool; by crossings."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
     x, y = points[:, :1], points[:, 1:]
@@ -257,4 +253,4 @@ _OUTLINES: tuple[Callable[[np.random.Generator], list[np.ndarray]], ...] = (
     _strokes,
     _strokes,
 )
-_VESSELS: tuple[Callable[[np.random.Generator], Geometry], ...] = (_open_box, _flat_square, _frame, _bowl)
+_CONTAINERS: tuple[Callable[[np.random.Generator], Geometry], ...] = (_open_box, _flat_square, _frame, _bowl)

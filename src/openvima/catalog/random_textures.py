@@ -50,8 +50,8 @@ def darkened_texture(texture: np.ndarray) -> np.ndarray:
         texture: Shape (H, W, 3), uint8.
     """
     value = texture.max(axis=2, keepdims=True) / 255
-    share = np.maximum(0, value - DARK_VALUE_DROP) / np.maximum(value, 1 / 255)
-    return (texture * share).astype(np.uint8)
+    factor = np.maximum(0, value - DARK_VALUE_DROP) / np.maximum(value, 1 / 255)
+    return (texture * factor).astype(np.uint8)
 
 
 def _random_colour(rng: np.random.Generator) -> np.ndarray:
@@ -73,8 +73,8 @@ def _contrasting_colours(rng: np.random.Generator, *, count: int) -> np.ndarray:
 def _blended(field: _Field, colours: np.ndarray) -> np.ndarray:
     """Go from colour to colour without a border, shape (S, S, 3)."""
     first = np.floor(field).astype(np.int64)
-    share = (field - first)[..., None]
-    return colours[first % len(colours)] * (1 - share) + colours[(first + 1) % len(colours)] * share
+    weight = (field - first)[..., None]
+    return colours[first % len(colours)] * (1 - weight) + colours[(first + 1) % len(colours)] * weight
 
 
 def _axes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

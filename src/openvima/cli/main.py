@@ -1,4 +1,4 @@
-"""The `openvima` program: finds the verb, imports only what it needs, runs it, reports errors in one line."""
+"""The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
 import errno
 import importlib
@@ -8,25 +8,25 @@ from collections.abc import Callable, Sequence
 from openvima import __version__
 from openvima.errors import OpenVimaError, unknown_name
 
-# Verb → what it does, in the order in which a newcomer meets them. Each is a module of this package.
+# Verb → summary. Each verb is a module of this package.
 VERBS = {
-    "quickstart": "the whole way in ten minutes: demonstrations, training, scores, report",
+    "quickstart": "generate, train, evaluate and report in ten minutes",
     "tasks": "list the tasks: prompt, tool, levels, steps",
-    "demo": "film the oracle or a policy at work on one task",
-    "generate": "write demonstrations with the oracle",
-    "data": "look into demonstrations, check, convert, divide or export them",
-    "assets": "show all objects and textures, or import those of the original benchmark",
-    "policies": "list networks and trained policies, convert or export checkpoints",
+    "demo": "record a video of the oracle or a policy on one task",
+    "generate": "generate demonstrations with the oracle",
+    "data": "inspect, verify, convert, split and export demonstrations",
+    "assets": "gallery of objects and textures; import of the original asset pack",
+    "policies": "list policies; convert and export checkpoints",
     "train": "train a policy on demonstrations",
-    "detector": "train and score the detector that finds objects in pixels",
-    "evaluate": "score policies on levels L1 to L4",
-    "serve": "let a policy be scored over the network, or from programs in other languages",
-    "report": "make the HTML report of evaluation results",
+    "detector": "train and evaluate the object detector",
+    "evaluate": "evaluate policies on levels L1 to L4",
+    "serve": "serve a policy over WebSockets",
+    "report": "write the HTML report of an evaluation",
 }
 
 _HELP = ("-h", "--help")
 
-OVERVIEW = """openvima {version}: multimodal-prompt robot manipulation
+OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 
 Usage: openvima VERB [OPTIONS]      openvima VERB --help explains one verb
 
@@ -40,10 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: The words after the program's name; by default those of the process.
+        arguments: Command-line arguments; by default those of the process.
 
     Returns:
-        Exit status: 0 done, 1 the work failed, 2 wrong usage or input, 130 interrupted.
+        Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in (*_HELP, "help"):
@@ -71,19 +71,18 @@ def _run(verb: str, rest: list[str]) -> int:
             return tyro.extras.subcommand_cli_from_dict(
                 commands, prog=f"openvima {verb}", description=module.__doc__, args=rest
             )
-        if hasattr(module, "run"):  # parses by itself
+        if hasattr(module, "run"):  # parses its own arguments
             return module.run(rest)
         return tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
     except OpenVimaError as error:
-        # Errors about input are also ValueError, KeyError or ImportError; others are failures of the work.
         usage = isinstance(error, ValueError | KeyError | ImportError)
         return _fail(f"{type(error).__name__}: {error}", 2 if usage else 1)
     except KeyboardInterrupt:
-        return _fail("interrupted; whole files were kept, and the same command continues.", 130)
-    except BrokenPipeError:  # the reader of our output, such as `head`, has gone
+        return _fail("interrupted; complete files were kept, and the same command resumes.", 130)
+    except BrokenPipeError:  # the reader of our output, such as `head`, exited
         sys.stderr.close()
         return 1
-    except OSError as error:  # a path that cannot be used, or a full disk
+    except OSError as error:  # an unusable path, or a full disk
         if error.filename is None:
             return _fail(f"{type(error).__name__}: {error}", 1)
         reason = error.strerror or type(error).__name__

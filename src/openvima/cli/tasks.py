@@ -21,15 +21,14 @@ def main(
     gallery: Path | None = None,
     assets: str = "procedural",
 ) -> int:
-    """List the tasks: what the robot is told, its tool, the levels, the steps, how often the oracle succeeds.
+    """List the tasks: prompt, tool, levels, steps and success rate of the oracle.
 
     Example: openvima tasks
 
     Args:
         as_json: Print JSON instead of a table.
-        gallery: Write a page with a picture of each task, and all of them on one sheet, into this folder.
-        assets: Asset pack of the gallery: procedural, original, or the folder of a checkout of the original
-            benchmark.
+        gallery: Write an HTML page with an image of each task into this folder.
+        assets: Asset pack of the gallery: procedural, original, or the folder of a checkout of VIMA-Bench.
 
     Returns:
         Exit status.
@@ -69,7 +68,7 @@ def main(
         }
         table.add_row(*(cells[name] for name in columns))
     console.print(table)
-    console.print("steps: those that the oracle may take, and what a policy is given on top")
+    console.print("steps: step limit of the oracle, and what a policy may use beyond it")
     console.print("oracle: its success rate in %, over all levels; --json has each level")
     return 0
 

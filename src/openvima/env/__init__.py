@@ -29,7 +29,7 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> object:  # importing the environment takes MuJoCo and Numba with it
+def __getattr__(name: str) -> object:  # importing the environment imports MuJoCo and Numba
     if name in _HOMES:
         return getattr(importlib.import_module(f"openvima.env.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Refusing, before anything moves, a call that a batch of environments could not take."""
+"""Validation of the resets and actions of vector environments."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,24 +14,24 @@ RESET_MASK = "reset_mask"  # Gymnasium's option: which sub-environments to reset
 
 
 class ActionValidator:
-    """Checks resets and actions of all sub-environments at once.
+    """Validates the resets and actions of all sub-environments before any of them moves.
 
-    Gymnasium checks nothing here: its synchronous kind moves the environments before the first bad action
-    and leaves those after it, and in its asynchronous kind a bad action or seed ends a worker.
+    Gymnasium does not: its synchronous kind steps the environments before the first invalid action and not
+    those after it, and in its asynchronous kind an invalid action or seed ends a worker.
 
     Args:
         num_envs: Number of sub-environments.
-        autoreset_mode: If it is "Disabled", a sub-environment whose episode is over waits for a `reset`.
+        autoreset_mode: With "Disabled", a sub-environment whose episode is over needs a `reset`.
     """
 
     def __init__(self, num_envs: int, autoreset_mode: AutoresetMode) -> None:
         self.num_envs = num_envs
         self._waits_for_reset = autoreset_mode is AutoresetMode.DISABLED
         self._needs_reset = np.ones(num_envs, dtype=bool)
-        self._resetting = np.zeros(num_envs, dtype=bool)
+        self._reset_mask = np.zeros(num_envs, dtype=bool)
 
     def check_reset(self, seed: object, options: Mapping[str, Any] | None) -> list[int | None]:
-        """Refuse seeds and options that a reset does not take.
+        """Check the seeds and options of a reset.
 
         Args:
             seed: None, a number k (then sub-environment i gets k + i), or one number or None for each.
@@ -53,22 +53,22 @@ class ActionValidator:
             raise ConfigError(f"got {len(seeds)} seeds for {self.num_envs} sub-environments; give one each.")
         unknown = set(options or ()) - {RESET_MASK}
         if unknown:
-            shown = ", ".join(map(str, sorted(unknown, key=str)))
-            raise ConfigError(f"reset has no option {shown} here; it takes '{RESET_MASK}'.")
+            names = ", ".join(map(str, sorted(unknown, key=str)))
+            raise ConfigError(f"reset has no option {names} here; it takes '{RESET_MASK}'.")
         mask = (options or {}).get(RESET_MASK)
-        self._resetting = np.ones(self.num_envs, dtype=bool) if mask is None else _checked_mask(mask, seeds)
+        self._reset_mask = np.ones(self.num_envs, dtype=bool) if mask is None else _checked_mask(mask, seeds)
         return seeds
 
-    def note_reset(self) -> None:
-        """Remember that the reset that was checked last has happened."""
-        self._needs_reset &= ~self._resetting
+    def record_reset(self) -> None:
+        """Record that the reset checked last was executed."""
+        self._needs_reset &= ~self._reset_mask
 
     def check_step(self, actions: object) -> None:
-        """Refuse actions of which one does not fit, and a step while a sub-environment awaits its reset.
+        """Check the actions of a step, and that every sub-environment has a running episode.
 
         Raises:
-            EpisodeError: A sub-environment has no episode that is running.
-            ActionError: An action does not fit; all problems are in one message. Nothing was moved.
+            EpisodeError: A sub-environment has no running episode.
+            ActionError: An action is invalid; all problems are in one message. Nothing was moved.
         """
         if self._needs_reset.any():
             waiting = ", ".join(map(str, np.flatnonzero(self._needs_reset)))
@@ -84,24 +84,24 @@ class ActionValidator:
             problems = [f"sub-environment {', '.join(map(str, at))}: {text}" for text, at in places.items()]
             raise ActionError(" ".join(problems) + " Nothing was moved.")
 
-    def note_step(self, is_over: np.ndarray) -> None:
-        """Remember which episodes ended in a step, shape (num_envs,), bool."""
+    def record_step(self, is_over: np.ndarray) -> None:
+        """Record which episodes ended in a step, shape (num_envs,), bool."""
         if self._waits_for_reset:
             self._needs_reset = np.array(is_over)
 
 
 def stack_actions(actions: Sequence[Mapping[str, Any] | Action | None]) -> dict[str, np.ndarray]:
-    """Join one action for each sub-environment into the batch that `step` of a vector environment takes.
+    """Stack one action for each sub-environment into the batch for `step` of a vector environment.
 
     Args:
-        actions: What a policy's `act` returns. None becomes an action that reaches into a corner of the
-            table, for sub-environments whose action does not matter.
+        actions: What a policy's `act` returns. None becomes a placeholder action in a corner of
+            the table, for sub-environments whose action does not matter.
 
     Returns:
         The four keys, each array with one row an action, float32.
 
     Raises:
-        ActionError: An action has not the four keys, or an array the wrong length.
+        ActionError: An action lacks a key, or an array has the wrong length.
     """
     corner = Action(WORKSPACE_LOW, WORKSPACE_LOW)
     rows = [corner if action is None else action for action in actions]
@@ -111,7 +111,7 @@ def stack_actions(actions: Sequence[Mapping[str, Any] | Action | None]) -> dict[
 
 
 def _rows(actions: object, num_envs: int) -> list[dict[str, Any]]:
-    """Take a batch of actions apart."""
+    """Split a batch of actions."""
     if not isinstance(actions, Mapping):
         keys, given = ", ".join(ACTION_SHAPES), type(actions).__name__
         raise ActionError(

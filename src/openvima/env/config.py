@@ -1,4 +1,4 @@
-"""What all episodes of a run have in common, whatever the task: assets, difficulty, fidelity."""
+"""Settings that all environments of a run share: assets, difficulty, fidelity."""
 
 import shlex
 from dataclasses import asdict, dataclass
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class EnvConfig:
-    """How the benchmark is run.
+    """Settings of the environments, whatever the task.
 
     Args:
-        assets: Asset pack: "procedural", "original" or the folder of a checkout of the original benchmark.
-        compat: Follow the original benchmark also where it is odd.
+        assets: Asset pack: "procedural", "original" or the folder of a checkout of VIMA-Bench.
+        compat: Reproduce VIMA-Bench's quirks.
         difficulty: "easy", as for all published results, "medium" or "hard".
 
     Raises:
@@ -37,10 +37,10 @@ class EnvConfig:
             task: Name of the task.
             level: "train" or "L1" to "L4".
             domain: Domain of the seeds.
-            realtime: Record every frame of a step.
+            realtime: Record `frames` during each step.
 
         Raises:
-            ConfigError: The task does not know the difficulty.
+            ConfigError: The task does not have this difficulty.
         """
         from openvima.env.tabletop import TabletopEnv
 
@@ -56,16 +56,16 @@ class EnvConfig:
 
     def options(self) -> dict[str, Any]:
         """Return the options of the task."""
-        if self.difficulty == "easy":  # a task may have but one, and then no such option
+        if self.difficulty == "easy":  # a task with one difficulty has no such option
             return {}
         return {"difficulty": self.difficulty}
 
     def record(self) -> dict[str, str | bool]:
-        """Return the settings as plain values, without a path."""
+        """Return the settings for a record, without paths."""
         return {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
 
     def words(self) -> list[str]:
-        """Return the options of a command line that differ from the defaults."""
+        """Return the command-line options that differ from the defaults."""
         words = [f"--assets {shlex.quote(self.assets)}"] if self.assets != "procedural" else []
         words += ["--compat"] if self.compat else []
         return words + ([f"--difficulty {self.difficulty}"] if self.difficulty != "easy" else [])

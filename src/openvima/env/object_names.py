@@ -1,4 +1,4 @@
-"""What is on the table, by id."""
+"""Names of the objects on the table, by id."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,12 +6,12 @@ from openvima.scene import Scene
 
 
 class ObjectNames(Mapping[int, dict[str, str]]):
-    """The names of object and texture of every placement, by its id; equal to a dictionary with the same.
+    """Maps the id of every placement to the names of its object and texture.
 
-    It is no dictionary because Gymnasium's vector environments take those apart and expect text as keys.
+    Not a dictionary: Gymnasium's vector environments split those and require string keys.
 
     Args:
-        scene: Whose placements are listed.
+        scene: The scene.
 
     Example:
         >>> info["objects"][5]  # doctest: +SKIP

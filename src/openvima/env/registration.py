@@ -1,4 +1,4 @@
-"""Names under which Gymnasium finds the environments: `openvima/rotate-v0` and so on, one a task."""
+"""Gymnasium ids of the environments, one per task: `openvima/rotate-v0` and so on."""
 
 import importlib.util
 import sys
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
 
-ENVIRONMENT_VERSION = 0  # grows whenever the bytes for a seed change; see the history at `TabletopEnv`
+ENVIRONMENT_VERSION = 0  # bumped when the bytes for a seed change; see the history of `TabletopEnv`
 
 
 def environment_id(task: str) -> str:
-    """Return the name that `gymnasium.make` takes for a task, such as "openvima/rotate-v0"."""
+    """Return the Gymnasium id of a task, such as "openvima/rotate-v0"."""
     return f"openvima/{task}-v{ENVIRONMENT_VERSION}"
 
 
@@ -23,7 +23,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
     """Build the environment of one task, without Gymnasium's wrappers.
 
     Args:
-        task: Name of the task, such as "rotate", or its Gymnasium name, such as "openvima/rotate-v0".
+        task: Name of the task, such as "rotate", or its Gymnasium id, such as "openvima/rotate-v0".
         **options: Keyword arguments of `TabletopEnv`, such as `level="L1"`.
 
     Returns:
@@ -32,7 +32,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
-        ConfigError: An option is not known or its value not allowed.
+        ConfigError: An option is unknown or its value invalid.
 
     Example:
         >>> env = make("rotate", level="L1")
@@ -45,7 +45,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
 
 
 def register_environments() -> None:
-    """Tell Gymnasium about all tasks; calling it again changes nothing."""
+    """Register all tasks with Gymnasium; idempotent."""
     from gymnasium.envs.registration import register, registry
 
     from openvima.tasks import list_tasks
@@ -60,19 +60,18 @@ def register_environments() -> None:
 
 
 def register_with_gymnasium() -> None:
-    """Register now if Gymnasium has been imported, else as soon as it is.
+    """Register now if Gymnasium has been imported, else when it is.
 
-    Importing Gymnasium takes longer than the whole rest of `import openvima`, and it no longer looks for
-    plugins by itself.
+    Importing Gymnasium takes longer than the rest of `import openvima`, and it no longer discovers plugins.
     """
     if "gymnasium.envs" in sys.modules:
         register_environments()
-    elif not any(isinstance(extractor, _AfterGymnasium) for extractor in sys.meta_path):
+    elif not any(isinstance(finder, _AfterGymnasium) for finder in sys.meta_path):
         sys.meta_path.insert(0, _AfterGymnasium())
 
 
 class _AfterGymnasium(MetaPathFinder):
-    """Registers the environments right after the first import of `gymnasium.envs`, then steps aside."""
+    """Registers the environments after the first import of `gymnasium.envs`, then removes itself."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None

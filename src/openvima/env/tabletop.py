@@ -41,11 +41,11 @@ _LARGEST_SEED = 2**31  # of the seeds that a reset without one draws
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoFrame:
-    """One picture of a film, not rendered yet.
+    """One frame of a video, not yet rendered.
 
     Args:
-        scene: Where everything is.
-        joints: Angles of the arm, shape (6,), radians.
+        scene: The scene.
+        joints: Joint angles of the arm, shape (6,), radians.
     """
 
     scene: Scene
@@ -54,7 +54,7 @@ class VideoFrame:
 
 @dataclass(slots=True, eq=False)
 class _Run:
-    """What belongs to the episode that is being played."""
+    """State of the running episode."""
 
     episode: Episode
     world: World
@@ -67,8 +67,8 @@ class _Run:
     frames: list[VideoFrame] = field(default_factory=list)
     prompt: RenderedPrompt | None = None
 
-    def watch(self, scene: Scene) -> None:
-        self.progress = goals.watch(self.episode.problem, self.progress, scene)
+    def monitor(self, scene: Scene) -> None:
+        self.progress = goals.monitor(self.episode.problem, self.progress, scene)
 
     def record(self, scene: Scene, joints: np.ndarray) -> None:
         self.frames.append(VideoFrame(scene, np.array(joints)))
@@ -79,7 +79,7 @@ class _Run:
 
 
 class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
-    """A UR5 arm at a table: read a prompt, look from two cameras, pick and place or sweep.
+    """A UR5 arm at a table, with a multimodal prompt, two cameras, and pick-and-place or sweep actions.
 
     **Observation** — a dictionary; the cameras `front` and `top` are fixed.
 
@@ -97,8 +97,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     | `pose0_rotation`, `pose1_rotation` | (4,) | quaternion xyzw, each −1 … 1; only its yaw matters |
 
     With the suction cup a step picks at pose0 and places at pose1, the object turned by the difference of
-    yaw. With the spatula it sweeps in a straight line from pose0 to pose1. An action that does not fit
-    raises `ActionError` and changes nothing.
+    yaw. With the spatula it sweeps in a straight line from pose0 to pose1. An invalid action raises
+    `ActionError` and changes nothing.
 
     **Reward** — 1.0 on the step that solves the task, else 0.0.
 
@@ -109,7 +109,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     0), `num_steps`, `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of
     object and texture). The images of the prompt are in `prompt`, an attribute.
 
-    **Start** — `reset(seed=k)` gives episode number k of the environment's domain, task and level: always
+    **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
     `reset(options={"episode": episode})` loads a sampled episode.
 
@@ -118,12 +118,12 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     Args:
         task: Name of the task, such as "rotate".
-        level: "train", "L1", "L2", "L3" or "L4": which objects, textures and tasks may occur. By default
+        level: "train", "L1", "L2", "L3" or "L4": generalization level. By default
             "train", or the only level of a task held out for L4.
         domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
-        compat: Follow the original benchmark also where it is odd: objects hover at the start, ids follow
-            the order of spawning, the oracle picks any visible point.
+        compat: Reproduce VIMA-Bench's quirks: objects hover at the start, ids follow the order of
+            spawning, the oracle picks any visible point.
         hide_arm: Leave arm and tool out of the images, as in all published data; else they are ids 2 to 4.
         realtime: Record `frames`, 30 a second, while a step runs.
         render_mode: None, or "rgb_array": `render` returns both views, front above top.
@@ -132,7 +132,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
-        ConfigError: The domain, the render mode, or an option of the task or its value, is not allowed.
+        ConfigError: The domain, the render mode or an option of the task is invalid.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
@@ -153,7 +153,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         _check_render_mode(render_mode)
         self.task = task
         self.level = task_spec(task).checked_level(level)
-        make_rng(domain, task, self.level, 0, purpose="scene")  # refuses an unknown domain
+        make_rng(domain, task, self.level, 0, purpose="scene")  # checks the domain
         self.domain = domain
         self.assets = load_assets(assets)
         self.compat = compat
@@ -166,8 +166,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self._rasteriser = Rasteriser(self.assets)
         self._run: _Run | None = None
         if task_options:
-            with suppress(SamplingError):  # bad luck in this draw says nothing about the next
-                self._sample(0)  # only the task itself knows which values it takes
+            with suppress(SamplingError):  # another seed may succeed
+                self._sample(0)  # the task checks its options
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -183,12 +183,12 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
         Raises:
             SamplingError: The task finds no start for this seed; no episode is running then.
-            ConfigError: An option is not known, or the seed is no whole number from 0 to 2**63 - 1.
+            ConfigError: An option is unknown, or the seed is not an integer from 0 to 2**63 - 1.
         """
         seed = None if seed is None else checked_seed(seed)
         given = _episode_option(options)
         super().reset(seed=seed)
-        self._run = None  # should the rest fail, nobody goes on with the episode before
+        self._run = None  # no running episode should the rest fail
         episode = given or self._sample(seed)
         rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
         world = World(episode.problem.scene, self.assets, compat=self.compat)
@@ -198,17 +198,17 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     def step(
         self, action: Mapping[str, Any] | Action
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Run one whole primitive and let everything come to rest.
+        """Execute one primitive and let all objects come to rest.
 
         Args:
             action: The four arrays, or an `Action`.
 
         Returns:
-            Observation, reward, terminated, truncated, info, as described at the class.
+            Observation, reward, terminated, truncated, info; see the class.
 
         Raises:
             EpisodeError: No episode is running.
-            ActionError: The action does not fit; nothing was moved.
+            ActionError: The action is invalid; nothing was moved.
         """
         run = self._running()
         if run.outcome.is_over or run.num_steps >= run.episode.max_steps:
@@ -217,7 +217,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         run.frames = []
         execution = run.world.execute(
             checked,
-            watch=run.watch if goals.needs_watching(run.episode.problem) else None,
+            monitor=run.monitor if goals.needs_monitoring(run.episode.problem) else None,
             record=run.record if self.realtime else None,
             frames_per_second=FRAMES_PER_SECOND,
         )
@@ -240,15 +240,15 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
 
     def close(self) -> None:
-        """Free the simulation; a `reset` brings it back."""
+        """Free the simulation; `reset` starts it again."""
         self._run = None
 
     def oracle_decision(self) -> OracleDecision:
-        """Ask the scripted oracle, which knows the scene, for the next action.
+        """Return the next action of the scripted oracle, which has access to the scene.
 
         Raises:
             EpisodeError: There is no episode yet.
-            OracleError: It has none.
+            OracleError: The oracle has no action.
         """
         run = self._running()
         return oracle_action(
@@ -262,12 +262,12 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     @property
     def episode(self) -> Episode:
-        """The problem that is being played."""
+        """The running episode."""
         return self._running().episode
 
     @property
     def prompt(self) -> RenderedPrompt:
-        """What the robot is told: text and rendered images; `prompt.sequence()` is its reading order."""
+        """The prompt: text and rendered images; `prompt.sequence()` interleaves them."""
         run = self._running()
         if run.prompt is None:
             run.prompt = self._rasteriser.prompt(run.episode.problem.prompt)
@@ -275,17 +275,17 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     @property
     def scene(self) -> Scene:
-        """Where everything is now: what a policy must not know."""
+        """The current scene, privileged information that a policy must not use."""
         return self._running().world.scene
 
     @property
     def progress(self) -> Progress:
-        """Which goals are met, and which constraints broken."""
+        """Open goals and violated constraints."""
         return self._running().progress
 
     @property
     def outcome(self) -> Outcome:
-        """How the episode stands."""
+        """Success, failure, or neither yet."""
         return self._running().outcome
 
     @property
@@ -295,7 +295,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     @property
     def frames(self) -> tuple[VideoFrame, ...]:
-        """The film of the last step, 30 frames a second; empty unless `realtime`."""
+        """Video frames of the last step, 30 a second; empty unless `realtime`."""
         return tuple(self._running().frames)
 
     def _running(self) -> _Run:

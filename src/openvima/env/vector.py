@@ -1,7 +1,7 @@
-"""Several environments stepped together: in this process, or each in a process of its own.
+"""Vector environments, in this process or with one worker process per sub-environment.
 
-Both kinds are Gymnasium's, with its spaces and autoreset modes. What is added to both: calls that cannot work
-are refused before anything moves. See `workers` for what is added to processes.
+Both are Gymnasium's classes, with its spaces and autoreset modes, and validate calls before anything moves.
+See `workers` for the additions to the asynchronous kind.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,16 +33,15 @@ def make_vec(
     """Build a vector environment.
 
     Args:
-        tasks: Name of the task; or a list of names, or of mappings with "task" and further options, which
-            the sub-environments take in turn.
+        tasks: Name of the task; or a list of names, or of mappings with "task" and further options,
+            assigned to the sub-environments in turn.
         num_envs: Number of sub-environments; by default one for each entry of `tasks`.
-        vectorization_mode: "sync": one after the other in this process. "async": each in a process of its
-            own, with the observations in shared memory; a script must then keep what it does under
-            `if __name__ == "__main__":`, for workers import it.
-        autoreset_mode: "NextStep", "SameStep" or "Disabled", or Gymnasium's `AutoresetMode`: when an episode
-            that ended is followed by the next.
-        seeds: Numbers of the episodes to play: sub-environment i begins with the i-th one and goes on with
-            each `num_envs`-th, then from its first again. By default every `reset` without a seed draws one.
+        vectorization_mode: "sync": in this process. "async": one worker process each, with observations
+            in shared memory; scripts then need `if __name__ == "__main__":`, because workers import them.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled", or Gymnasium's `AutoresetMode`: when the next
+            episode starts.
+        seeds: Seeds of the episodes: sub-environment i takes every `num_envs`-th, starting with the i-th, and
+            repeats them. By default every `reset` without a seed draws one.
         **options: Further keyword arguments of `TabletopEnv` for all sub-environments.
 
     Returns:
@@ -51,7 +50,7 @@ def make_vec(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: A task is not defined at the level.
-        ConfigError: A mode, an option or a seed is not allowed.
+        ConfigError: A mode, an option or a seed is invalid.
         WorkerError: A worker ended while it started.
 
     Example:
@@ -67,26 +66,26 @@ def make_vec(
     if vectorization_mode not in MODES:
         raise ConfigError(unknown_name("vectorization mode", vectorization_mode, MODES))
     mode = _autoreset_mode(autoreset_mode)
-    dealt = _deal(seeds, num_envs)
-    recipes = [_recipe(choices[i % len(choices)], options, dealt[i]) for i in range(num_envs)]
+    seed_lists = _split_seeds(seeds, num_envs)
+    env_fns = [_env_factory(choices[i % len(choices)], options, seed_lists[i]) for i in range(num_envs)]
     if vectorization_mode == "sync":
-        return SyncTabletopEnvs(recipes, mode)
-    for recipe in recipes:
-        recipe().close()  # what cannot be built fails here, where its message is at home
-    return AsyncTabletopEnvs(recipes, mode)
+        return SyncTabletopEnvs(env_fns, mode)
+    for env_fn in env_fns:
+        env_fn().close()  # fails here rather than in a worker
+    return AsyncTabletopEnvs(env_fns, mode)
 
 
 class SyncTabletopEnvs(SyncVectorEnv):
-    """Sub-environments that take turns in this process. See `make_vec`.
+    """Sub-environments in this process. See `make_vec`.
 
     Args:
-        recipes: Build the sub-environments.
-        autoreset_mode: When the next episode begins.
+        env_fns: Build the sub-environments.
+        autoreset_mode: When the next episode starts.
     """
 
-    def __init__(self, recipes: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
-        super().__init__(recipes, autoreset_mode=autoreset_mode)
-        self._gate = ActionValidator(len(recipes), autoreset_mode)
+    def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env]], autoreset_mode: AutoresetMode) -> None:
+        super().__init__(env_fns, autoreset_mode=autoreset_mode)
+        self._validator = ActionValidator(len(env_fns), autoreset_mode)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in all sub-environments, or in those of `options["reset_mask"]`.
@@ -99,57 +98,57 @@ class SyncTabletopEnvs(SyncVectorEnv):
             Batches of observations and infos.
 
         Raises:
-            ConfigError: A seed or option is not allowed.
+            ConfigError: A seed or option is invalid.
             SamplingError: A task finds no start for its seed.
         """
-        seeds = self._gate.check_reset(seed, options)
+        seeds = self._validator.check_reset(seed, options)
         result = super().reset(seed=seeds, options=dict(options or {}))
-        self._gate.note_reset()
+        self._validator.record_reset()
         return result
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take a step in every sub-environment.
 
         Args:
-            actions: The four keys of an action, each array with one row a sub-environment.
+            actions: The four keys of an action, one row per sub-environment.
 
         Returns:
             Batches of observation, reward, terminated, truncated and info.
 
         Raises:
             EpisodeError: A sub-environment has no running episode.
-            ActionError: An action does not fit. Nothing was moved in any sub-environment.
+            ActionError: An action is invalid. No sub-environment moved.
         """
-        self._gate.check_step(actions)
+        self._validator.check_step(actions)
         result = super().step(actions)
-        self._gate.note_step(result[2] | result[3])
+        self._validator.record_step(result[2] | result[3])
         return result
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
-    """How to build one sub-environment; workers receive it.
+class EnvFactory:
+    """Picklable constructor of one sub-environment.
 
     Args:
         options: Keyword arguments of `make`.
-        seeds: Numbers of its episodes, or empty.
+        seeds: Seeds of its episodes, or empty.
     """
 
     options: Mapping[str, Any]
     seeds: tuple[int, ...]
 
     def __call__(self) -> gymnasium.Env:
-        """Build it."""
+        """Build the sub-environment."""
         env = make(**self.options)
         return FixedSeeds(env, self.seeds) if self.seeds else env
 
 
 class FixedSeeds(gymnasium.Wrapper):
-    """Takes the seeds of its episodes from a list, in order, and from the first again after the last.
+    """Takes the seeds of its episodes from a list, cyclically.
 
     Args:
         env: The environment.
-        seeds: Numbers of the episodes, at least one.
+        seeds: Seeds of the episodes, at least one.
     """
 
     def __init__(self, env: gymnasium.Env, seeds: Sequence[int]) -> None:
@@ -158,7 +157,7 @@ class FixedSeeds(gymnasium.Wrapper):
         self._num_started = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
-        """Start the next episode of the list, or the one that is asked for."""
+        """Start the next episode of the list, or the requested one."""
         if seed is not None or options:
             return self.env.reset(seed=seed, options=options)
         seed = self._seeds[self._num_started % len(self._seeds)]
@@ -166,15 +165,17 @@ class FixedSeeds(gymnasium.Wrapper):
         return self.env.reset(seed=seed)
 
 
-def _recipe(choice: str | Mapping[str, Any], options: Mapping[str, Any], seeds: tuple[int, ...]) -> Recipe:
+def _env_factory(
+    choice: str | Mapping[str, Any], options: Mapping[str, Any], seeds: tuple[int, ...]
+) -> EnvFactory:
     own = {"task": choice} if isinstance(choice, str) else dict(choice)
     if "task" not in own:
         raise ConfigError(f"an entry of tasks is {own}; give a name, or a mapping with 'task' and options.")
-    return Recipe({**options, **own}, seeds)
+    return EnvFactory({**options, **own}, seeds)
 
 
-def _deal(seeds: Iterable[int] | None, num_envs: int) -> list[tuple[int, ...]]:
-    """Give each sub-environment its seeds, like cards."""
+def _split_seeds(seeds: Iterable[int] | None, num_envs: int) -> list[tuple[int, ...]]:
+    """Distribute the seeds over the sub-environments, round robin."""
     if seeds is None:
         return [()] * num_envs
     numbers = tuple(checked_seed(seed) for seed in seeds)

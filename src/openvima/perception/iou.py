@@ -1,52 +1,48 @@
-"""Which of the objects that were found are which of the true ones: those whose boxes overlap most."""
+"""Intersection over union of boxes, and matching of detected to true objects by it."""
 
 import numpy as np
 
 from openvima.perception.objects import ObjectViews
 
-IOU_THRESHOLD = 0.5  # intersection over union, as boxes are commonly called right
+IOU_THRESHOLD = 0.5  # of a match
 
 
-def object_iou(some: ObjectViews, others: ObjectViews) -> np.ndarray:
-    """Return how much objects overlap others, shape (objects, others), float64.
+def object_iou(objects: ObjectViews, others: ObjectViews) -> np.ndarray:
+    """Return the pairwise IoU of objects, shape (objects, others), float64.
 
-    That is intersection over union of their boxes, in the view in which it is larger; 0 where no view shows
-    both.
+    It is the larger one of both views; 0 where no view contains both boxes.
     """
-    return box_iou(some.boxes, some.masks, others.boxes, others.masks)
+    return box_iou(objects.boxes, objects.masks, others.boxes, others.masks)
 
 
 def box_iou(
-    some: np.ndarray, some_shown: np.ndarray, others: np.ndarray, others_shown: np.ndarray
+    boxes: np.ndarray, is_visible: np.ndarray, others: np.ndarray, others_visible: np.ndarray
 ) -> np.ndarray:
-    """Return the same from boxes, (2, N, 4) and (2, M, 4), and where they are shown, (2, N) and (2, M)."""
-    ours, theirs = _edges(some)[:, :, None], _edges(others)[:, None]
+    """Return the same for boxes, (2, N, 4) and (2, M, 4), with visibility masks, (2, N) and (2, M)."""
+    ours, theirs = _edges(boxes)[:, :, None], _edges(others)[:, None]
     first, last = np.maximum(ours[..., :2], theirs[..., :2]), np.minimum(ours[..., 2:], theirs[..., 2:])
-    shared = np.prod(np.maximum(last - first, 0), axis=-1)
-    both_shown = some_shown[:, :, None] & others_shown[:, None]
-    shares = np.where(both_shown, shared / (_areas(ours) + _areas(theirs) - shared), 0.0)
-    return shares.max(axis=0)
+    intersection = np.prod(np.maximum(last - first, 0), axis=-1)
+    both_visible = is_visible[:, :, None] & others_visible[:, None]
+    union = _areas(ours) + _areas(theirs) - intersection
+    return np.where(both_visible, intersection / union, 0.0).max(axis=0)
 
 
 def match_ids_to_slots(found: ObjectViews, true: ObjectViews) -> dict[int, int]:
-    """Say which slot shows each true object that was found.
-
-    Always the two are paired that overlap most of those that are left, so that no slot counts twice.
+    """Match true objects to detections greedily, by descending IoU.
 
     Args:
-        found: What a detector found.
-        true: What the segmentation shows of the same moment.
+        found: Detected objects.
+        true: Objects of the segmentation in the same observation.
 
     Returns:
-        Id of a true object to the slot in `found`; those without a box that overlaps theirs by half are left
-        out.
+        Id of a true object to its slot in `found`; objects below `IOU_THRESHOLD` are omitted.
     """
-    shares = object_iou(found, true)
+    iou = object_iou(found, true)
     slots = {}
-    while shares.size and shares.max() >= IOU_THRESHOLD:
-        slot, row = (int(index) for index in np.unravel_index(shares.argmax(), shares.shape))
+    while iou.size and iou.max() >= IOU_THRESHOLD:
+        slot, row = (int(index) for index in np.unravel_index(iou.argmax(), iou.shape))
         slots[int(true.ids[row])] = slot
-        shares[slot], shares[:, row] = 0, 0
+        iou[slot], iou[:, row] = 0, 0
     return slots
 
 

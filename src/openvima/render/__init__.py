@@ -1,4 +1,4 @@
-"""Images of scenes: fixed cameras, a triangle rasteriser, and the map of the table from above."""
+"""Rendering: fixed cameras, a triangle rasteriser, and the label raster of the table."""
 
 from openvima.render.camera import CAMERAS, FRONT, TOP, VIEWS, Camera, View, project, unproject
 from openvima.render.image_layout import channels_first, channels_last

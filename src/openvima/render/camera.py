@@ -1,4 +1,4 @@
-"""The two fixed cameras, and the way between points in the world and pixels."""
+"""The two fixed cameras, and projection between world and pixels."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,16 +12,14 @@ VIEWS: tuple[View, View] = ("front", "top")
 
 Row = tuple[float, float, float, float]
 
-MIN_DOUBLED_AREA_PX2 = (
-    0.01  # triangles up to this doubled area are left out, as the benchmark's renderer does
-)
+MIN_DOUBLED_AREA_PX2 = 0.01  # triangles up to this doubled area are skipped, as in VIMA-Bench
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera about 1000 m away, so that its images are orthographic but for a trace of perspective.
+    """A pinhole camera about 1000 m away, nearly orthographic.
 
-    A row (a, b, c, d) stands for the length a·x + b·y + c·z + d in metres, of a point (x, y, z) in the world.
+    A row (a, b, c, d) is the linear form a·x + b·y + c·z + d of a point (x, y, z) in the world, in metres.
 
     Args:
         view: Name of the view.
@@ -44,19 +42,19 @@ class Camera:
     min_doubled_area_px2: float = MIN_DOUBLED_AREA_PX2
 
     def enlarged(self, factor: int) -> "Camera":
-        """Return the same view in `factor` times the resolution.
+        """Return the same view at `factor` times the resolution.
 
-        Of every `factor` × `factor` pixels, the lower left one sees the point that the plain image samples
-        there: `large[factor - 1 :: factor, ::factor]` is the plain image.
+        The lower left of every `factor` × `factor` pixels samples the same point as the plain image:
+        `large[factor - 1 :: factor, ::factor]` is the plain image.
 
         Args:
-            factor: A whole number from 1.
+            factor: Integer from 1.
 
         Raises:
             ConfigError: `factor` is below 1.
         """
         if factor < 1:
-            raise ConfigError(f"enlarge is {factor}; it must be a whole number from 1.")
+            raise ConfigError(f"enlarge is {factor}; it must be an integer from 1.")
         return replace(
             self,
             width=self.width * factor,
@@ -66,7 +64,7 @@ class Camera:
         )
 
     def matrix(self) -> np.ndarray:
-        """Return the camera for the kernels.
+        """Return the camera as a matrix for the kernels.
 
         Returns:
             Shape (4, 4), float64: rows right, up, away, then (focal length, half width, half height, smallest
@@ -77,7 +75,7 @@ class Camera:
 
 
 # The focal lengths are whole pixels by construction (640000 // 2.55 and 640000 // 1.8). The constants of
-# the front camera, 45 degrees down, are the float32 entries of the benchmark's view matrix: rounder ones move
+# the front camera, 45 degrees down, are the float32 entries of VIMA-Bench's view matrix: rounder ones shift
 # whole rows of pixels.
 _COS_45 = 0.70710677
 TOP = Camera(
@@ -102,19 +100,19 @@ CAMERAS: dict[View, Camera] = {"front": FRONT, "top": TOP}
 
 
 def project(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Map points in the world to pixel coordinates of one view.
+    """Project world points to pixel coordinates of one view.
 
     Args:
         points: Positions in metres, shape (..., 3); x away from the robot, y to its left, z up.
         camera: The view; its image is `camera.height` × `camera.width` pixels.
 
     Returns:
-        Shape (..., 2), float64: column, then row, row 0 on top. Whole numbers are the points that pixels
-        sample. Points outside the image keep their coordinates; nothing is clipped.
+        Shape (..., 2), float64: column, then row, row 0 on top. Integers are the sampling
+        points of pixels. Nothing is clipped.
 
     Raises:
         ShapeError: The last axis of `points` does not have length 3.
-        CameraError: A point lies in or behind the camera plane (the message names the first one).
+        CameraError: A point is in or behind the camera plane.
 
     Example:
         >>> project(np.array([0.5, 0.0, 0.0]), TOP)
@@ -129,14 +127,14 @@ def project(points: np.ndarray, camera: Camera) -> np.ndarray:
     behind = away <= 0
     if behind.any():
         first = tuple(float(v) for v in points[behind].reshape(-1, 3)[0])
-        raise CameraError(f"point {first} lies behind the {camera.view} camera; give points near the table.")
+        raise CameraError(f"point {first} is behind the {camera.view} camera; give points near the table.")
     columns = camera.width / 2 + camera.focal_px * right / away
     heights = camera.height / 2 + camera.focal_px * up / away
     return np.stack([columns, camera.height - 1 - heights], axis=-1)
 
 
 def unproject(pixels: np.ndarray, camera: Camera, z: float | np.ndarray = 0.0) -> np.ndarray:
-    """Map pixel coordinates of one view to the points at a known height that they show.
+    """Unproject pixel coordinates of one view to points at a known height.
 
     Args:
         pixels: Column, then row, shape (..., 2); see `project`.
@@ -144,7 +142,7 @@ def unproject(pixels: np.ndarray, camera: Camera, z: float | np.ndarray = 0.0) -
         z: Height above the table in metres, one number or shape (...).
 
     Returns:
-        x, y in metres, shape (..., 2), float64; `project` undoes it.
+        x, y in metres, shape (..., 2), float64; the inverse of `project`.
 
     Raises:
         ShapeError: The last axis of `pixels` does not have length 2.

@@ -1,4 +1,4 @@
-"""Meshes in the form that the kernels read: each corner position once, poses as matrices."""
+"""Meshes in the layout of the kernels: indexed vertices, poses as matrices."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,7 +8,7 @@ import numpy as np
 from openvima.catalog.geometry import TriangleMesh
 from openvima.scene import Pose
 
-MERGE_FROM_TRIANGLES = 400  # below this, finding equal corners costs more than transforming them twice
+MERGE_FROM_TRIANGLES = 400  # below this, merging corners costs more than it saves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +21,7 @@ class IndexedMesh:
         normals: Unit normals at the corners, shape (F, 3, 3), float64.
         uvs: Texture coordinates at the corners, shape (F, 3, 2), float64.
         is_flat: Whether a triangle's three normals are equal, shape (F,), bool.
-        upward: Those rows of `corners` that face up while the body lies level, shape (U, 3), int32.
+        upward: The rows of `corners` that face up while the body is level, shape (U, 3), int32.
     """
 
     vertices: np.ndarray
@@ -45,7 +45,7 @@ def indexed(mesh: TriangleMesh) -> IndexedMesh:
     a, b, c = (mesh.vertices[:, k, :2] for k in range(3))
     doubled_area = (b - a)[:, 0] * (c - a)[:, 1] - (c - a)[:, 0] * (b - a)[:, 1]
     corners = np.ascontiguousarray(corners, dtype=np.int32)
-    # Copies, for kernels are compiled anew for arrays that cannot be written to, as those of packs.
+    # Copies: kernels would be compiled again for the read-only arrays of packs.
     return IndexedMesh(
         vertices=np.array(vertices, dtype=np.float64, order="C"),
         corners=corners,
@@ -58,19 +58,19 @@ def indexed(mesh: TriangleMesh) -> IndexedMesh:
 
 @lru_cache(maxsize=64)
 def magnified(mesh: TriangleMesh, factor: float) -> TriangleMesh:
-    """Return a mesh `factor` times as large about the origin of its frame."""
+    """Return a mesh scaled by `factor` about its origin."""
     return TriangleMesh(mesh.vertices * factor, mesh.normals, mesh.uvs)
 
 
-class Scratch:
-    """Working memory of the kernels, grown to the largest mesh seen; one thread at a time."""
+class KernelBuffers:
+    """Working memory of the kernels, grown to the largest mesh; not thread-safe."""
 
     def __init__(self) -> None:
         self._points = np.empty((0, 4))
         self._selected = np.empty(0, dtype=np.int32)
 
     def arrays(self, mesh: IndexedMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Return room for all vertices, (≥ V, 4) float64, and for triangle indices, (≥ F + 1,) int32."""
+        """Return buffers for vertices, (≥ V, 4) float64, and triangle indices, (≥ F + 1,) int32."""
         if len(mesh.vertices) > len(self._points):
             self._points = np.empty((len(mesh.vertices), 4))
         if len(mesh.corners) >= len(self._selected):

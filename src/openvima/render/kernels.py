@@ -1,6 +1,6 @@
-"""Numba kernels: filling and shading triangles, seen by a camera or straight from above.
+"""Numba kernels that fill and shade triangles, for a camera or from straight above.
 
-Nothing is checked here; the modules beside it own the arguments. Each kernel has a slow twin in the tests.
+The calling modules check the arguments. Each kernel has a slow reference implementation in the tests.
 """
 
 import math
@@ -71,8 +71,8 @@ def select_triangles(
 ) -> int:
     """List the triangles that show their front and may cover a whole-numbered point; return how many.
 
-    Most triangles of a fine mesh do neither. The list is built without branches, which the processor could
-    not predict: that takes a fifth off the time of the largest meshes.
+    Most triangles of a fine mesh do neither. The list is built without branches, which the CPU could not
+    predict: that saves a fifth of the time of the largest meshes.
     """
     count = 0
     for f in range(corners.shape[0]):

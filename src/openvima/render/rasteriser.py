@@ -1,4 +1,4 @@
-"""Images of scenes and prompts: colours, object ids and heights, the same bytes on every machine."""
+"""Rasteriser of scenes and prompts: colours, object ids and heights, bit-identical on every machine."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View
-from openvima.render.indexed import Scratch, indexed, magnified, matrix_3x4
+from openvima.render.indexed import KernelBuffers, indexed, magnified, matrix_3x4
 from openvima.render.kernels import draw_triangles
 from openvima.scene import (
     BACKGROUND_ID,
@@ -27,19 +27,19 @@ from openvima.scene import (
     SceneImage,
 )
 
-FLOOR_Z = -0.001  # m; the sheet lies 1 mm above the floor on which the bodies rest
+FLOOR_Z = -0.001  # m; the sheet is 1 mm above the floor on which bodies rest
 FLOOR_RGB = (255, 255, 255)
 SHEET_RGB = (51, 51, 51)
 SHEET_SIZE = (0.501, 0.999)  # m, x and y, about (0.5, 0)
-PROMPT_POSE = Pose.planar(0.5, 0.0, math.pi / 2)  # where prompt images show a lone object
-LARGEST_ID = 254  # 255 means nothing
+PROMPT_POSE = Pose.planar(0.5, 0.0, math.pi / 2)  # pose of the object in object images
+LARGEST_ID = 254  # 255 is background
 
 Rgb = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawable:
-    """A mesh to draw that is no object of the catalogue, such as a link of the arm.
+    """A mesh outside the catalogue, such as a link of the arm.
 
     Args:
         mesh: The triangles.
@@ -56,12 +56,12 @@ class Drawable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Image:
-    """What one camera sees.
+    """An image of one camera.
 
     Args:
         rgb: Colours, shape (3, H, W), uint8, row 0 on top.
-        segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 nothing.
-        height: Metres above the table, shape (H, W), float32; NaN where nothing is. None unless asked for.
+        segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 background.
+        height: Metres above the table, shape (H, W), float32; NaN for background. None unless requested.
     """
 
     rgb: np.ndarray
@@ -72,16 +72,16 @@ class Image:
 class Rasteriser:
     """Draws scenes and prompts with one asset pack.
 
-    Flat light, no shadows, no smoothing: the look of VIMA-Bench, pixel for pixel with its asset pack.
-    One instance must not be used by two threads at once.
+    Directional light, no shadows, no anti-aliasing: with the original asset pack, the pixels of VIMA-Bench.
+    Not thread-safe.
 
     Args:
-        assets: Where shapes and textures come from.
+        assets: Asset pack.
     """
 
     def __init__(self, assets: Assets) -> None:
         self.assets = assets
-        self._scratch = Scratch()
+        self._buffers = KernelBuffers()
         self._depth: dict[tuple[int, int], np.ndarray] = {}
 
     def scene(
@@ -93,28 +93,28 @@ class Rasteriser:
         extra: Sequence[Drawable] = (),
         enlarge: int = 1,
     ) -> dict[View, Image]:
-        """Draw a scene on its table.
+        """Render a scene on the table.
 
         Args:
-            scene: The objects; where surfaces coincide, the larger id shows.
-            views: Which cameras, in the order of the result.
+            scene: The scene; of coinciding surfaces, the larger id is visible.
+            views: Cameras, in the order of the result.
             height: Whether to return height maps too.
             extra: Further bodies, drawn before the objects.
-            enlarge: Factor on the resolution, for videos; 1 gives the benchmark's images of 128 × 256 pixels.
+            enlarge: Factor on the resolution of 128 × 256 pixels, for videos.
 
         Returns:
             View name to image.
 
         Raises:
             UnknownObjectError, UnknownTextureError, AssetError: An object has no shape or texture.
-            ShapeError: An id or texture that images cannot hold.
+            ShapeError: An id is out of range, or a texture malformed.
             ConfigError: `enlarge` is below 1.
         """
         bodies = [*extra, *(self._drawable(placement) for placement in scene.placements)]
         return self._draw(bodies, views, height=height, enlarge=enlarge, table=True)
 
     def prompt(self, prompt: Prompt) -> RenderedPrompt:
-        """Draw all images of a prompt, both views each.
+        """Render all images of a prompt in both views.
 
         Raises:
             UnknownObjectError, UnknownTextureError, AssetError: An object has no shape or texture.
@@ -129,16 +129,16 @@ class Rasteriser:
         return RenderedPrompt(prompt.text, images)
 
     def _object_image(self, name: str, fill: ObjectImage) -> PromptImage:
-        shown = fill.placement
-        body = self._drawable(shown, pose=PROMPT_POSE, object_id=0, magnification=fill.magnification)
+        placement = fill.placement
+        body = self._drawable(placement, pose=PROMPT_POSE, object_id=0, magnification=fill.magnification)
         drawn = self._draw([body], VIEWS, table=False)
-        records = (ObjectRecord(0, shown.object, shown.texture),)
+        records = (ObjectRecord(0, placement.object, placement.texture),)
         return PromptImage(name, "object", _rgb_of(drawn), _segm_of(drawn), records)
 
     def _scene_image(self, name: str, fill: SceneImage) -> PromptImage:
-        shown = fill.scene.placements
-        drawn = self._draw([self._drawable(placement) for placement in shown], VIEWS, table=True)
-        records = tuple(ObjectRecord(p.id, p.object, p.texture) for p in shown)
+        placements = fill.scene.placements
+        drawn = self._draw([self._drawable(placement) for placement in placements], VIEWS, table=True)
+        records = tuple(ObjectRecord(p.id, p.object, p.texture) for p in placements)
         return PromptImage(name, "scene", _rgb_of(drawn), _segm_of(drawn), records)
 
     def _drawable(
@@ -172,13 +172,13 @@ class Rasteriser:
         ]
         images: dict[View, Image] = {}
         for view in views:
-            ground = _ground(CAMERAS[view].enlarged(enlarge), table)
-            rgb, segm = ground.rgb.copy(), ground.segm.copy()
-            heights = ground.height.copy() if height else _NO_HEIGHTS
+            background = _background(CAMERAS[view].enlarged(enlarge), table)
+            rgb, segm = background.rgb.copy(), background.segm.copy()
+            heights = background.height.copy() if height else _NO_HEIGHTS
             depth = self._depth.setdefault(segm.shape, np.empty(segm.shape))
-            np.copyto(depth, ground.depth)
+            np.copyto(depth, background.depth)
             for mesh, pose, texture, object_id in prepared:
-                screen, selected = self._scratch.arrays(mesh)
+                screen, selected = self._buffers.arrays(mesh)
                 draw_triangles(
                     mesh.vertices,
                     mesh.corners,
@@ -186,7 +186,7 @@ class Rasteriser:
                     mesh.uvs,
                     mesh.is_flat,
                     pose,
-                    ground.camera,
+                    background.camera,
                     texture,
                     object_id,
                     screen,
@@ -204,8 +204,8 @@ _NO_HEIGHTS = np.empty((0, 0), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Ground:
-    """An image before any body is drawn into it, with its depths and the camera in the kernels' form."""
+class _Background:
+    """An image without bodies, its depths, and the camera matrix."""
 
     camera: np.ndarray
     rgb: np.ndarray
@@ -215,9 +215,9 @@ class _Ground:
 
 
 @lru_cache(maxsize=16)
-def _ground(camera: Camera, table: bool) -> _Ground:
+def _background(camera: Camera, table: bool) -> _Background:
     shape = (camera.height, camera.width)
-    ground = _Ground(
+    background = _Background(
         camera.matrix(),
         np.full((3, *shape), 255, dtype=np.uint8),
         np.full(shape, BACKGROUND_ID, dtype=np.uint8),
@@ -229,7 +229,7 @@ def _ground(camera: Camera, table: bool) -> _Ground:
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
             mesh = indexed(body.mesh)
-            screen, selected = Scratch().arrays(mesh)
+            screen, selected = KernelBuffers().arrays(mesh)
             draw_triangles(
                 mesh.vertices,
                 mesh.corners,
@@ -237,17 +237,17 @@ def _ground(camera: Camera, table: bool) -> _Ground:
                 mesh.uvs,
                 mesh.is_flat,
                 matrix_3x4(body.pose),
-                ground.camera,
+                background.camera,
                 _texture_array(body.texture),
                 body.id,
                 screen,
                 selected,
-                ground.depth,
-                ground.rgb,
-                ground.segm,
-                ground.height,
+                background.depth,
+                background.rgb,
+                background.segm,
+                background.height,
             )
-    return ground
+    return background
 
 
 def _rectangle(length_x: float, length_y: float) -> TriangleMesh:
@@ -258,7 +258,7 @@ def _rectangle(length_x: float, length_y: float) -> TriangleMesh:
 
 
 def _texture_array(texture: np.ndarray | Rgb) -> np.ndarray:
-    """The texture in the form that the kernels are compiled for: read-only, as packs deliver them."""
+    """The texture as a read-only array, for which the kernels are compiled."""
     if isinstance(texture, tuple):
         texture = np.array(texture, dtype=np.uint8).reshape(1, 1, 3)
     if texture.dtype != np.uint8 or texture.ndim != 3 or texture.shape[2] != 3 or texture.size == 0:

@@ -1,4 +1,4 @@
-"""Large pictures of single objects with a transparent background, for pages and documents."""
+"""Thumbnails of single objects with a transparent background."""
 
 from typing import Literal
 
@@ -14,22 +14,22 @@ from openvima.scene import Pose, Scene
 Detail = Literal[1, 2]
 
 _OBJECT_ID = 9
-_WIDTH_M, _HEIGHT_M = 0.64, 0.48  # of the part of the view that a portrait shows
-_PX_PER_M = 250  # of both views at the resolution of the benchmark, a little less than theirs
-_FILLED_SHARE = 0.94
-_SAMPLES = 2  # per pixel, across and down: smooths edges, which the benchmark's images do not
-_LONG = 2  # times as long as wide: such an object lies across the picture
+_WIDTH_M, _HEIGHT_M = 0.64, 0.48  # of the window of a thumbnail
+_PX_PER_M = 250  # of both views at benchmark resolution, slightly less than theirs
+_FILLED_FRACTION = 0.94
+_SAMPLES = 2  # per pixel and axis, for anti-aliasing
+_LONG = 2  # aspect ratio from which an object is drawn horizontally
 
 
 def draw_thumbnail(
     rasteriser: Rasteriser, object_name: str, texture_name: str, view: View, *, detail: Detail = 1
 ) -> np.ndarray:
-    """Draw an object of the catalogue so that it fills the picture, in the light of the benchmark.
+    """Draw an object of the catalogue so that it fills the image.
 
-    It stands as in prompt images, so that letters are upright; a long object lies across.
+    The pose is that of prompt images, so that letters are upright; long objects are horizontal.
 
     Args:
-        rasteriser: Draws; its pack gives shape and texture.
+        rasteriser: Rasteriser with the asset pack.
         object_name: Display name.
         texture_name: Display name.
         view: "front" looks down at 45 degrees, "top" from above.
@@ -48,32 +48,32 @@ def draw_thumbnail(
     is_across = length_y > _LONG * length_x
     across, along = (length_y, length_x) if is_across else (length_x, length_y)
     upwards = along if view == "top" else (along + length_z) / np.sqrt(2)
-    factor = _FILLED_SHARE * min(_WIDTH_M / across, _HEIGHT_M / upwards)
+    factor = _FILLED_FRACTION * min(_WIDTH_M / across, _HEIGHT_M / upwards)
     foot = np.array([*(low + high)[:2] / 2, low[2]])
     magnified = TriangleMesh((mesh.vertices - foot) * factor, mesh.normals, mesh.uvs)
     pose = Pose.planar(0.5, 0.0, 0.0 if is_across else np.pi / 2)
     body = Drawable(magnified, pose, _OBJECT_ID, texture)
     enlarge = 2 * detail * _SAMPLES
-    image = rasteriser.scene(Scene(()), views=(view,), extra=(body,), enlarge=enlarge)[view]
-    opaque = image.segm == _OBJECT_ID
-    return _smoothed(_framed(channels_last(image.rgb), opaque, enlarge), _SAMPLES)
+    rendered = rasteriser.scene(Scene(()), views=(view,), extra=(body,), enlarge=enlarge)[view]
+    opaque = rendered.segm == _OBJECT_ID
+    return _antialiased(_cropped(channels_last(rendered.rgb), opaque, enlarge), _SAMPLES)
 
 
-def _framed(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:
-    """Cut out the window about the object, shape (H, W, 4), uint8."""
+def _cropped(rgb: np.ndarray, opaque: np.ndarray, enlarge: int) -> np.ndarray:
+    """Crop the window around the object, shape (H, W, 4), uint8."""
     height, width = (round(length * _PX_PER_M * enlarge) for length in (_HEIGHT_M, _WIDTH_M))
     rows, columns = np.flatnonzero(opaque.any(axis=1)), np.flatnonzero(opaque.any(axis=0))
     top = (rows[0] + rows[-1] + 1 - height) // 2
     left = (columns[0] + columns[-1] + 1 - width) // 2
-    picture = np.concatenate([rgb, np.where(opaque, 255, 0)[..., None].astype(np.uint8)], axis=2)
-    picture = np.pad(picture, ((height, height), (width, width), (0, 0)))
-    return picture[top + height : top + 2 * height, left + width : left + 2 * width]
+    image = np.concatenate([rgb, np.where(opaque, 255, 0)[..., None].astype(np.uint8)], axis=2)
+    image = np.pad(image, ((height, height), (width, width), (0, 0)))
+    return image[top + height : top + 2 * height, left + width : left + 2 * width]
 
 
-def _smoothed(picture: np.ndarray, samples: int) -> np.ndarray:
+def _antialiased(image: np.ndarray, samples: int) -> np.ndarray:
     """Average squares of pixels; transparent ones give no colour."""
-    height, width = picture.shape[0] // samples, picture.shape[1] // samples
-    squares = picture.reshape(height, samples, width, samples, 4)
+    height, width = image.shape[0] // samples, image.shape[1] // samples
+    squares = image.reshape(height, samples, width, samples, 4)
     sums = np.zeros((height, width, 4))
     for row, column in np.ndindex(samples, samples):
         sample = squares[:, row, :, column].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Frozen records shared by all packages: poses, scenes, prompts, goals, episodes, actions."""
+"""Frozen dataclasses: poses, scenes, prompts, goals, episodes, actions."""
 
 from openvima.scene.action import ACTION_SHAPES, Action
 from openvima.scene.episode import Episode, Outcome, Problem

@@ -1,4 +1,4 @@
-"""Actions: the two poses of one primitive, checked at the border."""
+"""Actions: the two poses of one primitive."""
 
 import math
 from collections.abc import Mapping
@@ -36,9 +36,9 @@ class Action:
 
     @staticmethod
     def planar(pick: tuple[float, float], place: tuple[float, float], yaw_rad: float = 0.0) -> "Action":
-        """Build an action from two points, with the object turned by `yaw_rad` in between.
+        """Build an action from two points and the relative rotation of the object.
 
-        Positions are clipped to the workspace and rounded to float32, the precision in which actions travel.
+        Positions are clipped to the workspace and rounded to float32.
         """
         low, high = _workspace()
         pose0 = np.clip(np.array(pick, dtype=np.float32), low, high)
@@ -53,7 +53,7 @@ class Action:
 
     @staticmethod
     def from_arrays(action: Mapping[str, object]) -> "Action":
-        """Check an action as a policy sends it and convert it.
+        """Validate and convert an action of a policy.
 
         Args:
             action: `pose0_position` and `pose1_position`, shape (2,), metres; `pose0_rotation` and
@@ -64,7 +64,7 @@ class Action:
 
         Raises:
             ActionError: A key is missing or unknown, or an array has a wrong shape or dtype, a value that is
-                not finite, or one out of bounds. All problems are in one message.
+                not finite or out of bounds. All problems are in one message.
         """
         if not isinstance(action, Mapping):
             keys, given = ", ".join(ACTION_SHAPES), type(action).__name__
@@ -84,22 +84,22 @@ class Action:
         return Action((x0, y0), (x1, y1), (ax, ay, az, aw), (bx, by, bz, bw))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the action as a policy would send it: float32 arrays under the four keys."""
+        """Return the action as float32 arrays under the four keys."""
         return {key: np.array(getattr(self, key), dtype=np.float32) for key in ACTION_SHAPES}
 
     @property
     def yaw0_rad(self) -> float:
-        """Tool heading at pose0, in radians; a zero quaternion counts as no turn."""
+        """Tool heading at pose0, in radians; a zero quaternion counts as no rotation."""
         return _tool_yaw(self.pose0_rotation)
 
     @property
     def yaw1_rad(self) -> float:
-        """Tool heading at pose1, in radians; a zero quaternion counts as no turn."""
+        """Tool heading at pose1, in radians; a zero quaternion counts as no rotation."""
         return _tool_yaw(self.pose1_rotation)
 
 
 def _tool_yaw(quaternion: Quaternion) -> float:
-    """Heading of the tool's x axis; the tool stays vertical whatever tilt a policy asks for."""
+    """Heading of the tool's x axis; tilt is ignored."""
     if not any(quaternion):
         return 0.0
     x, y, z, w = normalised(quaternion)
@@ -135,11 +135,11 @@ def _checked(key: str, value: object, length: int) -> tuple[tuple[float, ...], l
         return (), [f"{key} is {given}; all values must be finite."]
     low, high = _workspace() if length == 2 else (np.full(4, -1.0), np.full(4, 1.0))
     if (array < low).any() or (array > high).any():
-        shown = ", ".join(f"{v:.4g}" for v in given)
+        text = ", ".join(f"{v:.4g}" for v in given)
         allowed = (
             f"x must lie in {low[0]:g} … {high[0]:g} m and y in {low[1]:g} … {high[1]:g} m"
             if length == 2
             else "each component must lie in -1 … 1"
         )
-        return (), [f"{key} is ({shown}); {allowed}."]
+        return (), [f"{key} is ({text}); {allowed}."]
     return given, []

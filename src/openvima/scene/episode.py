@@ -1,4 +1,4 @@
-"""One sampled problem, and how it stands."""
+"""Sampled problems, episodes and outcomes."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,19 @@ from openvima.scene.scene import Scene
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What a task samples: pure data, no physics and no images.
+    """A sampled problem: pure data, without physics or images.
 
     Args:
         scene: All objects at their start, at rest.
-        prompt: What the robot is told.
-        goals: The conditions to fulfil, in the order in which the oracle works on them unless it may choose.
-        constraints: What must not happen, in the order in which they are tested.
+        prompt: The prompt.
+        goals: The goals, in the order of the oracle unless it may choose.
+        constraints: The constraints, in the order of their tests.
         stages: Sizes of groups of consecutive goals. After a step only goals of the first group with an open
             one are tested, so a step never completes goals of two groups. Empty: all goals are one group.
         num_required: Exact number of goals to fulfil (more at once is a failure); None means all.
-        prerequisites: Moves that the oracle makes before it works on the goals, such as clearing a target. A
-            policy need not make them.
-        oracle_max_steps: Steps within which the oracle must be done; None: as registered for the task.
+        prerequisites: Moves that the oracle makes before it works on the goals, such as clearing a target;
+            optional for a policy.
+        oracle_max_steps: Step limit of the oracle; None: that of the task.
 
     Raises:
         SceneError: The stages do not add up to the number of goals.
@@ -53,7 +53,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """A problem together with where it came from.
+    """A problem with its task, level and seed.
 
     Args:
         task: Name of the task, such as "rotate".
@@ -61,9 +61,9 @@ class Episode:
         domain: Domain of the seed: "train", "eval" or "user"; equal seeds of two domains are unrelated.
         seed: The episode's number.
         problem: The sampled problem.
-        oracle_max_steps: Steps within which the oracle must be done.
-        max_steps: Steps that a policy is given (`oracle_max_steps` + 2).
-        num_redraws: Unlucky draws that were thrown away before this one.
+        oracle_max_steps: Step limit of the oracle.
+        max_steps: Step limit of a policy (`oracle_max_steps` + 2).
+        num_redraws: Failed draws before this one.
     """
 
     task: str
@@ -78,12 +78,12 @@ class Episode:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How an episode stands after a step: success, failure, or neither yet.
+    """Outcome of an episode after a step: success, failure, or neither yet.
 
     Args:
-        success: The task is done.
-        failure: It can no longer be done.
-        reason: Empty while open; else one sentence, such as "object 6 (letter A) left the workspace".
+        success: The task is solved.
+        failure: The task can no longer be solved.
+        reason: Empty while neither; else one sentence, such as "object 6 (letter A) left the workspace".
     """
 
     success: bool = False

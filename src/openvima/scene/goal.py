@@ -1,4 +1,4 @@
-"""Goals and constraints: named conditions on the poses of a scene, as data with a pure test."""
+"""Goals and constraints: conditions on the poses of a scene."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from openvima.scene.scene import Scene
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """How far from a target still counts; both comparisons are strict.
+    """Distance from a target that counts as reached; both comparisons are strict.
 
     Args:
         position_m: Planar distance in metres.
@@ -20,7 +20,7 @@ class Tolerance:
     yaw_rad: float | None = None
 
     def accepts(self, pose: Pose, target: Pose, symmetry_rad: float = 2 * math.pi) -> bool:
-        """Whether `pose` matches `target`; headings `symmetry_rad` apart look the same."""
+        """Whether `pose` matches `target`; headings `symmetry_rad` apart are equivalent."""
         if not pose.planar_distance(target) < self.position_m:
             return False
         if self.yaw_rad is None:
@@ -43,7 +43,7 @@ class Zone:
     size_y: float
 
     def contains(self, point: tuple[float, float, float]) -> bool:
-        """Whether a point lies strictly inside the rectangle and less than 0.3 m above the table."""
+        """Whether a point is strictly inside the rectangle and less than 0.3 m above the table."""
         px, py, pz = point
         return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
 
@@ -69,11 +69,11 @@ class AtPose:
 
     Args:
         object_id: The object to move.
-        target: Where it has to be.
-        tolerance: How near is near enough.
+        target: Its target pose.
+        tolerance: Tolerance of the pose.
         symmetry_rad: Angle of rotational symmetry of the object's shape.
-        relative_to: Id of the object that the target is tied to (the base it lies in, or the object itself
-            when it only turns); demonstrations record the place relative to it. None: tied to the table.
+        relative_to: Id of the object that the target is relative to (its base, or the object itself for a
+            rotation in place); demonstrations record it. None: relative to the table.
     """
 
     object_id: int
@@ -83,17 +83,17 @@ class AtPose:
     relative_to: int | None = None
 
     def is_met(self, scene: Scene) -> bool:
-        """Whether the object is there now."""
+        """Whether the object is at the target."""
         return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class InZone:
-    """All eight points of a small block lie in a zone.
+    """All eight points of a small block are in a zone.
 
     Args:
         object_id: The block.
-        zone: Where it has to be.
+        zone: The target zone.
         relative_to: Id of the object that marks the zone, as for `AtPose`.
     """
 
@@ -102,7 +102,7 @@ class InZone:
     relative_to: int | None = None
 
     def is_met(self, scene: Scene) -> bool:
-        """Whether the block is in the zone now."""
+        """Whether the block is in the zone."""
         return all(self.zone.contains(point) for point in block_points(scene[self.object_id].pose))
 
 
@@ -111,7 +111,7 @@ Goal = AtPose | InZone
 
 @dataclass(frozen=True, slots=True)
 class DistractorsApart:
-    """No distractor comes near a goal's target, and no goal's object near a distractor.
+    """No distractor is near a goal's target, and no goal's object near a distractor.
 
     Tested after every step, whether the goals are met or not: a distractor within a goal's
     `tolerance.position_m` of its target, or the goal's object matching the distractor's pose within the
@@ -130,7 +130,7 @@ class DistractorsApart:
 
 @dataclass(frozen=True, slots=True)
 class ZoneKeptClear:
-    """No point of these blocks lies in the zone; tested after every step."""
+    """No point of these blocks is in the zone; tested after every step."""
 
     object_ids: tuple[int, ...]
     zone: Zone
@@ -138,12 +138,12 @@ class ZoneKeptClear:
 
 @dataclass(frozen=True, slots=True)
 class NeverTouches:
-    """No point of these blocks ever lies in the zone; watched while things move, broken for good at once.
+    """No point of these blocks ever enters the zone; tested during motion, and permanent.
 
     Args:
-        object_ids: The blocks that must keep off.
+        object_ids: The blocks.
         zone: The forbidden rectangle.
-        name: What the zone is called in the reason of a failure, such as "line".
+        name: Name of the zone in the reason of a failure, such as "line".
     """
 
     object_ids: tuple[int, ...]
@@ -163,7 +163,7 @@ class InOrder:
     """None of these goals is fulfilled while an earlier goal of the episode is open; tested after every step.
 
     Args:
-        goals: Indices of the goals that have to wait.
+        goals: Indices of the later goals.
     """
 
     goals: tuple[int, ...]

@@ -17,7 +17,7 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 class Pose:
     """A rigid transform, world frame unless the name says otherwise.
 
-    `a @ b` chains transforms as matrices do: `world_from_tool = world_from_base @ base_from_tool`.
+    `a @ b` composes transforms like matrices: `world_from_tool = world_from_base @ base_from_tool`.
 
     Args:
         position: x (away from the robot), y (to its left), z (up), in metres.
@@ -29,7 +29,7 @@ class Pose:
 
     @staticmethod
     def planar(x: float, y: float, yaw_rad: float = 0.0, *, z: float = 0.0) -> "Pose":
-        """Build the pose of an object that lies flat: turned by `yaw_rad` about the world's z axis."""
+        """Build the pose of a flat object, rotated by `yaw_rad` about the world's z axis."""
         return Pose((float(x), float(y), float(z)), yaw_quaternion(yaw_rad))
 
     @property
@@ -53,11 +53,11 @@ class Pose:
         return quaternion_yaw(self.quaternion)
 
     def rotated(self, yaw_rad: float) -> "Pose":
-        """Return this pose turned on the spot by `yaw_rad` about the world's z axis."""
+        """Return this pose rotated in place by `yaw_rad` about the world's z axis."""
         return Pose(self.position, multiply(yaw_quaternion(yaw_rad), self.quaternion))
 
     def moved(self, dx: float = 0.0, dy: float = 0.0, dz: float = 0.0) -> "Pose":
-        """Return this pose shifted by metres along the world's axes."""
+        """Return this pose translated by metres in the world frame."""
         return Pose((self.x + dx, self.y + dy, self.z + dz), self.quaternion)
 
     def planar_distance(self, other: "Pose") -> float:
@@ -70,7 +70,7 @@ class Pose:
         return Pose(position, multiply(self.quaternion, other.quaternion))
 
     def inverse(self) -> "Pose":
-        """Return the pose that undoes this one: `pose @ pose.inverse()` is the identity."""
+        """Return the inverse: `pose @ pose.inverse()` is the identity."""
         x, y, z, w = self.quaternion
         conjugate = (-x, -y, -z, w)
         px, py, pz = rotate(conjugate, self.position)
@@ -88,16 +88,16 @@ class Pose:
         )
 
     def transform(self, points: np.ndarray) -> np.ndarray:
-        """Map points from this frame to the frame that it is given in; shape (..., 3) to (..., 3), metres."""
+        """Transform points from this frame to the parent frame; shape (..., 3) to (..., 3), metres."""
         points = np.asarray(points, dtype=np.float64)
         along_x, along_y, along_z = self.matrix().T
-        # Written out: the last bits of a matrix product depend on the processor.
-        turned = points[..., :1] * along_x + points[..., 1:2] * along_y + points[..., 2:] * along_z
-        return turned + np.asarray(self.position)
+        # Written out: the last bits of a matrix product depend on the CPU.
+        rotated = points[..., :1] * along_x + points[..., 1:2] * along_y + points[..., 2:] * along_z
+        return rotated + np.asarray(self.position)
 
 
 def yaw_quaternion(yaw_rad: float) -> Quaternion:
-    """Quaternion xyzw of a turn by `yaw_rad` about z."""
+    """Quaternion xyzw of a rotation by `yaw_rad` about z."""
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
@@ -124,7 +124,7 @@ def normalised(quaternion: Quaternion) -> Quaternion:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product of two quaternions xyzw: first turn by `b`, then by `a`."""
+    """Hamilton product of two quaternions xyzw: first rotate by `b`, then by `a`."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -136,7 +136,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate(quaternion: Quaternion, vector: Vector3) -> Vector3:
-    """Turn a vector by a unit quaternion xyzw."""
+    """Rotate a vector by a unit quaternion xyzw."""
     qx, qy, qz, qw = quaternion
     vx, vy, vz = vector
     tx, ty, tz = 2 * (qy * vz - qz * vy), 2 * (qz * vx - qx * vz), 2 * (qx * vy - qy * vx)
@@ -148,12 +148,12 @@ def rotate(quaternion: Quaternion, vector: Vector3) -> Vector3:
 
 
 def angle_difference(a_rad: float, b_rad: float, period_rad: float = 2 * math.pi) -> float:
-    """Smallest absolute difference of two angles that count as equal when `period_rad` apart, in radians.
+    """Smallest absolute difference of two angles modulo `period_rad`, in radians.
 
     Args:
         a_rad: One angle.
         b_rad: The other angle.
-        period_rad: Angle of rotational symmetry; 0 means every angle looks the same, so the difference is 0.
+        period_rad: Angle of rotational symmetry; 0: full symmetry, so the difference is 0.
     """
     if period_rad == 0:
         return 0.0

@@ -10,16 +10,16 @@ import numpy as np
 from openvima.errors import PromptError
 from openvima.scene.scene import Placement, Scene
 
-FIRST_IMAGE_ID = 2  # after floor and sheet; the pictures of prompts show no arm
+FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectImage:
-    """An image of one object alone on a white ground, in the pose in which prompts show objects.
+    """An image of a single object on white, in the fixed pose of prompt objects.
 
     Args:
-        placement: The object; its own pose and id are not used for the picture.
+        placement: The object; its pose and id are ignored.
         magnification: Factor on the whole geometry (7 for the small swept block).
     """
 
@@ -38,10 +38,7 @@ class SceneImage:
 
     @staticmethod
     def of(placements: Sequence[Placement]) -> "SceneImage":
-        """Show these objects where they are, under the ids 2, 3, … in the order given.
-
-        An object keeps its id over several images if it has the same place in each list.
-        """
+        """Return an image of these objects at their poses, with ids 2, 3, … in the given order."""
         return SceneImage(Scene(tuple(replace(p, id=n) for n, p in enumerate(placements, FIRST_IMAGE_ID))))
 
 
@@ -50,11 +47,11 @@ PromptFill = ObjectImage | SceneImage
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """What the robot is told, before anything is rendered.
+    """A prompt that is not rendered yet.
 
     Args:
-        text: The sentence; each image stands in it as its placeholder, such as "Put the {a} into the {b}.".
-        images: Placeholder names and what their images show, in the order of first appearance in the text.
+        text: The text with a placeholder for each image, such as "Put the {a} into the {b}.".
+        images: Placeholder names and image contents, in the order of first appearance in the text.
     """
 
     text: str
@@ -62,7 +59,7 @@ class Prompt:
 
     @staticmethod
     def parse(template: str, **fills: PromptFill | str | int) -> "Prompt":
-        """Fill a template: words and numbers are written into the text, images keep their placeholder.
+        """Fill the words and numbers of a template; images keep their placeholder.
 
         Args:
             template: Text with `{name}` for each slot.
@@ -82,20 +79,20 @@ class Prompt:
         if slots != set(fills):
             raise PromptError(f"template {template!r} has slots {sorted(slots)}, but got {sorted(fills)}.")
         text = template
-        shown: dict[str, PromptFill] = {}
+        fills_by_name: dict[str, PromptFill] = {}
         for name, fill in fills.items():
             if isinstance(fill, str | int):
                 text = text.replace("{" + name + "}", str(fill))
             else:
-                shown[name] = fill
+                fills_by_name[name] = fill
         order = dict.fromkeys(_PLACEHOLDER.findall(text))
-        images = tuple((name, shown[name]) for name in order)
+        images = tuple((name, fills_by_name[name]) for name in order)
         return Prompt(text, images)
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectRecord:
-    """Which object the pixels of one segmentation value show."""
+    """The object of one segmentation value."""
 
     object_id: int
     object: str
@@ -110,8 +107,8 @@ class PromptImage:
         name: The placeholder's name.
         kind: "object" (one object on white) or "scene" (objects on the table).
         rgb: View name to image, shape (3, 128, 256), uint8.
-        segm: View name to object ids, shape (128, 256), uint8; 255 where nothing is.
-        objects: The objects shown; floor and table are not listed.
+        segm: View name to object ids, shape (128, 256), uint8; 255 for background.
+        objects: The objects in the image; floor and table are not listed.
     """
 
     name: str
@@ -123,10 +120,10 @@ class PromptImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedPrompt:
-    """A prompt as a policy receives it.
+    """A rendered prompt, the input of a policy.
 
     Args:
-        text: The sentence with `{name}` placeholders.
+        text: The text with `{name}` placeholders.
         images: Placeholder name to image, in the order of first appearance in the text.
     """
 

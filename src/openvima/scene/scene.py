@@ -1,4 +1,4 @@
-"""What stands on the table: catalogue objects with texture, size and pose."""
+"""Scenes: catalogue objects with texture, size and pose."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ EndEffector = Literal["suction", "spatula"]
 
 WORKSPACE_LOW = (0.25, -0.5)  # m, x and y, inclusive
 WORKSPACE_HIGH = (0.75, 0.5)
-BACKGROUND_ID = 255  # segmentation value of pixels that show nothing at all
+BACKGROUND_ID = 255  # segmentation value of empty pixels
 FLOOR_ID = 0
 SHEET_ID = 1
 FIRST_OBJECT_ID: dict[EndEffector, int] = {"suction": 5, "spatula": 4}  # below: floor, sheet, arm, tool
@@ -29,7 +29,7 @@ class Placement:
         texture: Display name in the catalogue, such as "red swirl", or "gray" in neutral prompt images.
         size: Sampled nominal size (x, y, z) in metres, task scale not included.
         pose: Pose of the object's link frame (mesh origin) in the world.
-        fixed: Welded to the table: it collides but cannot be lifted or pushed.
+        fixed: Fixed to the table: it collides but cannot be lifted or pushed.
         scale: Factor per axis that a task applies on top of the size.
     """
 
@@ -48,7 +48,7 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """All objects on the table, in the order of their ids, and the tool that the arm holds.
+    """All objects on the table, in the order of their ids, and the end effector.
 
     Args:
         placements: The objects; ids ascend.
@@ -76,5 +76,5 @@ class Scene:
 
 
 def in_workspace(pose: Pose) -> bool:
-    """Whether the pose's planar position lies in the closed workspace rectangle."""
+    """Whether the pose's planar position is in the closed workspace rectangle."""
     return WORKSPACE_LOW[0] <= pose.x <= WORKSPACE_HIGH[0] and WORKSPACE_LOW[1] <= pose.y <= WORKSPACE_HIGH[1]

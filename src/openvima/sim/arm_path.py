@@ -1,4 +1,4 @@
-"""The way of the arm through one primitive: its key positions, and the frames of a film of it."""
+"""Path of the arm during one primitive: waypoints, and frames for a video."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ RecordFrame = Callable[[Scene, np.ndarray], None]
 
 
 def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
-    """Joint angles, shape (6,), for a tip above (x, y), as high as asked or as the arm reaches.
+    """Joint angles, shape (6,), for a tip above (x, y), at height `z` or as high as the arm reaches.
 
     Far from the base the arm does not reach its hover height with the tool vertical.
 
@@ -28,14 +28,14 @@ def reachable_joints(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray
 
 
 class ArmPath:
-    """Where the arm goes during one primitive.
+    """The path of the arm during one primitive.
 
-    Without a recorder only the key positions are kept; nothing is computed for frames.
+    Frames are computed only with a recorder.
 
     Args:
-        joints: Where it starts, shape (6,), radians.
-        record: Called with scene and joints for every frame of a film, or None.
-        frames_per_second: Of that film.
+        joints: Joint angles at the start, shape (6,), radians.
+        record: Called with scene and joints for every video frame, or None.
+        frames_per_second: Frame rate of the video.
     """
 
     def __init__(self, joints: np.ndarray, record: RecordFrame | None, frames_per_second: float) -> None:
@@ -47,12 +47,12 @@ class ArmPath:
 
     @property
     def joints(self) -> np.ndarray:
-        """Where the arm is now, shape (6,), radians."""
+        """Current joint angles, shape (6,), radians."""
         return self.waypoints[-1]
 
     @property
-    def is_filmed(self) -> bool:
-        """Whether frames are asked for."""
+    def is_recording(self) -> bool:
+        """Whether frames are recorded."""
         return self._record is not None
 
     def move(
@@ -61,8 +61,8 @@ class ArmPath:
         """Move in a straight line in joint space.
 
         Args:
-            joints: Where to, shape (6,), radians.
-            scene: Gives the scene for the joints of a frame; scenes stored before come first.
+            joints: Target joint angles, shape (6,), radians.
+            scene: Returns the scene for the joints of a frame; stored scenes come first.
             speed: In rad/s, Euclidean norm over the joints.
         """
         start = self.joints
@@ -79,18 +79,18 @@ class ArmPath:
             self._record(late, joints)
 
     def stay(self, num_ticks: int, *, scene: Callable[[], Scene], joints: Callable[[], np.ndarray]) -> None:
-        """Record the frames that fall into some ticks of physics, with the arm where `joints` says."""
+        """Record the frames of some physics ticks, with the arm at `joints()`."""
         for _ in self._frame_times(num_ticks * TICK_S):
             if self._record is not None:
                 self._record(scene(), joints())
 
     def store(self, num_ticks: int, *, scene: Callable[[], Scene]) -> None:
-        """Keep the frames that fall into some ticks for the arm's next move, which goes on meanwhile."""
+        """Store the frames of some physics ticks for the arm's next move, which happens meanwhile."""
         for _ in self._frame_times(num_ticks * TICK_S):
             self._stored.append(scene())
 
     def array(self) -> np.ndarray:
-        """Key positions, shape (W, 6), float32, radians."""
+        """Waypoints, shape (W, 6), float32, radians."""
         return np.array(self.waypoints, dtype=np.float32)
 
     def _frame_times(self, duration_s: float) -> Iterator[float]:

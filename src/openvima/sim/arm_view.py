@@ -1,6 +1,6 @@
-"""What the arm and its tools look like in films: tapered tubes for links, joints and tools, made by code.
+"""Meshes of the arm and its tools for videos: tapered tubes for links, joints and tools.
 
-Agents never see the arm; it is drawn for people, in the colours of the benchmark's robot.
+Observations do not show the arm by default; the colours are those of VIMA-Bench's robot.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from openvima.catalog.geometry import TriangleMesh, Vector3
 from openvima.render.rasteriser import Drawable
 from openvima.scene import EndEffector, Pose
-from openvima.sim.end_effectors import BLADE_BELOW_TIP_M, BLADE_HALF_SIZE_M, NEEDLE_BELOW_TIP_M
+from openvima.sim.end_effectors import PROBE_BELOW_TIP_M, SPATULA_BELOW_TIP_M, SPATULA_HALF_SIZE_M
 from openvima.sim.ur5 import FLANGE_M, FOREARM_M, TOOL_M, UPPER_ARM_M, link_frames
 
 _LIGHT = (204, 204, 204)
@@ -34,8 +34,8 @@ class _Tube:
     Args:
         link: Index in `link_frames`.
         axis: Unit vector along the tube.
-        span: Where it begins and ends along the axis, metres.
-        radii: At the beginning and at the end, metres.
+        span: Its ends along the axis, metres.
+        radii: Radii at the two ends, metres.
         rgb: Colour.
         id: Segmentation value.
         at: A point of its axis line, metres.
@@ -75,7 +75,7 @@ _ARM_TUBES = (
     _Tube(_WRIST_3, _Y, (0.0, FLANGE_M - 0.012), (0.034, 0.034)),
     _Tube(_WRIST_3, _Y, (FLANGE_M - 0.012, FLANGE_M), (0.032, 0.032), _DARK),
 )
-_CUP_END_M = TOOL_M + NEEDLE_BELOW_TIP_M
+_CUP_END_M = TOOL_M + PROBE_BELOW_TIP_M
 _SUCTION_TUBES = (
     _Tube(_FLANGE, _Z, (0.0, 0.014), (0.034, 0.034), _DARK, _TOOL_ID),
     _Tube(_FLANGE, _Z, (0.014, 0.070), (0.024, 0.020), _LIGHT, _TOOL_ID),
@@ -89,7 +89,7 @@ _SPATULA_TUBES = (
 
 
 def arm_drawables(joints: np.ndarray, end_effector: EndEffector) -> tuple[Drawable, ...]:
-    """Build the arm with its tool, for drawing beside a scene.
+    """Build the arm with its tool, to be drawn with a scene.
 
     An object that the arm holds is a part of the scene (`World.execute` records it at the tip).
 
@@ -120,15 +120,15 @@ def _parts(end_effector: EndEffector) -> tuple[tuple[tuple[int, tuple[int, int, 
     for tube in _ARM_TUBES + (_SUCTION_TUBES if end_effector == "suction" else _SPATULA_TUBES):
         groups.setdefault((tube.id, tube.rgb), []).append((tube.link, _tube_mesh(tube)))
     if end_effector == "spatula":
-        groups.setdefault((_TOOL_ID, _TIP), []).append((_FLANGE, _blade_mesh()))
+        groups.setdefault((_TOOL_ID, _TIP), []).append((_FLANGE, _spatula_mesh()))
     return tuple((key, tuple(parts)) for key, parts in groups.items())
 
 
 def _assembled(parts: _Parts, frames: Sequence[Pose]) -> TriangleMesh:
-    """Bring meshes from link frames to the world and join them."""
+    """Transform meshes from link frames to the world and join them."""
     vertices = [frames[link].transform(mesh.vertices) for link, mesh in parts]
-    turns = [Pose((0.0, 0.0, 0.0), frame.quaternion) for frame in frames]
-    normals = [turns[link].transform(mesh.normals) for link, mesh in parts]
+    rotations = [Pose((0.0, 0.0, 0.0), frame.quaternion) for frame in frames]
+    normals = [rotations[link].transform(mesh.normals) for link, mesh in parts]
     return TriangleMesh(
         np.concatenate(vertices), np.concatenate(normals), np.concatenate([mesh.uvs for _, mesh in parts])
     )
@@ -156,10 +156,10 @@ def _tube_mesh(tube: _Tube) -> TriangleMesh:
     return TriangleMesh(vertices, normals, np.zeros((len(vertices), 3, 2)))
 
 
-def _blade_mesh() -> TriangleMesh:
-    """The spatula's blade below the flange; it sweeps along the flange's y axis, across its thin side."""
-    thickness, width, height = BLADE_HALF_SIZE_M
-    centre = np.array([0.0, 0.0, TOOL_M + BLADE_BELOW_TIP_M - height])
+def _spatula_mesh() -> TriangleMesh:
+    """The spatula below the flange; it sweeps along the flange's y axis."""
+    thickness, width, height = SPATULA_HALF_SIZE_M
+    centre = np.array([0.0, 0.0, TOOL_M + SPATULA_BELOW_TIP_M - height])
     vertices, normals = [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):

@@ -1,4 +1,4 @@
-"""Bodies in MuJoCo: where they are, how they move, and the tool's needle and blade among them."""
+"""Poses and velocities of bodies in MuJoCo, suction probe and spatula included."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's names come from a compiled module without type stubs.)
@@ -11,20 +11,20 @@ import numpy as np
 from openvima.catalog.geometry import Assets, Vector3
 from openvima.scene import Pose, Scene
 from openvima.scene.pose import Quaternion, normalised
-from openvima.sim.model import NEEDLE_HALF_LENGTH_M, PARKED_M, TICK_S, body_shape, build_model
+from openvima.sim.model import PARKED_M, PROBE_HALF_LENGTH_M, TICK_S, body_shape, build_model
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
 _SLOWEST = -_FASTEST - np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0])  # falling is free
 
 
 class Bodies:
-    """The bodies of one scene with their present poses and velocities, in MuJoCo.
+    """The bodies of one scene in MuJoCo.
 
-    Bodies are numbered as the scene's placements. Poses are those of link frames.
+    Bodies are indexed as the scene's placements. Poses are those of link frames.
 
     Args:
         scene: The scene to load; all bodies start at rest.
-        assets: Gives the shapes.
+        assets: Asset pack.
     """
 
     def __init__(self, scene: Scene, assets: Assets) -> None:
@@ -32,8 +32,8 @@ class Bodies:
             body_shape(p.object, assets.geometry(p.object, p.size, p.scale), p.fixed)
             for p in scene.placements
         )
-        with_blade = scene.end_effector == "spatula"
-        self.model = build_model(self.shapes, with_blade=with_blade)
+        with_spatula = scene.end_effector == "spatula"
+        self.model = build_model(self.shapes, with_spatula=with_spatula)
         self.data = mujoco.MjData(self.model)
         rigid = [index for index, shape in enumerate(self.shapes) if not shape.fixed]
         fixed = [index for index, shape in enumerate(self.shapes) if shape.fixed]
@@ -44,14 +44,14 @@ class Bodies:
         self._geoms = tuple(
             range(int(first[i + 1]), int(first[i + 1] + count[i + 1])) for i in range(len(self.shapes))
         )
-        self._needle_mocap = len(fixed)
-        self.needle_geom = int(first[len(self.shapes) + 1])
-        self.blade_geom = int(first[len(self.shapes) + 2]) if with_blade else -1
+        self._probe_mocap = len(fixed)
+        self.probe_geom = int(first[len(self.shapes) + 1])
+        self.spatula_geom = int(first[len(self.shapes) + 2]) if with_spatula else -1
         self._positions = self.data.qpos.reshape(-1, 7)  # views: writing to them moves the bodies
         self._velocities = self.data.qvel.reshape(-1, 6)
         for index, placement in enumerate(scene.placements):
             self.place(index, placement.pose)
-        self.park_blade()
+        self.park_spatula()
         self.refresh()
 
     def geoms(self, index: int) -> range:
@@ -59,7 +59,7 @@ class Bodies:
         return self._geoms[index]
 
     def pose(self, index: int) -> Pose:
-        """Present pose of a body's link frame."""
+        """Current pose of a body's link frame."""
         if index in self._mocap:
             row = self._mocap[index]
             numbers = [*self.data.mocap_pos[row].tolist(), *self.data.mocap_quat[row].tolist()]
@@ -69,7 +69,7 @@ class Bodies:
         return Pose((x, y, z), (qx, qy, qz, qw))
 
     def place(self, index: int, pose: Pose) -> None:
-        """Put a body somewhere, at rest. Call `refresh` before asking for distances."""
+        """Set the pose of a body, at rest. Call `refresh` before computing distances."""
         numbers = _numbers(pose)
         if index in self._mocap:
             row = self._mocap[index]
@@ -80,104 +80,104 @@ class Bodies:
         self._velocities[self._joint[index]] = 0.0
 
     def park(self, index: int) -> None:
-        """Put a free body where it touches nothing; it falls there until it is placed again."""
+        """Move a free body out of contact; it falls there until it is placed again."""
         self.place(index, Pose((0.0, 0.0, PARKED_M)))
 
-    def place_needle(self, x: float, y: float, z: float) -> None:
-        """Put the lower end of the needle somewhere, metres."""
-        self.data.mocap_pos[self._needle_mocap] = (x, y, z + NEEDLE_HALF_LENGTH_M)
+    def place_probe(self, x: float, y: float, z: float) -> None:
+        """Set the position of the lower end of the probe, metres."""
+        self.data.mocap_pos[self._probe_mocap] = (x, y, z + PROBE_HALF_LENGTH_M)
 
-    def place_blade(self, pose: Pose) -> None:
-        """Put the blade's centre somewhere, at rest."""
+    def place_spatula(self, pose: Pose) -> None:
+        """Set the pose of the spatula's centre, at rest."""
         self._positions[-1] = _numbers(pose)
         self._velocities[-1] = 0.0
 
-    def park_blade(self) -> None:
-        """Put the blade where it touches nothing."""
-        if self.blade_geom >= 0:
-            self.place_blade(Pose((0.0, 0.0, 2 * PARKED_M)))
+    def park_spatula(self) -> None:
+        """Move the spatula out of contact."""
+        if self.spatula_geom >= 0:
+            self.place_spatula(Pose((0.0, 0.0, 2 * PARKED_M)))
 
     def refresh(self) -> None:
-        """Bring the shapes to the poses that were set."""
+        """Update the geometry to the poses that were set."""
         mujoco.mj_kinematics(self.model, self.data)
 
     def tick(self, num_ticks: int = 1) -> None:
         """Advance the physics."""
         mujoco.mj_step(self.model, self.data, num_ticks)
 
-    def tick_with_blade(self, pose: Pose, velocity: Vector3, *, num_ticks: int, top_speed: float) -> None:
-        """Advance the physics while the blade moves evenly, whatever stands in its way.
+    def tick_with_spatula(self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float) -> None:
+        """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
 
         Args:
-            pose: The blade's centre at the start.
-            velocity: Of the blade, m/s.
-            num_ticks: For how long.
-            top_speed: See `limit_speed`; kept after every tick, for a body that is squeezed between the blade
-                and a fixed one gains speed at a rate that no later limit could undo.
+            pose: The spatula's centre at the start.
+            velocity: Velocity of the spatula, m/s.
+            num_ticks: Number of ticks.
+            max_speed: See `limit_speed`; applied after every tick: a body squeezed between spatula and fixed
+                body accelerates too fast for a later limit.
         """
         place = np.array(_numbers(pose))
         speed = np.array((*velocity, 0.0, 0.0, 0.0))
         for _ in range(num_ticks):
             self._positions[-1], self._velocities[-1] = place, speed
             mujoco.mj_step(self.model, self.data)
-            self.limit_speed(top_speed)
+            self.limit_speed(max_speed)
             place[:3] += speed[:3] * TICK_S
 
     def stop(self) -> None:
-        """Bring all bodies to rest where they are."""
+        """Set all velocities to zero."""
         self.data.qvel[:] = 0.0
         self.data.qacc_warmstart[:] = 0.0
 
-    def limit_speed(self, top_speed: float) -> None:
-        """Slow down free bodies so that none flies off; falling stays free.
+    def limit_speed(self, max_speed: float) -> None:
+        """Clip the velocities of free bodies, except downwards.
 
         Args:
-            top_speed: Bound of every component of the velocity, downwards apart, in m/s; turning is bound to
-                what gives the smallest block's sides that speed.
+            max_speed: Bound of every velocity component except downwards, in m/s; angular velocity is bounded
+                so that the faces of the smallest block keep that speed.
         """
         velocities = self._velocities[: len(self.rigid)]
-        np.minimum(velocities, top_speed * _FASTEST, out=velocities)
-        np.maximum(velocities, top_speed * _SLOWEST, out=velocities)
+        np.minimum(velocities, max_speed * _FASTEST, out=velocities)
+        np.maximum(velocities, max_speed * _SLOWEST, out=velocities)
 
     def speeds(self) -> tuple[float, float]:
-        """Greatest component of the velocity (m/s) and of the turning rate (rad/s) of the free bodies."""
+        """Largest component of linear (m/s) and angular (rad/s) velocity of the free bodies."""
         velocities = np.abs(self._velocities[: len(self.rigid)])
         return float(velocities[:, :3].max(initial=0.0)), float(velocities[:, 3:].max(initial=0.0))
 
     def coordinates(self) -> np.ndarray:
-        """Present positions and quaternions of the free bodies, shape (N, 7), a copy."""
+        """Current positions and quaternions of the free bodies, shape (N, 7), a copy."""
         return self._positions[: len(self.rigid)].copy()
 
     def mean_speeds(
         self, since: np.ndarray, duration_s: float, *, apart_from: int | None = None
     ) -> tuple[float, float]:
-        """Greatest component of the mean velocity (m/s), and greatest mean turning rate component (rad/s).
+        """Largest component of the mean linear (m/s) and angular (rad/s) velocity.
 
-        A body that trembles in its place has a velocity, but no mean one.
+        A body that jitters in place has a velocity, but no mean velocity.
 
         Args:
-            since: What `coordinates` gave.
-            duration_s: How long ago that was.
-            apart_from: A body that does not count, such as a parked one.
+            since: Earlier `coordinates`.
+            duration_s: Time since then.
+            apart_from: Index of a body to ignore, such as a parked one.
         """
         change = np.abs(self._positions[: len(self.rigid)] - since) / duration_s
         if apart_from is not None:
             change[self._joint[apart_from]] = 0.0
         return float(change[:, :3].max(initial=0.0)), 2 * float(change[:, 3:].max(initial=0.0))
 
-    def shift(self, indices: Iterable[int], way: Vector3) -> None:
-        """Move free bodies by metres along the world's axes; they keep their velocities."""
+    def shift(self, indices: Iterable[int], offset: Vector3) -> None:
+        """Translate free bodies by metres in the world frame; they keep their velocities."""
         for index in indices:
-            self._positions[self._joint[index], :3] += way
+            self._positions[self._joint[index], :3] += offset
 
     def lowest_z(self, index: int, quaternion: Quaternion) -> float:
-        """Height of a body's lowest touching point above its link frame, in metres, in a given attitude."""
+        """Height of a body's lowest contact point above its link frame, in metres, for an orientation."""
         points = self.shapes[index].points
         heights = _heights(points, quaternion) - points[:, 3]
         return float(heights.min(initial=np.inf))
 
     def highest_z(self, index: int) -> float:
-        """Present height of a body's highest touching point, in metres."""
+        """Current height of a body's highest contact point, in metres."""
         pose = self.pose(index)
         points = self.shapes[index].points
         heights = _heights(points, pose.quaternion) + points[:, 3]
@@ -185,9 +185,9 @@ class Bodies:
 
 
 def _heights(points: np.ndarray, quaternion: Quaternion) -> np.ndarray:
-    """Heights above its link frame, shape (N,), of points of a body with that attitude.
+    """Heights above its link frame, shape (N,), of points of a body with that orientation.
 
-    Written out: the last bits of a matrix product depend on the processor.
+    Written out: the last bits of a matrix product depend on the CPU.
     """
     x, y, z, w = quaternion
     up = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))  # in the body's frame

@@ -1,8 +1,7 @@
-"""Where a shape that moves along a straight line first touches another.
+"""Distance to first contact of a shape that translates along a line.
 
-The distance of two convex shapes is a convex function of the way that one of them has moved. Newton's
-method, started from the free side, therefore never goes past the touching point, and reaches it in a few
-evaluations.
+The distance between two convex shapes is a convex function of the translation of one of them. Newton's
+method, started without contact, therefore never overshoots, and converges in a few evaluations.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,7 +16,7 @@ import numpy as np
 from openvima.catalog.geometry import Vector3
 from openvima.sim.bodies import Bodies
 
-TOUCH_M = 1e-5  # gaps below this count as touching
+CONTACT_M = 1e-5  # gaps below this count as contact
 _FARTHEST_M = 10.0  # beyond this, distances are not computed
 _MOST_STEPS = 50
 
@@ -29,7 +28,7 @@ def gap(bodies: Bodies, geom1: int, geom2: int) -> float:
 
 
 def body_gap(bodies: Bodies, index1: int, index2: int) -> float:
-    """Smallest gap of two bodies in metres; infinite if a rough bound shows that they are apart."""
+    """Smallest gap of two bodies in metres; infinite if their bounding circles are apart."""
     reach = bodies.shapes[index1].radius_m + bodies.shapes[index2].radius_m
     if bodies.pose(index1).planar_distance(bodies.pose(index2)) > reach + 0.01:
         return np.inf
@@ -37,33 +36,31 @@ def body_gap(bodies: Bodies, index1: int, index2: int) -> float:
     return min((gap(bodies, g1, g2) for g1, g2 in pairs), default=np.inf)
 
 
-def way_to_touch(
+def distance_to_contact(
     bodies: Bodies, moving: Iterable[int], others: Iterable[int], *, direction: Vector3, length_m: float
 ) -> float | None:
-    """How far some parts can move before one of them touches one of the others.
-
-    The parts are back where they were afterwards.
+    """How far some parts can move before one of them touches one of the others; nothing is moved.
 
     Args:
-        bodies: The bodies, with `refresh` done.
+        bodies: The bodies, refreshed.
         moving: MuJoCo ids of the parts that move together.
-        others: MuJoCo ids of the parts that stand still.
+        others: MuJoCo ids of the static parts.
         direction: Unit vector.
-        length_m: How far they move at most.
+        length_m: Largest distance.
 
     Returns:
-        Metres, 0 where they touch already; None if they touch nothing on the way.
+        Metres, 0 if they touch already; None without contact.
     """
     ways = [
         way
         for geom in moving
         for other in others
-        if (way := _way_of_pair(bodies, geom, other, np.array(direction), length_m)) is not None
+        if (way := _pair_distance_to_contact(bodies, geom, other, np.array(direction), length_m)) is not None
     ]
     return min(ways, default=None)
 
 
-def _way_of_pair(
+def _pair_distance_to_contact(
     bodies: Bodies, geom: int, other: int, direction: np.ndarray, length_m: float
 ) -> float | None:
     model, positions = bodies.model, bodies.data.geom_xpos
@@ -79,12 +76,12 @@ def _way_of_pair(
     for _ in range(_MOST_STEPS):
         positions[geom] = start + way * direction
         distance = mujoco.mj_geomDistance(model, bodies.data, geom, other, _FARTHEST_M, segment) - margin
-        if distance < TOUCH_M:
+        if distance < CONTACT_M:
             found = way
             break
         towards = segment[3:] - segment[:3]
         closing = _dot(towards, direction) / math.hypot(*towards.tolist())
-        if closing <= 1e-6:  # the nearest points no longer approach each other: it passes by
+        if closing <= 1e-6:  # the nearest points no longer approach each other: a miss
             break
         way += distance / closing
         if way > length_m:
@@ -94,6 +91,6 @@ def _way_of_pair(
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product, written out: the last bits of NumPy's depend on the processor."""
+    """Scalar product, written out: the last bits of NumPy's depend on the CPU."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return ax * bx + ay * by + az * bz

@@ -1,14 +1,13 @@
-"""The MuJoCo model of a scene: free and fixed bodies on a floor, and the tool's blade.
+"""The MuJoCo model of a scene: floor, free and fixed bodies, suction probe and spatula.
 
-A model depends on the shapes alone, not on where they stand, so that models and the convex hulls in them are
-shared between scenes; poses live in `MjData`.
+A model depends on the shapes alone, so that models and their convex hulls are shared between scenes; poses
+are in `MjData`.
 
 Contact parameters: MuJoCo's contacts are springs. `_SOLREF` and `_SOLIMP` make them as stiff as 1/240 s
 allows, so that a body at rest sinks in by micrometres.
 
-The benchmark multiplies the friction coefficients of a pair where MuJoCo takes the larger one. No coefficient
-exceeds 1, so it is enough to give the slipperier of two bodies priority, and to list pairs of two slippery
-ones with their product.
+VIMA-Bench multiplies the friction coefficients of a pair; MuJoCo takes the larger one. No coefficient exceeds
+1, so the body with less friction gets priority; pairs of two bodies below 1 are listed with their product.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -25,45 +24,43 @@ import numpy as np
 
 from openvima.catalog.geometry import CollisionBox, CollisionShape, Geometry, Vector3
 from openvima.catalog.objects import ObjectSpec, object_spec
-from openvima.sim.end_effectors import BLADE_HALF_SIZE_M, NEEDLE_RADIUS_M
+from openvima.sim.end_effectors import PROBE_RADIUS_M, SPATULA_HALF_SIZE_M
 
-# Left alone, MuJoCo writes its warnings into a file in the working directory.
+# By default MuJoCo writes warnings to a file in the working directory.
 mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
-# Left alone, MuJoCo keeps up to 500 MB of hulls; containers come in any size, so few are met again. With this
-# much, compiling takes as long.
+# By default MuJoCo caches up to 500 MB of hulls; containers come in any size, so few recur, and
+# compiling is as fast with 8 MB.
 if hasattr(mujoco, "mj_setCacheCapacity"):
     mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 8 << 20)
 
 TICK_S = 1 / 240
 GRAVITY_M_S2 = 9.8
-FLOOR_Z_M = -0.001  # top of the floor; the visible sheet lies at 0
+FLOOR_Z_M = -0.001  # top of the floor; the visible sheet is at 0
 HULL_MARGIN_M = 0.001  # hulls touch at this distance, as in the benchmark
 BOX_MARGIN_M = 1e-5  # at 0, a box that just touches the floor would fall freely for one tick
 
 _SOLREF = (0.0125, 1.0)  # s, damping ratio: three ticks, critically damped; at two, round bodies gain energy
 _SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
-_INERTIA_FACTOR = 3.0  # the benchmark's bodies turn as if they were three times as heavy
-_INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, every side
-_TURNING_DAMPING_PER_S = 3.0  # else discs wobble on; its effect on straight motion is a hundred times smaller
-_BLADE_MASS_KG = 17.0  # so that stopping it within a tick takes about the 500 N of the benchmark's tool mount
-PARKED_M = 1000.0  # height at which bodies are kept that must touch nothing
+_INERTIA_FACTOR = 3.0  # angular inertia of the benchmark's bodies
+_INERTIA_GROWTH_M = 0.003  # by which hull bounds are grown for that, on every side
+_TURNING_DAMPING_PER_S = 3.0  # else discs keep wobbling; its linear effect is 100 times smaller
+_SPATULA_MASS_KG = 17.0  # stopping it within a tick takes about the 500 N of VIMA-Bench's tool mount
+PARKED_M = 1000.0  # height of bodies out of contact
 _MODEL_CACHE_SIZE = 256
-_MEMORY_BYTES = 64 << 20  # reserved, not used: crowded scenes need 0.3 MB, a heap of bodies in one another 5
-NEEDLE_HALF_LENGTH_M = 0.2
-_COLLIDES, _COLLIDES_WITH_BLADE = 1, 2  # bits of contype and conaffinity
+_MEMORY_BYTES = 64 << 20  # reserved; crowded scenes use 0.3 MB, a heap of overlapping bodies 5 MB
+PROBE_HALF_LENGTH_M = 0.2
+_COLLIDES, _COLLIDES_WITH_SPATULA = 1, 2  # bits of contype and conaffinity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyShape:
-    """One body without its pose; equal `key` means equal in every respect.
+    """One body without its pose; bodies with equal `key` are equal.
 
     Args:
-        key: Digest of all that the model needs.
+        key: Digest of everything that the model depends on.
         shapes: Convex parts in the link frame.
-        points: Corners of all parts with the margin that each is given, shape (N, 4): x, y, z, margin;
-            metres.
-        radius_m: Greatest planar distance of a corner from the link frame, margin included, whatever the
-            attitude.
+        points: Corners of all parts with their margins, shape (N, 4): x, y, z, margin; metres.
+        radius_m: Largest distance of a corner from the link frame, margin included.
         spec: Catalogue entry.
         fixed: Welded to the floor.
         inertia: Principal moments in kg m².
@@ -80,7 +77,7 @@ class BodyShape:
 
 @lru_cache(maxsize=256)
 def body_shape(object_name: str, geometry: Geometry, fixed: bool) -> BodyShape:
-    """Prepare the body of an object; one that nothing can touch counts as fixed."""
+    """Prepare the body of an object; one without collision shapes counts as fixed."""
     spec = object_spec(object_name)
     digest = hashlib.sha1(repr((spec.mass_kg, spec.friction, spec.com_offset, fixed)).encode())
     for shape in geometry.collision:
@@ -107,7 +104,7 @@ def _corners(shape: CollisionShape) -> np.ndarray:
 
 
 def _inertia(points: np.ndarray, mass_kg: float) -> Vector3:
-    """Moments of the solid box around the collision shape, times the benchmark's factor."""
+    """Moments of the solid bounding box of the collision shape, times VIMA-Bench's factor."""
     if not len(points):
         return (1e-6, 1e-6, 1e-6)
     growth = 2 * _INERTIA_GROWTH_M if points[:, 3].max() > BOX_MARGIN_M else 0.0
@@ -116,30 +113,30 @@ def _inertia(points: np.ndarray, mass_kg: float) -> Vector3:
 
 
 @lru_cache(maxsize=_MODEL_CACHE_SIZE)
-def _model_cache(key: tuple[bytes, ...], with_blade: bool) -> list[mujoco.MjModel]:
-    """A place to keep the model of these bodies; empty the first time."""
+def _model_cache(key: tuple[bytes, ...], with_spatula: bool) -> list[mujoco.MjModel]:
+    """A cached list for the model of these bodies; empty at first."""
     return []
 
 
-def build_model(bodies: Sequence[BodyShape], *, with_blade: bool) -> mujoco.MjModel:
-    """Compile the model of some bodies, or return the one compiled before.
+def build_model(bodies: Sequence[BodyShape], *, with_spatula: bool) -> mujoco.MjModel:
+    """Compile the model of some bodies, cached.
 
-    Body 0 is the world, the next ones are `bodies` in order, then needle and blade. Free joints stand in the
-    same order, the blade's last.
+    Body 0 is the world, the next ones are `bodies` in order, then probe and spatula. Free joints are in
+    the same order, the spatula's last.
     """
-    kept = _model_cache(tuple(body.key for body in bodies), with_blade)
-    if not kept:
-        kept.append(_compile(bodies, with_blade))
-    return kept[0]
+    cached = _model_cache(tuple(body.key for body in bodies), with_spatula)
+    if not cached:
+        cached.append(_compile(bodies, with_spatula))
+    return cached[0]
 
 
-def _compile(bodies: Sequence[BodyShape], with_blade: bool) -> mujoco.MjModel:
+def _compile(bodies: Sequence[BodyShape], with_spatula: bool) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.memory = _MEMORY_BYTES
     spec.option.timestep = TICK_S
     spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
-    spec.option.tolerance = 1e-10  # before 4.0 relative to the mean inertia, which the blade dominates
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid would turn friction towards its edges
+    spec.option.tolerance = 1e-10  # relative to the mean inertia before 4.0; the spatula dominates it
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid biases friction towards its edges
     spec.option.impratio = 10.0  # friction as stiff as this against creeping
     floor = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [5.0, 5.0, 1.0], "pos": [0.0, 0.0, FLOOR_Z_M]}
     spec.worldbody.add_geom(**floor, **_contact(friction=1.0))
@@ -149,9 +146,9 @@ def _compile(bodies: Sequence[BodyShape], with_blade: bool) -> mujoco.MjModel:
         slippery += _add_body(spec, index, body, assets)
     spec.assets = assets
     _add_slippery_pairs(spec, slippery)
-    _add_needle(spec)
-    if with_blade:
-        _add_blade(spec)
+    _add_probe(spec)
+    if with_spatula:
+        _add_spatula(spec)
     return spec.compile()
 
 
@@ -175,14 +172,14 @@ def _add_body(
 ) -> list[tuple[str, float, bool]]:
     added = spec.worldbody.add_body(name=f"body{index}")
     if body.fixed:
-        added.mocap = True  # so that its pose, too, is data and not part of the model
+        added.mocap = True  # so that its pose is data too
     else:
         moment = sum(body.inertia) / 3
         added.add_joint(type=mujoco.mjtJoint.mjJNT_FREE, damping=[_TURNING_DAMPING_PER_S * moment] * 3)
         added.explicitinertial = True
         added.mass, added.inertia = body.spec.mass_kg, list(body.inertia)
         added.ipos, added.iquat = list(body.spec.com_offset), [1.0, 0.0, 0.0, 0.0]
-    affinity = _COLLIDES if body.fixed else _COLLIDES | _COLLIDES_WITH_BLADE
+    affinity = _COLLIDES if body.fixed else _COLLIDES | _COLLIDES_WITH_SPATULA
     friction = body.spec.friction
     names = []
     for part, shape in enumerate(body.shapes):
@@ -205,7 +202,7 @@ def _add_body(
 
 
 def _add_hull(spec: mujoco.MjSpec, points: np.ndarray, assets: dict[str, bytes]) -> str:
-    """Add points whose convex hull collides; MuJoCo keeps the hulls of files, so they are given as one."""
+    """Add the convex hull of points, as a file: MuJoCo caches the hulls of files."""
     header = np.array([len(points), 0, 0, 0], dtype=np.int32)  # vertices; no normals, texture points, faces
     content = header.tobytes() + points.astype(np.float32).tobytes()
     name = hashlib.sha1(content).hexdigest()
@@ -232,23 +229,23 @@ def _add_slippery_pairs(spec: mujoco.MjSpec, slippery: list[tuple[str, float, bo
             )
 
 
-def _add_needle(spec: mujoco.MjSpec) -> None:
-    """A thin upright line that collides with nothing; distances to it tell what is under the cup.
+def _add_probe(spec: mujoco.MjSpec) -> None:
+    """A thin vertical cylinder without collisions, for distances to what is under the suction cup.
 
-    No capsule: MuJoCo takes one that pierces a box to be apart from it in about half of all cases.
+    Not a capsule: MuJoCo misses about half of all capsules that pierce a box.
     """
-    body = spec.worldbody.add_body(name="needle", mocap=True, pos=[0.0, 0.0, PARKED_M])
-    shape = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [NEEDLE_RADIUS_M, NEEDLE_HALF_LENGTH_M, 0.0]}
-    body.add_geom(name="needle", **shape, contype=0, conaffinity=0)
+    body = spec.worldbody.add_body(name="probe", mocap=True, pos=[0.0, 0.0, PARKED_M])
+    shape = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [PROBE_RADIUS_M, PROBE_HALF_LENGTH_M, 0.0]}
+    body.add_geom(name="probe", **shape, contype=0, conaffinity=0)
 
 
-def _add_blade(spec: mujoco.MjSpec) -> None:
-    """A free body whose motion is prescribed; it pushes free bodies and passes through all others."""
-    body = spec.worldbody.add_body(name="blade", pos=[0.0, 0.0, PARKED_M], gravcomp=1.0)
+def _add_spatula(spec: mujoco.MjSpec) -> None:
+    """A body with prescribed motion that pushes free bodies and passes through all others."""
+    body = spec.worldbody.add_body(name="spatula", pos=[0.0, 0.0, PARKED_M], gravcomp=1.0)
     body.add_freejoint()
     body.explicitinertial = True
-    body.mass, body.inertia = _BLADE_MASS_KG, [_BLADE_MASS_KG] * 3
+    body.mass, body.inertia = _SPATULA_MASS_KG, [_SPATULA_MASS_KG] * 3
     body.ipos, body.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
-    contact = _contact(1.0) | {"contype": _COLLIDES_WITH_BLADE, "conaffinity": 0}
-    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(BLADE_HALF_SIZE_M)}
-    body.add_geom(name="blade", **box, **contact)
+    contact = _contact(1.0) | {"contype": _COLLIDES_WITH_SPATULA, "conaffinity": 0}
+    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": list(SPATULA_HALF_SIZE_M)}
+    body.add_geom(name="spatula", **box, **contact)

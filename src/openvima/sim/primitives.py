@@ -1,8 +1,8 @@
 """The two primitives: pick and place with the suction cup, sweep with the spatula.
 
-Events, not time: while nothing can be touched, nothing is stepped. A lifted body moves rigidly with the arm;
-physics runs when it is let go onto something else than bare floor, when the blade meets bodies, and until
-all is at rest.
+Event-driven: physics is skipped while nothing can be in contact. A lifted body moves rigidly with the arm;
+physics runs when it is released onto anything but bare floor, when the spatula touches bodies, and until
+everything is at rest.
 """
 
 import math
@@ -15,49 +15,49 @@ from openvima.sim import end_effectors as tools
 from openvima.sim import ur5
 from openvima.sim.arm_path import reachable_joints
 from openvima.sim.bodies import Bodies
-from openvima.sim.contacts import body_gap, gap, way_to_touch
+from openvima.sim.contacts import body_gap, distance_to_contact, gap
 from openvima.sim.model import FLOOR_Z_M
-from openvima.sim.spatula import Blade
-from openvima.sim.stage import RESTING_GAP_M, Stage, is_level
+from openvima.sim.primitive_state import RESTING_GAP_M, PrimitiveState, is_level
+from openvima.sim.spatula import Spatula
 
 _DOWN = (0.0, 0.0, -1.0)
 _ABOVE_ALL_M = 1.0  # height from which tools and held bodies are lowered, above every stack
 
 
-def pick_place(stage: Stage, action: Action) -> int | None:
-    """Lower the suction cup at pose0, lift what it caught, and set it down at pose1.
+def pick_place(state: PrimitiveState, action: Action) -> int | None:
+    """Lower the suction cup at pose0, lift the grasped body, and set it down at pose1.
 
-    The caught body keeps its pose relative to the tool and is let go when it first touches anything.
+    The body keeps its pose relative to the tool and is released at first contact.
 
     Args:
-        stage: Bodies and arm; afterwards all is at rest.
+        state: Bodies and arm; afterwards everything is at rest.
         action: Where to pick and to place.
 
     Returns:
-        Index of the body that was moved; None if the cup met the floor or a fixed body.
+        Index of the moved body; None if the cup hit the floor or a fixed body.
     """
-    bodies, path = stage.bodies, stage.path
+    bodies, path = state.bodies, state.path
     x, y = action.pose0_position
     hover = reachable_joints(x, y, tools.HOVER_TIP_Z_M, action.yaw0_rad)
-    path.move(hover, scene=lambda _: stage.start)
-    caught, surface_z = body_under_needle(bodies, x, y)
-    touch_z = surface_z + tools.NEEDLE_BELOW_TIP_M
-    path.move(reachable_joints(x, y, touch_z, action.yaw0_rad), scene=lambda _: stage.start)
+    path.move(hover, scene=lambda _: state.start)
+    caught, surface_z = body_under_probe(bodies, x, y)
+    contact_z = surface_z + tools.PROBE_BELOW_TIP_M
+    path.move(reachable_joints(x, y, contact_z, action.yaw0_rad), scene=lambda _: state.start)
     if caught is None or caught not in bodies.rigid:
-        path.move(hover, scene=lambda _: stage.start)
+        path.move(hover, scene=lambda _: state.start)
         return None
-    held = _HeldBody(caught, bodies.pose(caught), action, touch_z)
-    stands_alone = _lift(stage, held)
-    path.move(hover, scene=lambda joints: stage.scene(held.at(joints)))
-    _set_down(stage, held, stands_alone=stands_alone)
+    held = _HeldBody(caught, bodies.pose(caught), action, contact_z)
+    stands_alone = _lift(state, held)
+    path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
+    _set_down(state, held, stands_alone=stands_alone)
     return caught
 
 
-def body_under_needle(bodies: Bodies, x: float, y: float) -> tuple[int | None, float]:
-    """Which body a needle meets that is lowered at (x, y), in metres, and at what height.
+def body_under_probe(bodies: Bodies, x: float, y: float) -> tuple[int | None, float]:
+    """Find the body that a probe lowered at (x, y), in metres, hits, and at what height.
 
-    Of the bodies that the needle hits, the highest; if it hits none, the nearest within the capture radius.
-    Distances count from where a body touches, so hulls are caught up to 4 mm beside their edge.
+    Of the bodies that the probe hits, the highest; if it hits none, the nearest within the capture radius.
+    Distances include contact margins, so hulls are grasped up to 4 mm beside their edge.
 
     Returns:
         Index of the body, or None for the floor; height of its surface in metres.
@@ -67,7 +67,7 @@ def body_under_needle(bodies: Bodies, x: float, y: float) -> tuple[int | None, f
     if nearest is None or gaps[nearest] > tools.CAPTURE_RADIUS_M:
         return None, FLOOR_Z_M
     tops = {
-        index: _surface_z(bodies, index, x, y) for index in gaps if gaps[index] <= tools.TOUCH_RADIUS_M
+        index: _surface_z(bodies, index, x, y) for index in gaps if gaps[index] <= tools.CONTACT_RADIUS_M
     } or {nearest: _surface_z(bodies, nearest, x, y)}
     highest = max(tops, key=tops.__getitem__)
     return highest, tops[highest]
@@ -75,11 +75,11 @@ def body_under_needle(bodies: Bodies, x: float, y: float) -> tuple[int | None, f
 
 def _gaps_to_axis(bodies: Bodies, x: float, y: float) -> dict[int, float]:
     """Distances in metres of the bodies near a vertical line to it; negative where it pierces one."""
-    bodies.place_needle(x, y, FLOOR_Z_M)
+    bodies.place_probe(x, y, FLOOR_Z_M)
     bodies.refresh()
-    needle = bodies.needle_geom
+    probe = bodies.probe_geom
     return {
-        index: min((gap(bodies, needle, geom) for geom in bodies.geoms(index)), default=math.inf)
+        index: min((gap(bodies, probe, geom) for geom in bodies.geoms(index)), default=math.inf)
         for index, shape in enumerate(bodies.shapes)
         if math.hypot(bodies.pose(index).x - x, bodies.pose(index).y - y)
         < shape.radius_m + tools.CAPTURE_RADIUS_M
@@ -87,13 +87,13 @@ def _gaps_to_axis(bodies: Bodies, x: float, y: float) -> dict[int, float]:
 
 
 def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
-    """Height at which a needle lowered at (x, y) meets a body; of the top if it goes down beside it."""
-    bodies.place_needle(x, y, _ABOVE_ALL_M)
+    """Height at which a probe lowered at (x, y) hits a body; the top of the body if it misses."""
+    bodies.place_probe(x, y, _ABOVE_ALL_M)
     bodies.refresh()
-    needle = (bodies.needle_geom,)
+    probe = (bodies.probe_geom,)
     depth = _ABOVE_ALL_M - FLOOR_Z_M
-    way = way_to_touch(bodies, needle, bodies.geoms(index), direction=_DOWN, length_m=depth)
-    return bodies.highest_z(index) if way is None else _ABOVE_ALL_M - way
+    drop = distance_to_contact(bodies, probe, bodies.geoms(index), direction=_DOWN, length_m=depth)
+    return bodies.highest_z(index) if drop is None else _ABOVE_ALL_M - drop
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +103,12 @@ class _HeldBody:
     index: int
     grasped_at: Pose
     action: Action
-    touch_z: float
+    contact_z: float
 
     def at(self, joints: np.ndarray) -> tuple[int, Pose]:
-        """Index and pose when the arm stands at `joints`."""
+        """Index and pose for the arm at `joints`."""
         x, y = self.action.pose0_position
-        tip = ur5.tool_pose(x, y, self.touch_z, self.action.yaw0_rad)
+        tip = ur5.tool_pose(x, y, self.contact_z, self.action.yaw0_rad)
         return self.index, ur5.forward(joints) @ tip.inverse() @ self.grasped_at
 
     def target(self) -> Pose:
@@ -118,9 +118,9 @@ class _HeldBody:
         return place @ pick.inverse() @ self.grasped_at
 
 
-def _lift(stage: Stage, held: _HeldBody) -> bool:
-    """Take a body out of the physics, let others settle that leaned on it; whether it lay by itself."""
-    bodies = stage.bodies
+def _lift(state: PrimitiveState, held: _HeldBody) -> bool:
+    """Take a body out of the physics and let others settle; return whether it touched no other."""
+    bodies = state.bodies
     touching = [
         other
         for other in range(len(bodies.shapes))
@@ -129,37 +129,35 @@ def _lift(stage: Stage, held: _HeldBody) -> bool:
     on_floor = held.grasped_at.z + bodies.lowest_z(held.index, held.grasped_at.quaternion) - FLOOR_Z_M
     bodies.park(held.index)
     if any(other in bodies.rigid for other in touching):
-        stage.settle((held.index, held.grasped_at.moved(dz=tools.HOVER_TIP_Z_M)))
+        state.settle((held.index, held.grasped_at.moved(dz=tools.HOVER_TIP_Z_M)))
     return not touching and on_floor < RESTING_GAP_M and is_level(held.grasped_at)
 
 
-def _set_down(stage: Stage, held: _HeldBody, *, stands_alone: bool) -> None:
-    """Carry a body to pose1, lower it until it touches, let it go and wait until all is at rest."""
-    bodies, path = stage.bodies, stage.path
+def _set_down(state: PrimitiveState, held: _HeldBody, *, stands_alone: bool) -> None:
+    """Carry a body to pose1, lower it to first contact, release it and settle."""
+    bodies, path = state.bodies, state.path
     x, y = held.action.pose1_position
     yaw_rad = held.action.yaw1_rad
     target = held.target()
-    drop, on_floor = _way_down(bodies, held.index, target.moved(dz=_ABOVE_ALL_M))
+    drop, on_floor = _distance_down(bodies, held.index, target.moved(dz=_ABOVE_ALL_M))
     set_down_at = target.moved(dz=_ABOVE_ALL_M - drop)
     hover = reachable_joints(x, y, tools.HOVER_TIP_Z_M, yaw_rad)
-    touch_z = held.touch_z + set_down_at.z - target.z
-    path.move(hover, scene=lambda joints: stage.scene(held.at(joints)))
-    path.move(reachable_joints(x, y, touch_z, yaw_rad), scene=lambda joints: stage.scene(held.at(joints)))
-    if (
-        on_floor and stands_alone
-    ):  # as it stood before: no physics needed, and its height stays the same number
+    contact_z = held.contact_z + set_down_at.z - target.z
+    path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
+    path.move(reachable_joints(x, y, contact_z, yaw_rad), scene=lambda joints: state.scene(held.at(joints)))
+    if on_floor and stands_alone:  # no physics needed, and its height keeps the same value
         bodies.place(held.index, target)
         bodies.refresh()
     else:
         bodies.place(held.index, set_down_at)
         bodies.refresh()
-        stage.settle()
-    after = stage.scene() if path.is_filmed else stage.start
+        state.settle()
+    after = state.scene() if path.is_recording else state.start
     path.move(hover, scene=lambda _: after)
 
 
-def _way_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
-    """How far a body can be lowered from `above` until it touches, and whether that is bare floor."""
+def _distance_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
+    """How far a body can be lowered from `above` to first contact, and whether that is bare floor."""
     bodies.place(index, above)
     bodies.refresh()
     to_floor = above.z + bodies.lowest_z(index, above.quaternion) - FLOOR_Z_M
@@ -170,40 +168,38 @@ def _way_down(bodies: Bodies, index: int, above: Pose) -> tuple[float, bool]:
         if other != index and bodies.pose(other).planar_distance(above) < reach + shape.radius_m
         for geom in bodies.geoms(other)
     ]
-    to_others = way_to_touch(bodies, bodies.geoms(index), others, direction=_DOWN, length_m=to_floor)
+    to_others = distance_to_contact(bodies, bodies.geoms(index), others, direction=_DOWN, length_m=to_floor)
     if to_others is None:
         return to_floor, True
     return min(to_floor, to_others), False
 
 
-def sweep(stage: Stage, action: Action, *, compat: bool = False) -> None:
-    """Push with the blade from just before pose0 towards pose1, in a straight line and at constant speed.
+def sweep(state: PrimitiveState, action: Action, *, compat: bool = False) -> None:
+    """Push with the spatula from just before pose0 towards pose1, in a straight line at constant speed.
 
-    Rotations of the action do not matter. If the two points are the same there is no direction: nothing
-    happens.
+    Rotations of the action are ignored. Nothing happens if the two points are equal.
 
     Args:
-        stage: Bodies and arm; afterwards all is at rest.
-        action: From where to where.
-        compat: Move the blade as the benchmark's arm does, in bows, and stop it 3 mm earlier.
+        state: Bodies and arm; afterwards everything is at rest.
+        action: Start and end.
+        compat: Move straight in joint space, as VIMA-Bench does, and stop 3 mm earlier.
     """
     (x0, y0), (x1, y1) = action.pose0_position, action.pose1_position
     distance = math.hypot(x1 - x0, y1 - y0)
     if distance == 0:
         return
-    shortfall_m = tools.BLADE_SHORTFALL_M + (tools.COMPAT_SHORTFALL_M if compat else 0.0)
+    shortfall_m = tools.SPATULA_SHORTFALL_M + (tools.COMPAT_SHORTFALL_M if compat else 0.0)
     vx, vy = (x1 - x0) / distance, (y1 - y0) / distance
-    start = _within_reach(x0 - tools.BLADE_RUN_UP_M * vx, y0 - tools.BLADE_RUN_UP_M * vy)
+    start = _within_reach(x0 - tools.SPATULA_RUN_UP_M * vx, y0 - tools.SPATULA_RUN_UP_M * vy)
     end = _within_reach(x1 - shortfall_m * vx, y1 - shortfall_m * vy)
-    # A sweep shorter than run-up and shortfall first goes forward by what is missing, then back, as
-    # VIMA-Bench does.
-    nudge = distance + tools.BLADE_RUN_UP_M - shortfall_m
+    # A sweep shorter than run-up and shortfall overshoots, then returns, as in VIMA-Bench.
+    nudge = distance + tools.SPATULA_RUN_UP_M - shortfall_m
     legs = [end] if nudge >= 0 else [_within_reach(start[0] - nudge * vx, start[1] - nudge * vy), end]
-    blade = Blade(stage, math.atan2(vy, vx), in_bows=compat)
-    blade.lower(*start)
+    spatula = Spatula(state, math.atan2(vy, vx), in_joint_space=compat)
+    spatula.lower(*start)
     for x, y in legs:
-        blade.push(x, y)
-    blade.lift()
+        spatula.push(x, y)
+    spatula.lift()
 
 
 def _within_reach(x: float, y: float) -> tuple[float, float]:

@@ -1,7 +1,7 @@
-"""Exact kinematics of the UR5 arm with a vertical tool: forward by the chain, inverse in closed form.
+"""Kinematics of the UR5 arm with a vertical tool: forward, and inverse in closed form.
 
-The tip is the point 0.12 m beyond the flange along the tool axis. A tool yaw of 0 is the heading at which
-the tool frame is Rz(0) · B, where B turns by π about (−1, 1, 0)/√2: flange x along −y, y along −x, z down.
+The tip is the point 0.12 m beyond the flange along the tool axis. At tool yaw 0 the tool
+frame is Rz(0) · B, where B rotates by π about (−1, 1, 0)/√2: flange x along −y, y along −x, z down.
 
 Source: link lengths of the UR5 data sheet; derivation of the closed form beside `inverse`.
 """
@@ -32,7 +32,7 @@ _HEIGHT_OFFSET_M = TOOL_M + FLANGE_M - SHOULDER_HEIGHT_M
 _HALF = math.sqrt(0.5)
 _QUARTER_PITCH: Quaternion = (0.0, _HALF, 0.0, _HALF)
 _STRAIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
-# Translation from the parent frame, its fixed turn, and the index of the axis about which the joint turns.
+# Pose in the parent frame, and index of the joint axis.
 _CHAIN: tuple[tuple[Pose, int], ...] = (
     (Pose((0.0, 0.0, SHOULDER_HEIGHT_M), _STRAIGHT), 2),
     (Pose((0.0, 0.13585, 0.0), _QUARTER_PITCH), 1),
@@ -65,9 +65,9 @@ def link_frames(joints: np.ndarray) -> tuple[Pose, ...]:
         raise ShapeError(f"joints have shape {joints.shape}; the arm has 6, so give shape (6,).")
     frames = [_WORLD_FROM_BASE]
     for (parent_from_joint, axis), angle in zip(_CHAIN, joints.tolist(), strict=True):
-        turn = [0.0, 0.0, 0.0, math.cos(angle / 2)]
-        turn[axis] = math.sin(angle / 2)
-        joint = Pose((0.0, 0.0, 0.0), (turn[0], turn[1], turn[2], turn[3]))
+        rotation = [0.0, 0.0, 0.0, math.cos(angle / 2)]
+        rotation[axis] = math.sin(angle / 2)
+        joint = Pose((0.0, 0.0, 0.0), (rotation[0], rotation[1], rotation[2], rotation[3]))
         frames.append(frames[-1] @ parent_from_joint @ joint)
     frames.append(frames[-1] @ _WRIST_FROM_FLANGE)
     return tuple(frames)
@@ -83,14 +83,12 @@ def forward(joints: np.ndarray) -> Pose:
 
 
 def tool_pose(x: float, y: float, z: float, yaw_rad: float) -> Pose:
-    """Pose of the tip of a vertical tool at a point in metres, turned by `yaw_rad` about the vertical."""
+    """Pose of the tip of a vertical tool at a point in metres with a heading."""
     return Pose((x, y, z), multiply(yaw_quaternion(yaw_rad), _TOOL_DOWN))
 
 
 def inverse(x: float, y: float, z: float, yaw_rad: float) -> np.ndarray:
-    """Joint angles that bring the tip of the vertical tool to a point.
-
-    The elbow points up and the second wrist joint stays at −π/2, the branch in which the arm works.
+    """Joint angles for the tip of the vertical tool at a point, elbow up and second wrist joint at −π/2.
 
     Args:
         x: Metres away from the robot's base.
@@ -169,5 +167,5 @@ def _corner(a: float, b: float, opposite: float) -> float:
 
 
 def _wrapped(angle: float, low: float) -> float:
-    """The same direction in [low, low + 2π)."""
+    """The equivalent angle in [low, low + 2π)."""
     return (angle - low) % (2 * math.pi) + low

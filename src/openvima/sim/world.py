@@ -1,4 +1,4 @@
-"""A scene that can be acted upon: bodies, arm and tool."""
+"""The simulated world: bodies, arm and tool."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from openvima.scene import Action, Scene
 from openvima.sim import primitives, ur5
 from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
-from openvima.sim.stage import Stage, is_at_rest
+from openvima.sim.primitive_state import PrimitiveState, is_at_rest
 
-_PARTING_SPEED = 0.1  # m/s, with which bodies that were loaded overlapping part, as gently as in VIMA-Bench
+_SEPARATION_SPEED = 0.1  # m/s, of bodies that overlap at the start, as in VIMA-Bench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Execution:
-    """What one primitive did.
+    """Result of one primitive.
 
     Args:
-        grasped: Id of the object that was lifted; None if there was none, and always for the spatula.
-        joint_path: Key positions of the arm from start to end, shape (W, 6), float32, radians; it moves in
-            straight lines in joint space between them (in a straight line of the tool while sweeping).
-        num_ticks: Physics steps of 1/240 s that were computed.
-        completed: Whether everything came to rest within the limit of 1000 ticks.
+        grasped: Id of the lifted object; None without one, and always for the spatula.
+        joint_path: Waypoints of the arm, shape (W, 6), float32, radians, joined by straight lines in joint
+            space (straight lines of the tool while sweeping).
+        num_ticks: Number of physics ticks of 1/240 s.
+        completed: Whether everything came to rest within 1000 ticks.
     """
 
     grasped: int | None
@@ -36,19 +36,16 @@ class Execution:
 class World:
     """The table with its objects and the robot.
 
-    Deterministic: equal scenes, assets and actions give equal bytes. Nothing depends on time or on other
-    worlds.
+    Deterministic: equal scenes, assets and actions give equal bytes.
 
     Args:
-        scene: The objects at their start. Those that hover or overlap come to rest during the first
-            primitive.
-        assets: Gives the shapes.
-        compat: Move the blade as the benchmark's arm does: it descends, pushes and rises in bows, straight in
-            joint space, and ends 3 mm earlier.
+        scene: The objects at the start. Those that hover or overlap settle in the first primitive.
+        assets: Asset pack.
+        compat: Move the spatula straight in joint space, as VIMA-Bench's arm does, and stop it 3 mm earlier.
 
     Raises:
-        UnknownObjectError: The scene holds an object that the catalogue does not know.
-        AssetError: The asset pack lacks one of its files.
+        UnknownObjectError: An object is not in the catalogue.
+        AssetError: The asset pack lacks a file.
 
     Example:
         >>> world = World(scene, assets)  # doctest: +SKIP
@@ -65,48 +62,48 @@ class World:
 
     @property
     def scene(self) -> Scene:
-        """All objects with the present poses of their link frames."""
+        """The current scene."""
         return self._scene
 
     @property
     def joints(self) -> np.ndarray:
-        """Present joint angles of the arm, shape (6,), float64, radians. It stays where a primitive ends."""
+        """Current joint angles of the arm, shape (6,), float64, radians."""
         return self._joints.copy()
 
     def execute(
         self,
         action: Action,
         *,
-        watch: Callable[[Scene], None] | None = None,
+        monitor: Callable[[Scene], None] | None = None,
         record: RecordFrame | None = None,
         frames_per_second: float = 30,
     ) -> Execution:
-        """Carry out one action: pick and place, or sweep, as the scene's end effector does.
+        """Execute one action: pick and place, or sweep, depending on the end effector.
 
-        Watching and recording change nothing about what happens.
+        Monitoring and recording do not change the result.
 
         Args:
             action: The action; positions lie in the workspace.
-            watch: Called with the scene at least every 25 ticks while bodies may move, and at the end.
-            record: Called with scene and joints, shape (6,), for every frame of a film of the arm at work.
-            frames_per_second: Of that film, in simulated time.
+            monitor: Called with the scene at least every 25 ticks while bodies may move, and at the end.
+            record: Called with scene and joints, shape (6,), for every video frame.
+            frames_per_second: Frame rate in simulated time.
 
         Returns:
-            What happened; `scene` and `joints` hold the new state.
+            The result; `scene` and `joints` are updated.
         """
         path = ArmPath(self._joints, record, frames_per_second)
-        stage = Stage(self._scene, self._bodies, path, watch)
+        state = PrimitiveState(self._scene, self._bodies, path, monitor)
         if not self._is_settled:
-            stage.settle(top_speed=_PARTING_SPEED)
+            state.settle(max_speed=_SEPARATION_SPEED)
             self._is_settled = True
-        grasped = self._perform(stage, action)
-        self._scene = stage.finish()
+        grasped = self._perform(state, action)
+        self._scene = state.finish()
         self._joints = path.joints
-        grasped_id = None if grasped is None else stage.placement(grasped).id
-        return Execution(grasped_id, path.array(), stage.num_ticks, stage.completed)
+        grasped_id = None if grasped is None else state.placement(grasped).id
+        return Execution(grasped_id, path.array(), state.num_ticks, state.completed)
 
-    def _perform(self, stage: Stage, action: Action) -> int | None:
+    def _perform(self, state: PrimitiveState, action: Action) -> int | None:
         if self._scene.end_effector == "suction":
-            return primitives.pick_place(stage, action)
-        primitives.sweep(stage, action, compat=self._compat)
+            return primitives.pick_place(state, action)
+        primitives.sweep(state, action, compat=self._compat)
         return None

@@ -1,6 +1,6 @@
-"""The tasks and the machinery that they share."""
+"""Tasks: sampling, goals and the oracle."""
 
-from openvima.tasks.goals import Progress, advance, begin, watch
+from openvima.tasks.goals import Progress, advance, begin, monitor
 from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.registry import TaskSpec, list_tasks, register_task, task_spec
 from openvima.tasks.sampling import sample_episode
@@ -17,9 +17,9 @@ __all__ = [
     "begin",
     "list_tasks",
     "make_rng",
+    "monitor",
     "oracle_action",
     "register_task",
     "sample_episode",
     "task_spec",
-    "watch",
 ]

@@ -1,4 +1,4 @@
-"""Small blocks for the sweeping tasks: groups scattered over a corner of the table."""
+"""Groups of small blocks for the sweeping tasks."""
 
 import math
 
@@ -10,7 +10,7 @@ from openvima.tasks.table import TableSampler
 
 BLOCK = "small block"
 _COMPAT_TRIES = 10
-_TRIES = 500  # many, so that crowded groups of three are not rarer than they should be
+_TRIES = 500  # many, so that crowded groups of three are not underrepresented
 _GAP_M = 0.001
 
 
@@ -23,13 +23,12 @@ def scattered_blocks(
     count: int,
     outside: Zone,
 ) -> list[Placement]:
-    """Scatter a group of small blocks over a square, drawing the whole group anew until it is fit.
+    """Scatter small blocks over a square by rejection sampling of the whole group.
 
-    Blocks must lie in the workspace. Unless the table is laid as the original benchmark does, they must also
-    not overlap, nor have a point in the goal's zone.
+    Blocks are in the workspace; without `compat` they neither overlap nor enter the goal's zone.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         texture: Texture of all of them.
         corner: x, y of the square's lower corner in metres.
         spread_m: Side of the square.
@@ -40,7 +39,7 @@ def scattered_blocks(
         The blocks.
 
     Raises:
-        SamplingError: No fit group was drawn.
+        SamplingError: No valid group was found.
     """
     sizes = [table.sample_size(BLOCK) for _ in range(count)]
     for _ in range(_COMPAT_TRIES if table.compat else _TRIES):
@@ -52,12 +51,12 @@ def scattered_blocks(
                 table.add(BLOCK, texture, size=size, pose=pose)
                 for size, pose in zip(sizes, poses, strict=True)
             ]
-    raise SamplingError(f"no fit places for {count} small blocks near {corner}.")
+    raise SamplingError(f"no valid poses for {count} small blocks near {corner}.")
 
 
 def _scattered_pose(table: TableSampler, corner: tuple[float, float], spread_m: float) -> Pose:
-    share_x, share_y, turn = table.rng.random(3).tolist()
-    return Pose.planar(corner[0] + spread_m * share_x, corner[1] + spread_m * share_y, 2 * math.pi * turn)
+    x, y, rotation = table.rng.random(3).tolist()
+    return Pose.planar(corner[0] + spread_m * x, corner[1] + spread_m * y, 2 * math.pi * rotation)
 
 
 def _overlap(poses: list[Pose], sizes: list[Vector3]) -> bool:

@@ -1,27 +1,27 @@
-"""Circles around shapes on the table."""
+"""Smallest enclosing circles."""
 
 import numpy as np
 
 _NUM_STEPS = 1000  # the error falls as one over this number
 
 
-def middle_of_smallest_circle(points: np.ndarray) -> tuple[float, float]:
-    """Return the centre of the smallest circle around points of the plane.
+def smallest_circle_centre(points: np.ndarray) -> tuple[float, float]:
+    """Return the centre of the smallest circle that encloses points of the plane.
 
     Args:
         points: Shape (N, 2), float64, metres.
 
     Returns:
-        x, y in metres, to about a thousandth of the circle's radius.
+        x, y in metres, accurate to about a thousandth of the radius.
 
-    Source: Bădoiu and Clarkson, "Smaller core-sets for balls" (2003): ever shorter steps towards the point
-    that is farthest.
+    Source: Bădoiu and Clarkson, "Smaller core-sets for balls" (2003): shrinking steps towards the
+    farthest point.
     """
     points = np.unique(points, axis=0)
-    middle = points[0]
+    centre = points[0]
     for step in range(2, _NUM_STEPS):
-        away = points - middle
+        away = points - centre
         farthest = int(np.argmax(away[:, 0] ** 2 + away[:, 1] ** 2))
-        middle = middle + away[farthest] / step
-    x, y = middle.tolist()
+        centre = centre + away[farthest] / step
+    x, y = centre.tolist()
     return x, y

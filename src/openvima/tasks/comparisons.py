@@ -1,4 +1,4 @@
-"""Comparisons that teach an invented adjective, and twins on the table that differ in just that respect."""
+"""Comparisons that define an invented adjective, and pairs of objects that differ in that attribute alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,20 +14,20 @@ from openvima.tasks.options import check_count, check_difficulty
 from openvima.tasks.table import NO_SCALE, TableSampler
 
 MEANINGS = ("shorter", "taller", "lighter", "darker")
-"""What an adjective means in published episodes."""
+"""Meanings in published episodes."""
 ALL_MEANINGS = (*MEANINGS, "smaller", "larger")
 NUM_COMPARISONS = 3
-_NO_ID = 0  # of objects that stand in the prompt only
-_ORIGIN = Pose((0.0, 0.0, 0.0))  # pictures of lone objects choose the pose themselves
+_NO_ID = 0  # of objects in the prompt only
+_ORIGIN = Pose((0.0, 0.0, 0.0))  # object images have a pose of their own
 
 
 @dataclass(frozen=True, slots=True)
-class Degree:
-    """One side of a comparison: how an object is altered.
+class Attribute:
+    """One side of a comparison: scale and shade of an object.
 
     Args:
         scale: Factor per axis.
-        shade: Which variant of its texture the object has; None leaves it as it is.
+        shade: Variant of its texture; None: unchanged.
     """
 
     scale: Vector3 = NO_SCALE
@@ -43,80 +43,80 @@ class Degree:
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
-    """What the prompt teaches about an adjective, and which of two twins it asks for.
+class AdjectiveExample:
+    """Comparisons that define an adjective, and the attribute that the prompt asks for.
 
     Args:
         text: The comparisons.
-        fills: What stands in their slots, and in the slots `adv` and `novel_adj` of the request.
-        asked: What the twin is like that is asked for.
-        other: What the other one is like.
+        fills: Values of their slots and of the slots `adv` and `novel_adj` of the request.
+        asked: Attribute of the target.
+        other: Attribute of its twin.
     """
 
     text: str
     fills: dict[str, ObjectImage | str]
-    asked: Degree
-    other: Degree
+    asked: Attribute
+    other: Attribute
 
 
 def comparison_text(num_comparisons: int = NUM_COMPARISONS) -> str:
-    """Return the sentences that compare two objects each, with their slots."""
+    """Return the comparisons, with their slots."""
     return " ".join(
         f"{{demo_blicker_obj_{n}}} is {{novel_adj}} than {{demo_less_blicker_obj_{n}}}."
         for n in range(1, num_comparisons + 1)
     )
 
 
-def sample_lesson(
+def sample_adjective_example(
     table: TableSampler,
     *,
     adjectives: str | Sequence[str],
     meanings: str | Sequence[str],
     num_comparisons: int,
-) -> Lesson:
-    """Draw an adjective, its meaning, and pairs of objects that show it.
+) -> AdjectiveExample:
+    """Draw an adjective, its meaning, and pairs of objects that illustrate it.
 
-    Word, meaning, and whether the "less …" twin is asked for are independent of one another.
+    Word, meaning and whether the request says "less" are independent.
 
     Args:
-        table: Objects and textures come from its pool; nothing is put on it.
+        table: Source of objects and textures; nothing is placed.
         adjectives: Invented words to choose from.
-        meanings: What they may mean, out of `ALL_MEANINGS`.
+        meanings: Possible meanings, out of `ALL_MEANINGS`.
         num_comparisons: Number of pairs, 1 … 9.
 
     Raises:
-        ConfigError: An option is not allowed, or a texture that may be drawn has no light and dark variant.
+        ConfigError: An option is invalid, or a texture of the pool has no light and dark variant.
     """
     check_count("num_comparisons", num_comparisons, low=1, high=9)
     (adjective,) = choose_words(table, "adjectives", adjectives)
     meaning = table.choose(_checked_meanings(table, meanings))
-    more, less = _degrees(table, meaning)
+    more, less = _attributes(table, meaning)
     is_flipped = table.choose((False, True))
     fills: dict[str, ObjectImage | str] = {"adv": "less " if is_flipped else "", "novel_adj": adjective}
     for n in range(1, num_comparisons + 1):
         object_name = table.choose(table.pool.dragged_objects)
         texture = table.choose(table.pool.dragged_textures)
         size = table.sample_size(object_name)
-        for slot, degree in ((f"demo_blicker_obj_{n}", more), (f"demo_less_blicker_obj_{n}", less)):
-            fills[slot] = _image(object_name, degree.texture(texture), size, degree.scale)
+        for slot, attribute in ((f"demo_blicker_obj_{n}", more), (f"demo_less_blicker_obj_{n}", less)):
+            fills[slot] = _image(object_name, attribute.texture(texture), size, attribute.scale)
     asked, other = (less, more) if is_flipped else (more, less)
-    return Lesson(comparison_text(num_comparisons), fills, asked, other)
+    return AdjectiveExample(comparison_text(num_comparisons), fills, asked, other)
 
 
 def place_base_and_twins(
-    table: TableSampler, lesson: Lesson, *, num_distractors: int, difficulty: str
+    table: TableSampler, example: AdjectiveExample, *, num_distractors: int, difficulty: str
 ) -> tuple[Placement, Placement, list[Placement]]:
-    """Put a base and two twins on the table, and distractors of other shapes.
+    """Place a base, the target and its twin, and distractors of other shapes.
 
     Args:
-        table: The table to lay.
-        lesson: How the twins differ.
+        table: Sampler of the scene.
+        example: The attributes of target and twin.
         num_distractors: Distractors of any shape, bases included, besides those of the difficulty.
-        difficulty: "easy"; "medium" and "hard" add an object of another shape that in the respect of the
-            comparison is like the wrong twin or like the one asked for.
+        difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the twin
+            or of the target.
 
     Returns:
-        Base, target, and everything that the target must stay away from, the wrong twin first.
+        Base, target, and all other objects, the twin first.
     """
     check_difficulty(difficulty)
     check_count("num_distractors", num_distractors, high=3)
@@ -129,29 +129,29 @@ def place_base_and_twins(
     shape, other_shape = pool.dragged_objects[first], pool.dragged_objects[second]
     size = table.sample_size(shape)
 
-    def put(what: str, object_name: str, degree: Degree, size: Vector3 | None) -> Placement:
-        look = (object_name, degree.texture(texture))
-        return table.place_one(what, lambda: look, size=size, scale=degree.scale, apart_m=APART_M)
+    def put(what: str, object_name: str, attribute: Attribute, size: Vector3 | None) -> Placement:
+        appearance = (object_name, attribute.texture(texture))
+        return table.place_one(what, lambda: appearance, size=size, scale=attribute.scale, apart_m=APART_M)
 
-    target = put("target", shape, lesson.asked, size)
-    others = [put("twin", shape, lesson.other, size)]
+    target = put("target", shape, example.asked, size)
+    others = [put("twin", shape, example.other, size)]
     if difficulty != "easy":
-        likeness = lesson.asked if difficulty == "hard" else lesson.other
-        others.append(put("object of another shape", other_shape, likeness, size if table.compat else None))
+        attribute = example.asked if difficulty == "hard" else example.other
+        others.append(put("object of another shape", other_shape, attribute, size if table.compat else None))
     draw = of_a_third_shape(table, base, target, (*pool.dragged_textures, *pool.base_textures))
     return base, target, others + place_distractors(table, draw, count=num_distractors)
 
 
-def _degrees(table: TableSampler, meaning: str) -> tuple[Degree, Degree]:
-    """Draw what an object is like to which the adjective applies more, and to which it applies less."""
+def _attributes(table: TableSampler, meaning: str) -> tuple[Attribute, Attribute]:
+    """Draw the attributes of an object that has more and of one that has less of the adjective."""
     if meaning in ("shorter", "taller"):
         height = table.rng.uniform(0.3, 0.4)
-        low, high = Degree((1.0, 1.0, height)), Degree((1.0, 1.0, height + 2.0))
+        low, high = Attribute((1.0, 1.0, height)), Attribute((1.0, 1.0, height + 2.0))
     elif meaning in ("smaller", "larger"):
         width = table.rng.uniform(0.55, 0.6)
-        low, high = Degree((width, width, 1.0)), Degree((width + 0.4, width + 0.4, 1.0))
+        low, high = Attribute((width, width, 1.0)), Attribute((width + 0.4, width + 0.4, 1.0))
     else:
-        low, high = Degree(shade="light"), Degree(shade="dark")
+        low, high = Attribute(shade="light"), Attribute(shade="dark")
     return (low, high) if meaning in ("shorter", "smaller", "lighter") else (high, low)
 
 
@@ -169,7 +169,7 @@ def _checked_meanings(table: TableSampler, meanings: str | Sequence[str]) -> tup
         plain = [spec.name for spec in specs if not (spec.is_dark or spec.dark_variant)]
         if plain:
             raise ConfigError(
-                f"{', '.join(plain)} come in one shade only; for the meanings lighter and darker give "
-                f"textures that have a light and a dark variant."
+                f"{', '.join(plain)} have no light and dark variant, which the meanings lighter "
+                f"and darker need; give other textures."
             )
     return listed

@@ -1,4 +1,4 @@
-"""Ways around a line that lies between blocks and zone: where to push a block first."""
+"""Waypoints around a line between blocks and zone."""
 
 import functools
 import itertools
@@ -10,14 +10,14 @@ from openvima.tasks.pushes import BLOCK_REACH_M, Point, Push
 from openvima.tasks.sweep_view import ends, touches_line
 
 _STEP_M = 0.03
-_BESIDE_M = (0.03, 0.23)  # how far beside a line's end the waypoints lie
+_BESIDE_M = (0.03, 0.23)  # distance of the waypoints from a line's end
 _EDGE_M = 0.05  # left free at the workspace's edge
-_MARGIN_M = 0.005  # a block comes to rest that far from its waypoint
+_MARGIN_M = 0.005  # deviation of a pushed block from its waypoint
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A point from which a block can be pushed straight into the zone.
+    """A point from which a block has a straight path into the zone.
 
     Args:
         point: x, y in metres.
@@ -30,11 +30,11 @@ class Waypoint:
 
 @functools.lru_cache(maxsize=32)
 def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[Waypoint, ...]:
-    """Points beside the lines in front of a zone, as if there were no other blocks.
+    """Waypoints beside the lines in front of a zone, other blocks ignored.
 
     Args:
-        zone: Where blocks have to go, from farther away from the robot.
-        lines: What they may not touch; lines behind the zone are in nobody's way.
+        zone: Goal of the blocks, which come from farther away from the robot.
+        lines: Forbidden zones; lines behind the zone do not matter.
     """
     wider = tuple(
         replace(line, size_x=line.size_x + 2 * _MARGIN_M, size_y=line.size_y + 2 * _MARGIN_M)
@@ -52,7 +52,7 @@ def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[Waypoint, ...]:
 
 
 def _beside(line: Zone, zone: Zone) -> Iterator[Point]:
-    """A grid of points to either side of a line, along the whole way from far away into the zone."""
+    """A grid of points on both sides of a line."""
     xs = _steps(zone.x - zone.size_x / 2 + _EDGE_M, WORKSPACE_HIGH[0] - _EDGE_M)
     first = line.size_y / 2 + _BESIDE_M[0]
     farthest = min(line.size_y / 2 + _BESIDE_M[1], WORKSPACE_HIGH[1] - _EDGE_M)

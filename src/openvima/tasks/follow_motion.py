@@ -1,9 +1,9 @@
-"""`follow_motion`: repeat, move for move, the motion of an object that frames show.
+"""`follow_motion`: repeat the motion of an object in video frames.
 
 Scene:    an object on one of five points of a circle, and a distractor in the middle of it.
 Prompt:   "Follow this motion for {dragged_obj}: {frame_0} {frame_1} {frame_2}." In the frames another
-          distractor is in the middle, and the object walks from point to neighbouring point.
-Success:  every step brings the object within 0.1 m of where the next frame shows it; the first step that
+          distractor is in the middle, and the object moves between neighbouring points.
+Success:  every step brings the object within 0.1 m of its position in the next frame; the first step that
           does not is a failure.
 Source:   VIMA paper, task list of the appendix, "Follow motion".
 """
@@ -38,21 +38,21 @@ def sample(table: TableSampler, *, num_frames: int | None = None, difficulty: st
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_frames: Frames of the motion, 2 … 10; by default as many as the difficulty says.
+        table: Sampler of the scene.
+        num_frames: Frames of the motion, 2 … 10; by default that of the difficulty.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 frames.
     """
     num_frames = checked_num_frames(num_frames, difficulty, high=10)
-    looks = [
+    appearances = [
         (name, texture) for name in table.pool.dragged_objects for texture in table.pool.dragged_textures
     ]
-    look = table.choose(looks)
-    other_looks = [other for other in looks if other != look]
+    appearance = table.choose(appearances)
+    other_appearances = [other for other in appearances if other != appearance]
 
     walk = _sample_walk(table, num_frames)
-    dragged = _put(table, look, walk[0])
-    _put(table, table.choose(other_looks), CENTRE)
-    in_frames = _put(table.blank(), table.choose(other_looks), CENTRE)
+    dragged = _put(table, appearance, walk[0])
+    _put(table, table.choose(other_appearances), CENTRE)
+    in_frames = _put(table.blank(), table.choose(other_appearances), CENTRE)
 
     frames = [(dragged.at(place.moved(dz=dragged.pose.z)),) for place in walk]
     images = frame_images([(*frame, in_frames) for frame in frames])
@@ -70,13 +70,13 @@ def sample(table: TableSampler, *, num_frames: int | None = None, difficulty: st
 
 
 def _sample_walk(table: TableSampler, num_places: int) -> list[Pose]:
-    """Draw places on the circle, each a neighbour of the one before."""
+    """Draw a random walk between neighbouring points of the circle."""
     start = int(table.rng.integers(NUM_POINTS))
     steps = (table.choose((-1, 1)) for _ in range(num_places - 1))
     angles = (2 * math.pi * point / NUM_POINTS for point in accumulate(steps, initial=start))
     return [CENTRE.moved(RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle)) for angle in angles]
 
 
-def _put(table: TableSampler, look: tuple[str, str], pose: Pose) -> Placement:
-    size = table.sample_size(look[0])
-    return table.add(*look, size=size, pose=pose, z=size[2] if table.compat else None)
+def _put(table: TableSampler, appearance: tuple[str, str], pose: Pose) -> Placement:
+    size = table.sample_size(appearance[0])
+    return table.add(*appearance, size=size, pose=pose, z=size[2] if table.compat else None)

@@ -1,10 +1,10 @@
-"""`follow_order`: stack objects in the order that frames show.
+"""`follow_order`: stack objects in the order of video frames.
 
 Scene:    three or four objects of one shape in a row, and distractors of other shapes.
-Prompt:   "Stack objects in this order {frame_0} {frame_1} {frame_2}." The frames show the row without the
+Prompt:   "Stack objects in this order {frame_0} {frame_1} {frame_2}." The frames contain no
           distractors; from frame to frame the topmost object of one stack moves onto another.
-Success:  every step brings the right object within 0.1 m of where the next frame shows it, at any height; the
-          first step that does not is a failure.
+Success:  every step brings the right object within 0.1 m of its position in the next frame, at any height;
+          the first step that does not is a failure.
 Source:   VIMA paper, task list of the appendix, "Follow order".
 """
 
@@ -29,7 +29,7 @@ TEMPLATE = "Stack objects in this order {frames}."
 NUM_BLOCKS = {"easy": 3, "medium": 4, "hard": 4}
 
 Stacks = tuple[tuple[int, ...], ...]
-"""For each place of the row the blocks there, bottom to top."""
+"""Blocks at each place of the row, bottom to top."""
 
 
 @register_task(
@@ -49,9 +49,9 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_blocks: Objects to stack, 2 … 4; by default as many as the difficulty says.
-        num_frames: Frames shown, 2 … 5; by default as many as the difficulty says.
+        table: Sampler of the scene.
+        num_blocks: Objects to stack, 2 … 4; by default that of the difficulty.
+        num_frames: Frames, 2 … 5; by default that of the difficulty.
         num_distractors: Further objects, 0 … 3.
         difficulty: "easy", "medium" or "hard": 3, 4 or 4 objects in 3, 4 or 5 frames.
     """
@@ -62,12 +62,12 @@ def sample(
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     shape = table.choose(objects)
-    looks = table.rng.choice(len(textures), num_blocks, replace=False)
+    appearances = table.rng.choice(len(textures), num_blocks, replace=False)
     stackings = table.choose(all_stackings(num_blocks, num_frames - 1))
     size = table.sample_size(shape)
     blocks = [
-        table.add(shape, textures[look], size=size, pose=place)
-        for look, place in zip(looks, _row(num_blocks), strict=True)
+        table.add(shape, textures[appearance], size=size, pose=place)
+        for appearance, place in zip(appearances, _row(num_blocks), strict=True)
     ]
     other_shapes = [name for name in objects if name != shape]
     table.place(
@@ -92,9 +92,9 @@ def sample(
 
 @functools.cache
 def all_stackings(num_blocks: int, num_moves: int) -> tuple[tuple[Stacks, ...], ...]:
-    """Return every way to make some moves, one topmost block at a time, from a row of single blocks.
+    """Return all sequences of moves of one topmost block at a time, from a row of single blocks.
 
-    Each way is given by the stacks before the first move and after each; moves may undo earlier ones.
+    A sequence lists the stacks before the first move and after each; moves may undo earlier ones.
     """
     ways: list[tuple[Stacks, ...]] = [(tuple((block,) for block in range(num_blocks)),)]
     for _ in range(num_moves):
@@ -112,23 +112,25 @@ def _after_one_move(stacks: Stacks) -> Iterator[Stacks]:
 
 
 def _row(num_places: int) -> list[Pose]:
-    """Places at equal distances from each other and from the ends of the table."""
+    """Evenly spaced places along the table."""
     distance_m = -2 * WORKSPACE_LOW[1] / (num_places + 1)
     return [Pose.planar(0.5, WORKSPACE_LOW[1] + n * distance_m) for n in range(1, num_places + 1)]
 
 
 def _stacked(table: TableSampler, blocks: list[Placement], stacks: Stacks) -> Frame:
-    """Show the blocks in stacks; with `compat` as far apart as their nominal height says."""
-    shown, poses = table.blank(), {}
+    """Place the blocks in stacks; with `compat` spaced by nominal height."""
+    sampler, poses = table.blank(), {}
     for stack, place in zip(stacks, _row(len(stacks)), strict=True):
         for level, index in enumerate(stack):
             block = blocks[index]
             z = (2 * level + 1) * block.size[2] / 2 if table.compat else None
-            lying = shown.add(block.object, block.texture, size=block.size, pose=place, z=z, on_top=level > 0)
-            poses[index] = lying.pose
+            placed = sampler.add(
+                block.object, block.texture, size=block.size, pose=place, z=z, on_top=level > 0
+            )
+            poses[index] = placed.pose
     return [block.at(poses[index]) for index, block in enumerate(blocks)]
 
 
 def _by_place(frame: Frame) -> Frame:
-    """Order blocks along the row, and those of a stack from bottom to top."""
+    """Sort blocks along the row, stacks from bottom to top."""
     return sorted(frame, key=lambda block: (block.pose.y, block.pose.z))

@@ -1,4 +1,4 @@
-"""What tasks share whose prompt shows, frame by frame, what has to be done."""
+"""Shared parts of one-shot video imitation: prompts of video frames."""
 
 import itertools
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ NUM_FRAMES = {"easy": 3, "medium": 4, "hard": 5}
 TOLERANCE = Tolerance(position_m=0.1)
 
 Frame = Sequence[Placement]
-"""The objects to follow, each in the same place in all frames, under the ids that they have on the table."""
+"""The objects to imitate, in the same order in all frames, with their ids on the table."""
 
 
 def checked_num_frames(num_frames: int | None, difficulty: str, *, high: int) -> int:
-    """Return how many frames to show: what was asked for, else what the difficulty says.
+    """Return the number of frames, by default that of the difficulty.
 
     Raises:
         ConfigError: The difficulty is unknown, or the number is not in 2 … `high`.
@@ -27,18 +27,18 @@ def checked_num_frames(num_frames: int | None, difficulty: str, *, high: int) ->
 
 
 def with_frame_slots(template: str, num_frames: int) -> str:
-    """Write the slots {frame_0} {frame_1} … in place of the one slot {frames} of a template."""
+    """Replace the slot {frames} of a template by {frame_0} {frame_1} …."""
     slots = " ".join(f"{{{name}}}" for name in _names(num_frames))
     return template.replace("{frames}", slots)
 
 
 def frame_images(frames: Sequence[Frame]) -> dict[str, SceneImage]:
-    """Return what the slots frame_0, frame_1, … show."""
+    """Return the images of the slots frame_0, frame_1, …."""
     return {name: SceneImage.of(frame) for name, frame in zip(_names(len(frames)), frames, strict=True)}
 
 
 def goals_between(frames: Sequence[Frame]) -> tuple[AtPose, ...]:
-    """Ask for each object that moved from one frame to the next to go where the later one shows it."""
+    """Return a goal for each object that moves between consecutive frames."""
     return tuple(
         AtPose(after.id, after.pose, TOLERANCE)
         for earlier, later in itertools.pairwise(frames)

@@ -1,4 +1,4 @@
-"""Gathering: put all objects that share something with a base into it, and leave the others out."""
+"""Gathering: put all objects with a property of the base into it."""
 
 from collections.abc import Sequence
 
@@ -14,15 +14,15 @@ _SPARE_STEPS = 2
 
 
 def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int | None) -> tuple[int, int]:
-    """Return how many objects go into the base and how many stay out.
+    """Return the number of objects to gather and of distractors.
 
     Args:
-        difficulty: Gives the numbers that are None.
+        difficulty: Default for numbers that are None.
         num_dragged: 1 … 3.
         num_distractors: 0 … 3.
 
     Raises:
-        ConfigError: With what is allowed.
+        ConfigError: An option is invalid.
     """
     check_difficulty(difficulty)
     num_dragged = NUM_DRAGGED[difficulty] if num_dragged is None else num_dragged
@@ -37,28 +37,27 @@ def gathering_problem(
     template: str,
     *,
     base: Placement,
-    dragged_looks: tuple[Sequence[str], Sequence[str]],
+    dragged_appearances: tuple[Sequence[str], Sequence[str]],
     distractor_objects: Sequence[str],
     counts: tuple[int, int],
     after_bowl: bool | None,
 ) -> Problem:
-    """Lay the objects around a base and ask for those that belong into it.
+    """Place the objects and build the problem.
 
-    A distractor has a texture of the pool's dragged ones that no dragged object has.
+    Distractors have textures of the pool's dragged ones that no dragged object has.
 
     Args:
-        table: The table; the base stands on it.
+        table: Sampler of the scene, with the base placed.
         template: The prompt with the slot `base_obj`.
-        base: Where the dragged objects belong.
-        dragged_looks: Shapes and textures of the dragged objects, each drawn on its own.
+        base: The base.
+        dragged_appearances: Shapes and textures of the dragged objects, drawn independently.
         distractor_objects: Shapes of distractors.
         counts: Number of dragged objects and of distractors.
-        after_bowl: Whether the bowl's smaller tolerance holds whatever the base. The original keeps it from
-            the first bowl on for as long as an environment lives. None: only with `compat`, where the pool
-            holds a bowl.
+        after_bowl: Whether the bowl's smaller tolerance applies to every base, as in VIMA-Bench after the
+            first bowl of an environment. None: with `compat` if the pool contains a bowl.
 
     Returns:
-        The problem; not with `compat`, nothing in it is decided at the start.
+        The problem; without `compat`, it is undecided at the start.
     """
     if after_bowl is None:
         after_bowl = table.compat and "bowl" in table.pool.base_objects
@@ -69,7 +68,7 @@ def gathering_problem(
     def draw() -> tuple[str, str]:
         dragged[:] = table.placements[1 : 1 + num_dragged]
         if len(dragged) < num_dragged:
-            objects, textures = dragged_looks
+            objects, textures = dragged_appearances
         else:
             used = {placement.texture for placement in dragged}
             objects = distractor_objects

@@ -1,4 +1,4 @@
-"""How an episode stands: goals met so far, constraints broken, success or failure and why."""
+"""Progress of an episode: goals met, constraints violated, success or failure with its reason."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -20,11 +20,11 @@ from openvima.scene import (
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What has been achieved and what has been spoilt for good.
+    """Open goals, and a permanent violation.
 
     Args:
-        open_goals: Indices into `problem.goals` of those not met yet, ascending. A goal once met stays met.
-        violation: Empty, or one sentence on a constraint that was broken while things moved.
+        open_goals: Indices into `problem.goals` of the open ones, ascending. A goal once met stays met.
+        violation: Empty, or one sentence on a constraint violated during motion.
     """
 
     open_goals: tuple[int, ...]
@@ -32,25 +32,25 @@ class Progress:
 
 
 def begin(problem: Problem) -> Progress:
-    """Return the progress at the start: all goals open, nothing broken."""
+    """Return the progress at the start: all goals open, no violation."""
     return Progress(tuple(range(len(problem.goals))))
 
 
-def needs_watching(problem: Problem) -> bool:
-    """Whether something has to be watched while objects move, not only when they have come to rest."""
+def needs_monitoring(problem: Problem) -> bool:
+    """Whether a constraint must be checked while objects move."""
     return any(isinstance(constraint, NeverTouches) for constraint in problem.constraints)
 
 
-def watch(problem: Problem, progress: Progress, scene: Scene) -> Progress:
-    """Note broken constraints while objects move.
+def monitor(problem: Problem, progress: Progress, scene: Scene) -> Progress:
+    """Check the constraints that hold while objects move.
 
     Args:
         problem: The episode's problem.
-        progress: How things stood before.
-        scene: Where the objects are now, in the middle of a step.
+        progress: Progress so far.
+        scene: The scene during a step.
 
     Returns:
-        The same progress, or one with the first violation written into it.
+        The progress, with the first violation.
     """
     if progress.violation:
         return progress
@@ -59,26 +59,26 @@ def watch(problem: Problem, progress: Progress, scene: Scene) -> Progress:
             object_id = constraint.touching(scene)
             if object_id is not None:
                 return replace(
-                    progress, violation=f"{_called(scene, object_id)} touched the {constraint.name}"
+                    progress, violation=f"{_describe(scene, object_id)} touched the {constraint.name}"
                 )
     return progress
 
 
 def advance(problem: Problem, progress: Progress, scene: Scene) -> tuple[Progress, Outcome]:
-    """Judge the scene after a step.
+    """Evaluate goals and constraints after a step.
 
-    The order of the checks is part of the benchmark: what was broken comes before what was reached, so an
-    object put into its base on top of a distractor is a failure.
+    The order of the checks is part of the benchmark: constraints come before goals, so an object put into its
+    base on top of a distractor is a failure.
 
     Args:
         problem: The episode's problem.
-        progress: How things stood before, with what `watch` noted during the step.
-        scene: Where the objects came to rest.
+        progress: Progress so far, including `monitor` during the step.
+        scene: The scene at rest.
 
     Returns:
         The new progress and the outcome.
     """
-    progress = watch(problem, progress, scene)
+    progress = monitor(problem, progress, scene)
     open_before = progress.open_goals
     progress = replace(progress, open_goals=_still_open(problem, open_before, scene))
     return progress, _outcome(problem, open_before, progress, scene)
@@ -106,7 +106,7 @@ def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress,
 
 
 def _disturbance(problem: Problem, open_before: tuple[int, ...], progress: Progress, scene: Scene) -> str:
-    """One sentence on the first constraint that the scene at rest breaks, or nothing."""
+    """One sentence on the first constraint that the scene at rest violates, or an empty string."""
     for constraint in problem.constraints:
         reason = ""
         if isinstance(constraint, DistractorsApart):
@@ -123,7 +123,7 @@ def _disturbance(problem: Problem, open_before: tuple[int, ...], progress: Progr
 
 
 def _were_completed(goals: Iterable[int], open_before: tuple[int, ...], progress: Progress) -> bool:
-    """Whether this very step fulfilled the last of these goals."""
+    """Whether this step fulfilled the last of these goals."""
     were_open = [index for index in goals if index in open_before]
     return bool(were_open) and not any(index in progress.open_goals for index in were_open)
 
@@ -133,9 +133,9 @@ def _distractor_too_near(
 ) -> str:
     goals = [goal for index in goal_indices if isinstance(goal := problem.goals[index], AtPose)]
     for object_id in object_ids:
-        pose, distractor = scene[object_id].pose, f"distractor {_called(scene, object_id)}"
+        pose, distractor = scene[object_id].pose, f"distractor {_describe(scene, object_id)}"
         for goal in goals:
-            reach, moved = goal.tolerance.position_m, _called(scene, goal.object_id)
+            reach, moved = goal.tolerance.position_m, _describe(scene, goal.object_id)
             if pose.planar_distance(goal.target) < reach:
                 return f"{distractor} is within {reach:g} m of the target of {moved}"
             if goal.tolerance.accepts(scene[goal.object_id].pose, pose, goal.symmetry_rad):
@@ -146,7 +146,7 @@ def _distractor_too_near(
 def _distractor_in_zone(constraint: ZoneKeptClear, scene: Scene) -> str:
     for object_id in constraint.object_ids:
         if any(constraint.zone.contains(point) for point in block_points(scene[object_id].pose)):
-            return f"distractor {_called(scene, object_id)} is in the goal zone"
+            return f"distractor {_describe(scene, object_id)} is in the goal zone"
     return ""
 
 
@@ -155,8 +155,8 @@ def _out_of_order(problem: Problem, constraint: InOrder, progress: Progress, sce
         has_to_wait = bool(progress.open_goals) and progress.open_goals[0] < index
         goal = problem.goals[index]
         if has_to_wait and (index not in progress.open_goals or goal.is_met(scene)):
-            awaited = _called(scene, problem.goals[progress.open_goals[0]].object_id)
-            moved = _called(scene, goal.object_id)
+            awaited = _describe(scene, problem.goals[progress.open_goals[0]].object_id)
+            moved = _describe(scene, goal.object_id)
             return (
                 f"{moved} is where it belongs later" if moved == awaited else f"{moved} came before {awaited}"
             )
@@ -167,14 +167,14 @@ def _wasted_step(problem: Problem, open_before: tuple[int, ...], progress: Progr
     if EveryStepCounts() not in problem.constraints or progress.open_goals != open_before:
         return ""
     awaited = problem.goals[open_before[0]].object_id
-    return f"the step did not bring {_called(scene, awaited)} to where it had to go next"
+    return f"the step did not bring {_describe(scene, awaited)} to where it had to go next"
 
 
 def _left_workspace(problem: Problem, progress: Progress, scene: Scene) -> str:
     for index in progress.open_goals:
         object_id = problem.goals[index].object_id
         if not in_workspace(scene[object_id].pose):
-            return f"{_called(scene, object_id)} left the workspace"
+            return f"{_describe(scene, object_id)} left the workspace"
     return ""
 
 
@@ -182,6 +182,6 @@ def _count(num_met: int) -> str:
     return "1 goal is met" if num_met == 1 else f"{num_met} goals are met"
 
 
-def _called(scene: Scene, object_id: int) -> str:
+def _describe(scene: Scene, object_id: int) -> str:
     placement = scene[object_id]
     return f"object {object_id} ({placement.texture} {placement.object})"

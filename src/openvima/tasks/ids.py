@@ -1,4 +1,4 @@
-"""Object ids that say nothing about an object's role."""
+"""Object ids independent of roles."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,26 +24,28 @@ AnyGoal = TypeVar("AnyGoal", bound=Goal)
 
 
 def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
-    """Deal the ids of a problem's objects out anew.
+    """Permute the ids of a problem's objects.
 
-    Tasks place objects in a fixed order of roles, so ids in that order would point at the target.
+    Tasks place objects in a fixed order of roles, so their order would reveal the target.
 
     Args:
         problem: The problem with ids in the order of placing.
-        rng: Draws one permutation.
+        rng: Generator of the permutation.
 
     Returns:
-        The same problem under the new ids: scene, goals, constraints and prompt images agree.
+        The same problem with new ids in scene, goals, constraints and prompt images.
     """
     new_of = _permutation([placement.id for placement in problem.scene.placements], rng)
-    shown_ids = {
+    prompt_ids = {
         p.id
         for _, fill in problem.prompt.images
         if isinstance(fill, SceneImage)
         for p in fill.scene.placements
     }
-    new_shown = _permutation(sorted(shown_ids), rng)  # one for all images: frames of a motion stay comparable
-    images = tuple((name, _renumbered_image(fill, new_of, new_shown)) for name, fill in problem.prompt.images)
+    new_in_prompt = _permutation(sorted(prompt_ids), rng)  # one for all frames
+    images = tuple(
+        (name, _renumbered_image(fill, new_of, new_in_prompt)) for name, fill in problem.prompt.images
+    )
     return replace(
         problem,
         scene=_renumbered_scene(problem.scene, new_of),
@@ -77,8 +79,8 @@ def _renumbered_constraint(constraint: Constraint, new_of: dict[int, int]) -> Co
     return replace(constraint, object_ids=object_ids)
 
 
-def _renumbered_image(fill: PromptFill, new_of: dict[int, int], new_shown: dict[int, int]) -> PromptFill:
+def _renumbered_image(fill: PromptFill, new_of: dict[int, int], new_in_prompt: dict[int, int]) -> PromptFill:
     if isinstance(fill, SceneImage):
-        return SceneImage(_renumbered_scene(fill.scene, new_shown))
-    shown: Placement = fill.placement
-    return replace(fill, placement=replace(shown, id=new_of.get(shown.id, shown.id)))
+        return SceneImage(_renumbered_scene(fill.scene, new_in_prompt))
+    placement: Placement = fill.placement
+    return replace(fill, placement=replace(placement, id=new_of.get(placement.id, placement.id)))

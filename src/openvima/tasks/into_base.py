@@ -1,4 +1,4 @@
-"""Putting one object into one base: what the tasks of that kind share."""
+"""Shared parts of the tasks that put one object into one base."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,21 +6,21 @@ from openvima.scene import AtPose, DistractorsApart, Placement, Problem, Prompt,
 from openvima.tasks.table import TableSampler
 
 TOLERANCE = Tolerance(position_m=0.1)
-APART_M = TOLERANCE.position_m  # nearer, and the episode would be decided at the start
+APART_M = TOLERANCE.position_m  # below this the episode is decided at the start
 
 
 def place_base_and_target(
     table: TableSampler, *, dragged_textures: Sequence[str], base_textures: Sequence[str]
 ) -> tuple[Placement, Placement]:
-    """Put a base and an object to move on the table.
+    """Place a base and the target.
 
     Args:
-        table: The table to lay.
-        dragged_textures: Textures to choose from for the object.
-        base_textures: Textures to choose from for the base.
+        table: Sampler of the scene.
+        dragged_textures: Textures of the target.
+        base_textures: Textures of the base.
 
     Returns:
-        Base and object.
+        Base and target.
     """
     base_texture = table.choose(base_textures)
     target_texture = table.choose(dragged_textures)
@@ -34,20 +34,20 @@ def place_base_and_target(
 def place_distractors(
     table: TableSampler, draw: Callable[[], tuple[str, str]], *, count: int
 ) -> list[Placement]:
-    """Put distractors on the table, as `draw` gives their object and texture."""
+    """Place distractors; `draw` returns object and texture."""
     return table.place("distractor", draw, count=count, tries=count + 10, apart_m=APART_M)
 
 
 def of_a_third_shape(
     table: TableSampler, base: Placement, target: Placement, textures: Sequence[str]
 ) -> Callable[[], tuple[str, str]]:
-    """Draw distractors of any shape, bases included, but that of the base and that of the target.
+    """Return a function that draws distractors of any shape but those of base and target.
 
     Args:
-        table: Its pool says which shapes there are.
+        table: Source of the shapes.
         base: The base.
-        target: The object to move.
-        textures: Textures to choose from; one that is listed twice comes twice as often.
+        target: The target.
+        textures: Textures; duplicates count twice.
 
     Returns:
         A function that draws object and texture.
@@ -68,7 +68,7 @@ def into_base(
     base: Placement,
     distractors: Sequence[Placement],
 ) -> Problem:
-    """Ask for the target to be put into the base, while no distractor is near either of them."""
+    """Return the problem: target into base, distractors apart."""
     return Problem(
         scene=table.scene(),
         prompt=prompt,

@@ -1,4 +1,4 @@
-"""Compiled loops over the table's raster; the functions that check and explain are in the calling modules."""
+"""Numba kernels over the label raster; the calling modules check the arguments."""
 
 import numpy as np
 from numba import njit
@@ -6,7 +6,7 @@ from numba import njit
 
 @njit(cache=True)
 def mark_free_centres(
-    labels: np.ndarray,  # (R, C) int16, 0 where nothing is
+    labels: np.ndarray,  # (R, C) int16, 0 where free
     side: int,
     run: np.ndarray,  # (C,) int32, scratch
     centres: np.ndarray,  # (R, C) uint8, gets 1 at free centres

@@ -1,6 +1,6 @@
-"""`manipulate_old_neighbor`: put an object into the base, then the one that used to stand beside it.
+"""`manipulate_old_neighbor`: put an object into the base, then its former neighbour.
 
-Scene:    a grid of objects, no two alike, some cells of it empty, and a base to its right.
+Scene:    a grid of distinct objects with some empty cells, and a base to its right.
 Prompt:   "First put {dragged_obj} into {base_obj} then put the object that was previously at its north into
           the same {base_obj}." North is away from the viewer, towards the robot; east is to the right.
 Success:  object, then neighbour, within 0.1 m of the base's origin, while no other object is as near to it or
@@ -41,8 +41,8 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        difficulty: "easy", "medium" or "hard": 2, 3 or 4 columns of which 1, 3 or 4 cells are empty.
+        table: Sampler of the scene.
+        difficulty: "easy", "medium" or "hard": 2, 3 or 4 columns with 1, 3 or 4 empty cells.
     """
     check_difficulty(difficulty)
     pool, num_columns = table.pool, NUM_COLUMNS[difficulty]
@@ -53,12 +53,12 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     chosen = table.rng.choice(len(others), size=NUM_EMPTY[difficulty], replace=False)
     empty_cells = {others[index] for index in chosen}
 
-    looks = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
-    drawn = table.rng.choice(len(looks), size=len(cells), replace=False)
+    appearances = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]
+    drawn = table.rng.choice(len(appearances), size=len(cells), replace=False)
     placed: dict[tuple[int, int], Placement] = {}
     for cell, index in zip(cells, drawn, strict=True):
         if cell not in empty_cells:
-            name, texture = looks[index]
+            name, texture = appearances[index]
             pose = _cell_centre(cell, num_columns)
             placed[cell] = table.add(name, texture, size=table.sample_size(name), pose=pose, fixed=False)
 
@@ -83,14 +83,14 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
 def _choose_neighbour(
     table: TableSampler, cell: tuple[int, int], cells: list[tuple[int, int]]
 ) -> tuple[str, tuple[int, int]]:
-    """Draw one of the directions in which the grid goes on, and the cell there."""
+    """Draw a direction with a neighbouring cell, and that cell."""
     row, column = cell
     found = {name: (row + down, column + right) for name, (down, right) in NEIGHBOURS.items()}
     return table.choose([(name, there) for name, there in found.items() if there in cells])
 
 
 def _cell_centre(cell: tuple[int, int], num_columns: int) -> Pose:
-    """Return where a cell lies; the base stands in the column after the last one."""
+    """Return the centre of a cell; the base is in the column after the last one."""
     (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
     row, column = cell
     x = low_x + (row + 1) * (high_x - low_x) / (NUM_ROWS + 1)

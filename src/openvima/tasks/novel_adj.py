@@ -1,9 +1,9 @@
-"""`novel_adj`: learn an adjective from comparisons, then put the thing into the base to which it applies.
+"""`novel_adj`: put the object to which an adjective applies into the base; comparisons define the adjective.
 
-Scene:    a base and two twins that differ in height or in shade only.
+Scene:    a base, and two objects that differ in height or shade only.
 Prompt:   "{demo_blicker_obj_1} is kobar than {demo_less_blicker_obj_1}. …  Put the less kobar {dragged_obj}
-          into the {base_obj}." Three comparisons, "less" or not; the last two pictures are gray.
-Success:  the right twin within 0.1 m of the base's origin, while the other one is near neither of them.
+          into the {base_obj}." Three comparisons, "less" or not; the last two images are gray.
+Success:  the right object within 0.1 m of the base's origin, while its twin is near neither.
 Source:   VIMA paper, task list of the appendix, "Novel adjective".
 """
 
@@ -15,7 +15,7 @@ from openvima.tasks.comparisons import (
     NUM_COMPARISONS,
     comparison_text,
     place_base_and_twins,
-    sample_lesson,
+    sample_adjective_example,
 )
 from openvima.tasks.into_base import into_base
 from openvima.tasks.novel_words import ADJECTIVES, gray_image
@@ -43,21 +43,23 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        adjectives: Invented adjectives to choose from.
-        meanings: What they may mean: "shorter", "taller", "lighter", "darker", "smaller", "larger".
-        num_comparisons: Pairs of objects that show the meaning, 1 … 9.
+        table: Sampler of the scene.
+        adjectives: Invented adjectives.
+        meanings: Possible meanings: "shorter", "taller", "lighter", "darker", "smaller", "larger".
+        num_comparisons: Pairs of objects that illustrate the meaning, 1 … 9.
         num_distractors: Further objects of other shapes, 0 … 3.
-        difficulty: "easy"; "medium" and "hard" add an object of another shape that is, in what the adjective
-            is about, like the wrong twin or like the right one.
+        difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
+            twin or of the target.
     """
-    lesson = sample_lesson(table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons)
+    example = sample_adjective_example(
+        table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
+    )
     base, target, others = place_base_and_twins(
-        table, lesson, num_distractors=num_distractors, difficulty=difficulty
+        table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(
-        f"{lesson.text} {REQUEST}",
-        **lesson.fills,
+        f"{example.text} {REQUEST}",
+        **example.fills,
         dragged_obj=gray_image(target),
         base_obj=gray_image(base),
     )

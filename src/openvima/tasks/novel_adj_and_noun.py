@@ -1,10 +1,10 @@
-"""`novel_adj_and_noun`: put a thing into a base, all three words of the request being invented.
+"""`novel_adj_and_noun`: put an object into a base; adjective and both nouns are invented.
 
-Scene:    a base, two twins that differ in height or in shade only, and two distractors of other shapes.
+Scene:    a base, two objects that differ in height or shade only, and two distractors of other shapes.
 Prompt:   "This is a wug {dragged_obj}. This is a dax {base_obj}. {demo_blicker_obj_1} is kobar than
           {demo_less_blicker_obj_1}. …  Put the less kobar wug into the dax." The first two sentences come in
-          either order, their pictures are gray; three comparisons, "less" or not.
-Success:  the right twin within 0.1 m of the base's origin, while nothing else is near either of them.
+          either order, their images are gray; three comparisons, "less" or not.
+Success:  the right object within 0.1 m of the base's origin, while nothing else is near either of them.
 Source:   VIMA paper, task list of the appendix, "Novel adjective and noun".
 """
 
@@ -16,7 +16,7 @@ from openvima.tasks.comparisons import (
     NUM_COMPARISONS,
     comparison_text,
     place_base_and_twins,
-    sample_lesson,
+    sample_adjective_example,
 )
 from openvima.tasks.into_base import into_base
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS, choose_words, gray_image, in_any_order
@@ -46,24 +46,26 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        adjectives: Invented adjectives to choose from.
-        nouns: Invented nouns to choose from, at least two.
-        meanings: What the adjectives may mean: "shorter", "taller", "lighter", "darker", "smaller", "larger".
-        num_comparisons: Pairs of objects that show the meaning, 1 … 9.
+        table: Sampler of the scene.
+        adjectives: Invented adjectives.
+        nouns: Invented nouns, at least two.
+        meanings: Possible meanings: "shorter", "taller", "lighter", "darker", "smaller", "larger".
+        num_comparisons: Pairs of objects that illustrate the meaning, 1 … 9.
         num_distractors: Further objects of other shapes, 0 … 3.
-        difficulty: "easy"; "medium" and "hard" add an object of another shape that is, in what the adjective
-            is about, like the wrong twin or like the right one.
+        difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
+            twin or of the target.
     """
-    lesson = sample_lesson(table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons)
+    example = sample_adjective_example(
+        table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
+    )
     noun, base_noun = choose_words(table, "nouns", nouns, count=2)
     introductions = in_any_order(table, INTRODUCTIONS)
     base, target, others = place_base_and_twins(
-        table, lesson, num_distractors=num_distractors, difficulty=difficulty
+        table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(
-        " ".join((*introductions, lesson.text, REQUEST)),
-        **lesson.fills,
+        " ".join((*introductions, example.text, REQUEST)),
+        **example.fills,
         novel_name_1=noun,
         novel_name_2=base_noun,
         dragged_obj=gray_image(target),

@@ -1,8 +1,8 @@
-"""`novel_noun`: put one thing into another after their invented names were told by picture.
+"""`novel_noun`: put one object into another; images define their invented names.
 
-Scene:    a base, an object to move, and distractors of other shapes, which may themselves look like bases.
+Scene:    a base, an object to move, and distractors of other shapes, which may be bases.
 Prompt:   "This is a wug {base_obj}. This is a zup {dragged_obj_1}. Put a zup into a wug." The first two
-          sentences come in either order; their pictures are gray, so that names stand for shapes.
+          sentences come in either order; their images are gray, so that names refer to shapes.
 Success:  object within 0.1 m of the base's origin, while no distractor is as near to either of them.
 Source:   VIMA paper, task list of the appendix, "Novel noun".
 """
@@ -36,10 +36,10 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        nouns: Invented nouns to choose from, at least two.
+        table: Sampler of the scene.
+        nouns: Invented nouns, at least two.
         num_distractors: Further objects, 0 … 3.
-        difficulty: "easy", or "medium" and "hard", which mix and exchange the textures of the two roles.
+        difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
     check_count("num_distractors", num_distractors, high=3)
     noun, base_noun = choose_words(table, "nouns", nouns, count=2)

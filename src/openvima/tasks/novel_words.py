@@ -1,4 +1,4 @@
-"""Invented words, and pictures that show what a noun means by shape alone."""
+"""Invented words, and gray object images."""
 
 import re
 from collections.abc import Sequence
@@ -17,30 +17,30 @@ _WORD = re.compile(r"[^\W\d_]+(-[^\W\d_]+)*")
 def choose_words(
     table: TableSampler, option: str, words: str | Sequence[str], *, count: int = 1
 ) -> tuple[str, ...]:
-    """Draw different words from a list that a user may have given.
+    """Draw distinct words.
 
     Args:
-        table: The draw is made by its generator.
-        option: Name of the option that holds the list.
-        words: The list; a single word counts as a list of one.
-        count: How many to draw.
+        table: Source of the draws.
+        option: Name of the option, for errors.
+        words: A word or a list of words.
+        count: Number of words.
 
     Raises:
-        ConfigError: The list holds fewer words, one twice, or something that is no word.
+        ConfigError: The list is too short, or has duplicates or invalid words.
     """
     listed = (words,) if isinstance(words, str) else tuple(words)
     wrong = [word for word in listed if not (isinstance(word, str) and _WORD.fullmatch(word))]
     if wrong or len(set(listed)) < max(len(listed), count):
-        shown = ", ".join(map(repr, wrong or listed)) or "nothing"
-        raise ConfigError(f"{option} holds {shown}; give at least {count} different words, letters only.")
+        given = ", ".join(map(repr, wrong or listed)) or "nothing"
+        raise ConfigError(f"{option} holds {given}; give at least {count} different words, letters only.")
     return tuple(listed[int(i)] for i in table.rng.permutation(len(listed))[:count])
 
 
 def in_any_order(table: TableSampler, sentences: Sequence[str]) -> list[str]:
-    """Return sentences in an order drawn at random."""
+    """Return sentences in random order."""
     return [sentences[int(i)] for i in table.rng.permutation(len(sentences))]
 
 
 def gray_image(placement: Placement) -> ObjectImage:
-    """Show the shape of an object and nothing else: no texture, no scale."""
+    """Return an image of the shape alone, without texture and scale."""
     return ObjectImage(replace(placement, texture=NEUTRAL_TEXTURE, scale=NO_SCALE))

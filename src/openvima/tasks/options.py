@@ -1,4 +1,4 @@
-"""Checks of the options that tasks share."""
+"""Validation of task options."""
 
 from typing import Literal, get_args
 
@@ -11,33 +11,33 @@ Difficulty = Literal["easy", "medium", "hard"]
 
 
 def check_difficulty(difficulty: str) -> None:
-    """Refuse anything but "easy", "medium" and "hard".
+    """Check a difficulty.
 
     Raises:
-        ConfigError: With the words that are allowed.
+        ConfigError: It is unknown.
     """
     if difficulty not in get_args(Difficulty):
         raise ConfigError(unknown_name("difficulty", difficulty, get_args(Difficulty)))
 
 
 def check_count(name: str, count: object, *, high: int, low: int = 0) -> None:
-    """Refuse a number of objects outside `low` … `high`.
+    """Check that a number of objects is in `low` … `high`.
 
     Raises:
-        ConfigError: With the range that is allowed.
+        ConfigError: It is not.
     """
     if isinstance(count, bool) or not isinstance(count, int) or not low <= count <= high:
         raise ConfigError(f"{name} is {count!r}; give an integer from {low} to {high}.")
 
 
-def check_share(name: str, share: object) -> None:
-    """Refuse anything but a number from 0 to 1.
+def check_fraction(name: str, value: object) -> None:
+    """Check that a number is in 0 … 1.
 
     Raises:
-        ConfigError: With the range that is allowed.
+        ConfigError: It is not.
     """
-    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
-        raise ConfigError(f"{name} is {share!r}; give a number from 0 to 1.")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise ConfigError(f"{name} is {value!r}; give a number from 0 to 1.")
 
 
 def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -45,7 +45,7 @@ def textures_by_difficulty(table: TableSampler, difficulty: str) -> tuple[tuple[
 
     Args:
         table: Its pool is used; "medium" draws once.
-        difficulty: "easy": the pool's; "medium": both from one of the two lists; "hard": exchanged.
+        difficulty: "easy": the pool's; "medium": both from one of the two lists; "hard": swapped.
     """
     check_difficulty(difficulty)
     pool: Pool = table.pool

@@ -1,4 +1,4 @@
-"""The scripted solver: one action at a time, from the true poses of all objects."""
+"""The scripted oracle: one action at a time, from the true poses of all objects."""
 
 import math
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ TIED_TO_TABLE = -1
 
 @dataclass(frozen=True, slots=True)
 class OracleDecision:
-    """An action and what it is about, for policies that learn to point.
+    """An action and the objects that it refers to.
 
     Args:
         action: The action.
         pick_id: Id of the object to pick or to sweep.
-        place_id: Id of the object that the place is tied to: the base, the object itself if it only turns,
-            the line in front of which blocks are swept. -1 if the place is tied to the table.
+        place_id: Id of the object that the place pose is relative to: the base, the object itself for a
+            rotation, the line in front of which blocks are swept. -1: relative to the table.
     """
 
     action: Action
@@ -39,30 +39,28 @@ def oracle_action(
     rng: np.random.Generator,
     compat: bool = False,
 ) -> OracleDecision:
-    """Return the next action: what has to be done first, then towards the first open goal.
-
-    Of blocks to sweep the easiest one comes first.
+    """Return the next action: prerequisites first, then the first open goal; of blocks to sweep the easiest.
 
     Args:
         problem: The episode's problem.
-        progress: Which goals are still open.
-        scene: Where the objects are now.
-        assets: Where their shapes come from.
-        rng: Drawn from only with `compat`.
-        compat: Act as the original benchmark's oracle does: pick at a random visible point, turn every object
-            to its target's heading, sweep blocks in order without looking.
+        progress: The open goals.
+        scene: The current scene.
+        assets: Asset pack.
+        rng: Used only with `compat`.
+        compat: Act as VIMA-Bench's oracle does: pick at a random visible point, rotate every object to its
+            target's heading, sweep blocks in order and ignore obstacles.
 
     Returns:
-        The action, which stays within the bounds of actions.
+        The action, within the bounds of actions.
 
     Raises:
-        OracleError: No goal is open, or the object to move cannot be seen from above.
+        OracleError: No goal is open, or the object to move is not visible from above.
     """
     goals = [problem.goals[index] for index in progress.open_goals]
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
-    chores = [goal for goal in problem.prerequisites if not goal.is_met(scene)]
-    goal = (chores or goals)[0]
+    pending = [goal for goal in problem.prerequisites if not goal.is_met(scene)]
+    goal = (pending or goals)[0]
     if isinstance(goal, AtPose):
         point = visible_point(scene, goal.object_id, assets=assets, rng=rng if compat else None)
         action = _pick_and_place(goal, scene[goal.object_id].pose, point, compat=compat)
@@ -77,29 +75,28 @@ def oracle_action(
 def visible_point(
     scene: Scene, object_id: int, *, assets: Assets, rng: np.random.Generator | None = None
 ) -> tuple[float, float]:
-    """Return a point at which an object is topmost, seen from straight above.
+    """Return a point where an object is visible from straight above.
 
     Args:
-        scene: Where the objects are.
-        object_id: The object to be picked.
-        assets: Where shapes come from.
-        rng: If given, any visible cell of the raster is drawn, and its lower corner returned, as the original
-            benchmark does. Else the answer is the centre of the cell that is farthest from the object's
-            visible outline; among equals the nearest to the object's origin.
+        scene: The scene.
+        object_id: The object to pick.
+        assets: Asset pack.
+        rng: If given, return the lower corner of a random visible cell, as VIMA-Bench does. Else return the
+            centre of the cell farthest from the object's visible outline, nearest to its origin among equals.
 
     Returns:
         x, y in metres.
 
     Raises:
-        OracleError: Nothing of the object can be seen within the workspace.
+        OracleError: The object is not visible within the workspace.
     """
     from openvima.render.labels import CELL_M, cell_centres, label_raster
 
     labels = label_raster(scene, assets)
     rows, columns = np.nonzero(labels == object_id)
     if not len(rows):
-        shown = f"object {object_id} ({scene[object_id].texture} {scene[object_id].object})"
-        raise OracleError(f"nothing of {shown} can be seen from above, so it cannot be picked.")
+        name = f"object {object_id} ({scene[object_id].texture} {scene[object_id].object})"
+        raise OracleError(f"{name} is not visible from above, so it cannot be picked.")
     points = cell_centres(rows, columns)
     if rng is not None:
         x, y = (points[rng.integers(len(points))] - CELL_M / 2).tolist()
@@ -113,7 +110,7 @@ def visible_point(
 
 
 def _squared_depths(labels: np.ndarray, object_id: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Squared distances of an object's cells to the nearest cell that is not of it, in the order given."""
+    """Squared distances of an object's cells to the nearest other cell, in the order given."""
     from openvima.tasks.kernels import squared_depths
 
     top, left = int(rows.min()), int(columns.min())
@@ -123,10 +120,10 @@ def _squared_depths(labels: np.ndarray, object_id: int, rows: np.ndarray, column
 
 
 def _pick_and_place(goal: AtPose, pose: Pose, point: tuple[float, float], *, compat: bool) -> Action:
-    """Action that brings the object's origin to the target's, with the least turn that the goal asks for."""
+    """Action that moves the object's origin to the target's, with the smallest rotation that it needs."""
     in_base = goal.relative_to is not None and goal.relative_to != goal.object_id
     if in_base and goal.tolerance.yaw_rad is None and not compat:
-        turn_rad = 0.0  # any heading is fine there
+        turn_rad = 0.0  # any heading is allowed
     else:
         turn_rad = math.remainder(goal.target.yaw_rad - pose.yaw_rad, 2 * math.pi)
     offset = Pose.planar(0, 0, turn_rad) @ Pose((point[0] - pose.x, point[1] - pose.y, 0.0))

@@ -1,4 +1,4 @@
-"""What the oracle was measured to solve, as recorded with this version of the tasks."""
+"""Measured success of the oracle with this version of the tasks."""
 
 import functools
 import json
@@ -9,14 +9,14 @@ ORACLE_FILE = "oracle_success.json"
 
 
 def oracle_record(task: str) -> Mapping[str, Mapping[str, int]]:
-    """Return how many evaluation episodes of a task the oracle solved.
+    """Return the number of evaluation episodes of a task that the oracle solved.
 
     Args:
         task: Name of the task.
 
     Returns:
-        Level to {"episodes", "successes"}; empty for a task that was not measured. `benchmarks/oracle.py`
-        measures and writes the record.
+        Level to {"episodes", "successes"}; empty for a task without a measurement. `benchmarks/oracle.py`
+        writes the record.
     """
     return _records().get(task, {})
 

@@ -1,10 +1,10 @@
-"""`pick_in_order_then_restore`: carry an object from base to base in the pictured order, then back home.
+"""`pick_in_order_then_restore`: move an object from base to base in the order of the prompt, then back.
 
-Scene:    six bases of one shape, each of another texture, in two rows; an object lies in one of them.
+Scene:    six bases of one shape, each of another texture, in two rows; an object in one of them.
 Prompt:   "Put {dragged_obj} into {base_obj_1} then {base_obj_2}. Finally restore it into its original
           container."
-Success:  object within 0.05 m of the origin of each pictured base in turn, then of the base that it came
-          from; it must not be in a pictured base before its turn.
+Success:  object within 0.05 m of the origin of each base of the prompt in turn, then of its original base;
+          it must not be in a base of the prompt before its turn.
 Source:   VIMA paper, task list of the appendix, "Visual memory".
 """
 
@@ -28,12 +28,12 @@ TEMPLATE = "Put {{dragged_obj}} into {targets}. Finally restore it into its orig
 TOLERANCE = Tolerance(position_m=0.05)
 NUM_ROWS, NUM_COLUMNS = 2, 3
 NUM_TARGETS = {"easy": 2, "medium": 2, "hard": 3}
-_DEEP_BASES = ("bowl", "pallet")  # over which the original's object hovers higher
+_DEEP_BASES = ("bowl", "pallet")  # over which the object hovers higher in VIMA-Bench
 _SPARE_STEPS = 2
 
 
 def template(num_targets: int) -> str:
-    """Return the prompt with its slots for that many pictured bases."""
+    """Return the prompt with slots for that many bases."""
     return TEMPLATE.format(targets=" then ".join(f"{{base_obj_{n + 1}}}" for n in range(num_targets)))
 
 
@@ -44,8 +44,8 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        same_bases: Whether all bases have one shape and size, so that only textures tell them apart.
+        table: Sampler of the scene.
+        same_bases: Whether all bases have one shape and size and differ in texture only.
         difficulty: "easy" and "medium" ask for two bases, "hard" for three.
     """
     check_difficulty(difficulty)
@@ -72,10 +72,10 @@ def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "e
         start = table.centred_in(source, name, size) if source.object == "bowl" else centres[0]
         dragged = table.add(name, texture, size=size, pose=start, fixed=False, on_top=True)
     targets = [add_base(index) for index in range(1, len(centres))][:num_targets]
-    shown = {f"base_obj_{n}": ObjectImage(target) for n, target in enumerate(targets, 1)}
+    images = {f"base_obj_{n}": ObjectImage(target) for n, target in enumerate(targets, 1)}
     return Problem(
         scene=table.scene(),
-        prompt=Prompt.parse(template(num_targets), dragged_obj=ObjectImage(dragged), **shown),
+        prompt=Prompt.parse(template(num_targets), dragged_obj=ObjectImage(dragged), **images),
         goals=tuple(
             AtPose(dragged.id, base.pose, TOLERANCE, relative_to=base.id) for base in (*targets, source)
         ),

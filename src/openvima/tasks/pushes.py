@@ -1,6 +1,6 @@
-"""What one push of a small block covers, and the sweep that makes it.
+"""Geometry of pushes of small blocks, and of the sweeps that perform them.
 
-Of 480 simulated pushes of 0.05 to 0.3 m, the blade's middle up to 15 mm beside the block's, no point of a
+Of 480 simulated pushes of 0.05 to 0.3 m, the spatula's middle up to 15 mm beside the block's, no point of a
 block strayed more than 24 mm to the side, and no block came to rest more than 9 mm beyond its end.
 """
 
@@ -13,18 +13,18 @@ from openvima.tasks.footprints import Rectangle
 
 Point = tuple[float, float]
 
-STANDOFF_M = 0.006  # how far behind a block's centre a sweep starts: the blade then clears any of its corners
-SHORTFALL_M = 0.0325  # how far short of a sweep's end the centre of the pushed block comes to rest
+STANDOFF_M = 0.006  # distance behind a block's centre where a sweep starts: clears all corners
+SHORTFALL_M = 0.0325  # distance of the pushed block's centre from a sweep's end
 BLOCK_HALF_M, BLOCK_REACH_M = 0.015, 0.0212  # from a block's centre to its face and to its corner
-OVERRUN_M = 0.009  # how far a block may slide on
+OVERRUN_M = 0.009  # how far a block may slide
 
-_ASIDE_M = 0.015  # how far beside a block's centre the middle of the blade may be
+_ASIDE_M = 0.015  # lateral offset of the spatula from a block's centre
 
-_BLADE_AT_M = 0.02  # where the blade comes down, behind the start of a sweep
-_BLADE_HALF_THICKNESS_M = 0.0025
-_BLADE_HALF_WIDTH_M = 0.025
-_BLADE_GAP_M = 0.002  # kept free on either side of the blade
-_DRIFT_M = 0.005  # what a block moves to the side while it turns
+_SPATULA_OFFSET_M = 0.02  # distance behind the start of a sweep where the spatula is lowered
+_SPATULA_HALF_THICKNESS_M = 0.0025
+_SPATULA_HALF_WIDTH_M = 0.025
+_SPATULA_GAP_M = 0.002  # clearance on either side of the spatula
+_DRIFT_M = 0.005  # lateral shift of a block that rotates
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +47,10 @@ class Push:
     """A block's centre pushed in a straight line.
 
     Args:
-        start, end: Where from and where to, x and y in metres.
+        start, end: x and y in metres.
         ux, uy: Unit vector of the push.
         length_m: Its length.
-        aside_m: How far to the left of the line the middle of the blade is.
+        aside_m: Offset of the spatula's centre to the left of the line.
     """
 
     start: Point
@@ -62,7 +62,7 @@ class Push:
 
     @staticmethod
     def between(start: Point, end: Point) -> "Push":
-        """Return the push from one point to another; one of no length points towards the robot."""
+        """Return the push between two points; one of zero length points towards the robot."""
         dx, dy = end[0] - start[0], end[1] - start[1]
         length = math.hypot(dx, dy)
         ux, uy = (dx / length, dy / length) if length > 0 else (-1.0, 0.0)
@@ -74,38 +74,36 @@ class Push:
         return math.atan2(self.uy, self.ux)
 
     def variants(self) -> Iterator["Push"]:
-        """The same push with the blade in the middle of the block, to the left of it and to the right.
-
-        Left out are those that actions, which stay in the workspace, cannot describe; behind a block at its
-        edge a sweep may start a little nearer.
-        """
+        """Variants with the spatula centred, to the left and to the right, within the bounds of actions."""
         for aside_m in (0.0, _ASIDE_M, -_ASIDE_M):
             push = replace(self, aside_m=aside_m)
             if is_inside(push._first(), -STANDOFF_M) and is_inside(push._last(), 0.0):
                 yield push
 
     def sweep(self, goal: InZone) -> Sweep:
-        """Return the sweep that pushes the goal's block like this."""
+        """Return the sweep that performs this push of the goal's block."""
         return Sweep(goal, self._first(), self._last())
 
-    def blade_at_start(self) -> Rectangle:
-        """Where the blade comes down."""
-        x, y = self._point(-STANDOFF_M - _BLADE_AT_M)
-        return Rectangle(x, y, self.yaw_rad, _BLADE_HALF_THICKNESS_M, _BLADE_HALF_WIDTH_M + _BLADE_GAP_M)
+    def spatula_at_start(self) -> Rectangle:
+        """Footprint of the spatula when it is lowered."""
+        x, y = self._point(-STANDOFF_M - _SPATULA_OFFSET_M)
+        return Rectangle(
+            x, y, self.yaw_rad, _SPATULA_HALF_THICKNESS_M, _SPATULA_HALF_WIDTH_M + _SPATULA_GAP_M
+        )
 
-    def blade_way(self) -> Rectangle:
-        """Everything that the blade covers."""
-        behind = STANDOFF_M + _BLADE_AT_M + _BLADE_HALF_THICKNESS_M
-        half_width = _BLADE_HALF_WIDTH_M + _BLADE_GAP_M
+    def spatula_area(self) -> Rectangle:
+        """Area that the spatula covers."""
+        behind = STANDOFF_M + _SPATULA_OFFSET_M + _SPATULA_HALF_THICKNESS_M
+        half_width = _SPATULA_HALF_WIDTH_M + _SPATULA_GAP_M
         return self._strip(behind, -BLOCK_HALF_M, half_width=half_width, aside_m=self.aside_m)
 
-    def block_way(self) -> Rectangle:
-        """Everything that the block covers."""
+    def block_area(self) -> Rectangle:
+        """Area that the block covers."""
         return self._strip(BLOCK_REACH_M, BLOCK_REACH_M + OVERRUN_M, half_width=BLOCK_REACH_M + _DRIFT_M)
 
-    def ways(self) -> tuple[Rectangle, Rectangle]:
-        """Everything that is covered: the ways of blade and block."""
-        return self.blade_way(), self.block_way()
+    def swept_areas(self) -> tuple[Rectangle, Rectangle]:
+        """Areas of spatula and block."""
+        return self.spatula_area(), self.block_area()
 
     def _first(self) -> Point:
         return self._point(-STANDOFF_M)
@@ -114,7 +112,7 @@ class Push:
         return self._point(self.length_m + SHORTFALL_M)
 
     def _point(self, along_m: float) -> Point:
-        """Point on the line of the blade's middle, so far after the block's start."""
+        """Point on the spatula's line, measured from the block's start."""
         x, y = self.start
         return x + along_m * self.ux - self.aside_m * self.uy, y + along_m * self.uy + self.aside_m * self.ux
 
@@ -128,7 +126,7 @@ class Push:
 
 
 def is_inside(point: Point, edge_m: float) -> bool:
-    """Whether a point lies in the workspace and keeps off its edge; if negative, so far outside will do."""
+    """Whether a point is in the workspace, shrunk by `edge_m` on every side."""
     return all(
         low + edge_m <= value <= high - edge_m
         for value, low, high in zip(point, WORKSPACE_LOW, WORKSPACE_HIGH, strict=True)

@@ -1,6 +1,6 @@
-"""`rearrange`: move objects to the places shown in a picture, clearing a target first if something is on it.
+"""`rearrange`: move objects to their places in a goal image, and clear a blocked target first.
 
-Scene:    one to three objects away from their targets. A single object has a distractor, which stands on the
+Scene:    one to three objects away from their targets. A single object has a distractor, which is on the
           target in half of the episodes.
 Prompt:   "Rearrange to this {scene}."
 Success:  each object was within 0.1 m of its target, and at the end the distractor is as near to neither
@@ -28,9 +28,9 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with chances 0.4, 0.4 and 0.2.
-        conflict_rate: Share of single objects whose target is taken by the distractor.
+        table: Sampler of the scene.
+        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with probabilities 0.4, 0.4 and 0.2.
+        conflict_rate: Probability that the distractor is on the target of a single object.
         distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
             those of the level.
         difficulty: "easy", "medium" or "hard"; without effect, as in the benchmark.
@@ -44,8 +44,8 @@ def sample(
     )
     return Problem(
         scene=table.scene(),
-        prompt=Prompt.parse(TEMPLATE, scene=arrangement.picture),
+        prompt=Prompt.parse(TEMPLATE, scene=arrangement.goal_image),
         goals=arrangement.goals,
         constraints=(DistractorsApart(arrangement.distractor_ids, at_end=True),),
-        prerequisites=arrangement.chores,
+        prerequisites=arrangement.prerequisites,
     )

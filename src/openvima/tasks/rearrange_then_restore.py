@@ -1,4 +1,4 @@
-"""`rearrange_then_restore`: move objects to the places shown in a picture, then back to where they were.
+"""`rearrange_then_restore`: move objects to their places in a goal image, then back.
 
 Scene:    as in `rearrange`: one to three objects; a single one has a distractor, often on its target.
 Prompt:   "Rearrange objects to this setup {scene} and then restore."
@@ -28,9 +28,9 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with chances 0.4, 0.4 and 0.2.
-        conflict_rate: Share of single objects whose target is taken by the distractor.
+        table: Sampler of the scene.
+        num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with probabilities 0.4, 0.4 and 0.2.
+        conflict_rate: Probability that the distractor is on the target of a single object.
         distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
             those of the level.
         restore_distractor: Ask for the distractor at its original place as well, after the objects were at
@@ -54,9 +54,9 @@ def sample(
     restore = tuple(AtPose(start.id, start.pose, TOLERANCE) for start in to_restore)
     return Problem(
         scene=table.scene(),
-        prompt=Prompt.parse(TEMPLATE, scene=arrangement.picture),
+        prompt=Prompt.parse(TEMPLATE, scene=arrangement.goal_image),
         goals=(*arrange, *restore),
         constraints=(apart,),
         stages=(len(arrange), len(restore)),
-        prerequisites=arrangement.chores,
+        prerequisites=arrangement.prerequisites,
     )

@@ -1,30 +1,32 @@
-"""Rearranging: objects, the places where they have to go, and a distractor that may stand in the way."""
+"""Rearrangement: objects, their targets, and a distractor that may block a target."""
 
 from dataclasses import dataclass
 
 from openvima.catalog import TEXTURE_SETS
 from openvima.errors import ConfigError, SamplingError, unknown_name
 from openvima.scene import AtPose, Placement, SceneImage, Tolerance
-from openvima.tasks.options import check_count, check_difficulty, check_share
+from openvima.tasks.options import check_count, check_difficulty, check_fraction
 from openvima.tasks.table import Reject, TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
 NUM_OBJECTS_WEIGHTS = (0.4, 0.4, 0.2)
 MAX_OBJECTS = len(NUM_OBJECTS_WEIGHTS)
-CONFLICT_RATE = 0.5  # share of distractors that stand on the target
-_APART_M = TOLERANCE.position_m + 0.01  # of a distractor from starts; 10 mm for an object put down askew
+CONFLICT_RATE = 0.5  # probability that the distractor is on the target
+_APART_M = (
+    TOLERANCE.position_m + 0.01
+)  # of a distractor from starts; 10 mm margin for an object put down askew
 _TRIES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Arrangement:
-    """What has to be rearranged.
+    """A rearrangement problem.
 
     Args:
-        starts: The objects where they stand.
-        targets: The same objects, in the same order, where they have to go.
-        distractor: A further object, where it stands; only if there is one object to move.
-        parking: The distractor at a place where it is in nobody's way, if it stands on the target.
+        starts: The objects at their starts.
+        targets: The same objects at their targets.
+        distractor: The distractor; only with a single object.
+        parking: The distractor at a free place, if it is on the target.
     """
 
     starts: tuple[Placement, ...]
@@ -33,8 +35,8 @@ class Arrangement:
     parking: Placement | None = None
 
     @property
-    def picture(self) -> SceneImage:
-        """The objects where they have to go, without the distractor."""
+    def goal_image(self) -> SceneImage:
+        """The objects at their targets, without the distractor."""
         return SceneImage.of(self.targets)
 
     @property
@@ -43,8 +45,8 @@ class Arrangement:
         return tuple(AtPose(target.id, target.pose, TOLERANCE) for target in self.targets)
 
     @property
-    def chores(self) -> tuple[AtPose, ...]:
-        """What the oracle has to clear away first."""
+    def prerequisites(self) -> tuple[AtPose, ...]:
+        """Clearing of the target by the oracle."""
         return () if self.parking is None else (AtPose(self.parking.id, self.parking.pose, TOLERANCE),)
 
     @property
@@ -61,24 +63,24 @@ def sample_arrangement(
     distractor_textures: str,
     difficulty: str,
 ) -> Arrangement:
-    """Lay a table of objects to be rearranged.
+    """Sample a rearrangement.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         num_objects: Objects to move, 1 … 3; None draws the number.
-        conflict_rate: Share of the distractors that stand on the target.
+        conflict_rate: Probability that the distractor is on the target.
         distractor_textures: "all", or "pool": those of the objects to move.
         difficulty: Checked, without effect.
 
     Returns:
-        The arrangement; its objects and the distractor are on the table, at their starts.
+        The arrangement, with all objects placed at their starts.
 
     Raises:
-        ConfigError: An option is not allowed.
-        SamplingError: Something found no place.
+        ConfigError: An option is invalid.
+        SamplingError: No placement was found.
     """
     check_difficulty(difficulty)
-    check_share("conflict_rate", conflict_rate)
+    check_fraction("conflict_rate", conflict_rate)
     textures_of = {"all": TEXTURE_SETS["T"], "pool": table.pool.dragged_textures}
     if distractor_textures not in textures_of:
         raise ConfigError(unknown_name("choice of distractor_textures", distractor_textures, textures_of))
@@ -100,27 +102,27 @@ def sample_arrangement(
     ][::-1]
     if num_objects > 1:
         return Arrangement(tuple(starts), tuple(targets))
-    look = (
+    appearance = (
         table.choose([name for name in objects if name != targets[0].object]),
         table.choose(textures_of[distractor_textures]),
     )
     if table.rng.random() < conflict_rate:
-        distractor, parking = _on_target(table, look, starts[0], targets[0])
+        distractor, parking = _on_target(table, appearance, starts[0], targets[0])
     else:
         distractor = table.place_one(
-            "distractor", lambda: look, tries=_TRIES, apart_m=_APART_M, reject=in_the_way
+            "distractor", lambda: appearance, tries=_TRIES, apart_m=_APART_M, reject=in_the_way
         )
         parking = None
     return Arrangement(tuple(starts), tuple(targets), distractor, parking)
 
 
 def _on_target(
-    table: TableSampler, look: tuple[str, str], start: Placement, target: Placement
+    table: TableSampler, appearance: tuple[str, str], start: Placement, target: Placement
 ) -> tuple[Placement, Placement]:
-    """Put the distractor exactly where the object has to go; return it there and where it may be parked."""
-    size = table.sample_size(look[0])
-    z = target.pose.z if table.compat else None  # the benchmark lets it start at the height of the object
-    distractor = table.add(*look, size=size, pose=target.pose, z=z)
+    """Place the distractor on the target; return it there and at its parking place."""
+    size = table.sample_size(appearance[0])
+    z = target.pose.z if table.compat else None  # as in VIMA-Bench, at the height of the object
+    distractor = table.add(*appearance, size=size, pose=target.pose, z=z)
     if not table.compat and is_in_the_way(distractor, start):
         raise SamplingError("the distractor on the target crowds the object's start.")
     in_the_way = _in_the_way_of([target], table)
@@ -129,7 +131,7 @@ def _on_target(
 
 
 def _in_the_way_of(targets: list[Placement], table: TableSampler) -> Reject:
-    """Return a test for places that crowd a target or, unless `compat`, count as being there."""
+    """Return a test for placements that crowd or, without `compat`, reach a target."""
     reach = 0.0 if table.compat else TOLERANCE.position_m
 
     def is_blocking(place: Placement) -> bool:

@@ -1,4 +1,4 @@
-"""The list of tasks: each task file registers its `sample` function here."""
+"""Registry of tasks: each task file registers its `sample` function."""
 
 import functools
 import importlib
@@ -19,23 +19,23 @@ from openvima.scene import EndEffector, Problem
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
-EXTRA_STEPS = 2  # that a policy is given beyond the oracle's
+EXTRA_STEPS = 2  # of a policy beyond the oracle's
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
 
 
 @dataclass(frozen=True, slots=True)
 class TaskSpec:
-    """What is known of a task without sampling it.
+    """Description of a task.
 
     Args:
         name: Name as in "rotate".
         family: Group of the paper under which results are reported, as in "visual_reasoning".
-        template: The prompt with its slots, as documentation.
+        template: The prompt with its slots.
         end_effector: "suction" or "spatula".
-        pools: What the task may draw from, for each level at which it is defined.
-        oracle_max_steps: Steps within which the oracle must be done.
+        pools: Objects and textures at each level where the task is defined.
+        oracle_max_steps: Step limit of the oracle.
         summary: First line of the task file's docstring.
-        sample: Draws one `Problem` from a `TableSampler`; keyword arguments are the task's options.
+        sample: Samples a `Problem` with a `TableSampler`; keyword arguments are the task's options.
     """
 
     name: str
@@ -54,12 +54,12 @@ class TaskSpec:
 
     @property
     def max_steps(self) -> int:
-        """Steps that a policy is given: two more than the oracle."""
+        """Step limit of a policy: two more than the oracle's."""
         return self.oracle_max_steps + EXTRA_STEPS
 
     @property
     def options(self) -> dict[str, Any]:  # Any: options are of whatever type the task declares
-        """Names and defaults of what a user may vary."""
+        """Names and defaults of the task's options."""
         parameters = inspect.signature(self.sample).parameters.values()
         return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
 
@@ -77,7 +77,7 @@ class TaskSpec:
         raise LevelError(f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}.")
 
     def pool(self, level: str | None = None) -> Pool:
-        """Return what the task may draw from at a level, by default at its first.
+        """Return the objects and textures at a level, by default the first.
 
         Raises:
             LevelError: There is no such level, or the task is not defined there.
@@ -97,21 +97,21 @@ def register_task(
     end_effector: EndEffector = "suction",
     pools: Mapping[Level, Pool] | None = None,
 ) -> Callable[[SampleFunction], SampleFunction]:
-    """Decorate the `sample` function of a task file, which puts the task on the list.
+    """Register a task; decorates its `sample` function.
 
     Args:
         name: Name of the task.
         family: Group of the paper under which results are reported, as in "visual_reasoning".
         template: The prompt with its slots.
-        oracle_max_steps: Steps within which the oracle must be done.
+        oracle_max_steps: Step limit of the oracle.
         end_effector: Tool of the arm.
-        pools: What the task may draw from at each level; by default the catalogue's entry of that name.
+        pools: Objects and textures at each level; by default those of the catalogue.
 
     Returns:
-        The decorator; it returns the function unchanged.
+        The decorator, which returns the function unchanged.
 
     Raises:
-        ValueError: Another function has that name already.
+        ValueError: The name is already registered.
     """
 
     def register(sample: SampleFunction) -> SampleFunction:
@@ -140,7 +140,7 @@ def _summary(sample: SampleFunction) -> str:
 
 
 def task_spec(name: str) -> TaskSpec:
-    """Return what is registered under a name.
+    """Return a registered task.
 
     Raises:
         UnknownTaskError: There is no such task; the message suggests the nearest name.
@@ -161,9 +161,9 @@ def list_tasks() -> tuple[str, ...]:
 
 @functools.cache
 def _load_task_files() -> None:
-    """Import all modules of this package, so that a task is found by its file being there, and users' own."""
+    """Import all modules of this package, then entry points and files of users."""
     for module in pkgutil.iter_modules([str(Path(__file__).parent)], f"{__package__}."):
-        if not module.name.endswith(".kernels"):  # compiled code, loaded when an episode is sampled
+        if not module.name.endswith(".kernels"):  # Numba, imported when an episode is sampled
             importlib.import_module(module.name)
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         entry_point.load()
@@ -172,7 +172,7 @@ def _load_task_files() -> None:
 
 
 def _import_file(path: Path) -> None:
-    """Import a task file that lies anywhere.
+    """Import a task file from any folder.
 
     Raises:
         ConfigError: There is no such Python file.
@@ -180,8 +180,8 @@ def _import_file(path: Path) -> None:
     spec = importlib.util.spec_from_file_location(f"openvima_task_{path.stem}", path)
     if spec is None or spec.loader is None or not path.is_file():
         raise ConfigError(
-            f"{TASK_FILES_VARIABLE} names {str(path)!r}, which is no Python file; "
-            f"give paths with {os.pathsep!r} in between."
+            f"{TASK_FILES_VARIABLE} names {str(path)!r}, which is not a Python file; "
+            f"give paths separated by {os.pathsep!r}."
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

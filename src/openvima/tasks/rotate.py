@@ -1,4 +1,4 @@
-"""`rotate`: turn an object on the spot by an angle given in degrees.
+"""`rotate`: rotate an object in place by an angle in degrees.
 
 Scene:    one object without rotational symmetry and distractors of another texture, all free on the table.
 Prompt:   "Rotate the {dragged_obj} 60 degrees."
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
 from openvima.tasks.options import check_count, check_difficulty
 from openvima.tasks.registry import register_task
+from openvima.tasks.rotation import ANGLES_DEG, check_angles, check_asymmetric, rotation_goal
 from openvima.tasks.table import TableSampler
-from openvima.tasks.turning import ANGLES_DEG, check_angles, check_turnable, turn_goal
 
 TEMPLATE = "Rotate the {dragged_obj} {angle_in_degree} degrees."
 TOLERANCE_M = 0.1
@@ -30,7 +30,7 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         angles_deg: Angles to choose from; positive turns clockwise seen from above.
         num_distractors: Further objects, 0 … 6; by default as many as the difficulty says.
         difficulty: "easy", "medium" or "hard": 1, 3 or 5 distractors.
@@ -39,7 +39,7 @@ def sample(
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     check_count("num_distractors", num_distractors, high=6)
     check_angles(angles_deg)
-    check_turnable(table.pool)
+    check_asymmetric(table.pool)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     angle_deg = table.choose(angles_deg)
@@ -55,6 +55,6 @@ def sample(
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(TEMPLATE, dragged_obj=ObjectImage(target), angle_in_degree=round(angle_deg)),
-        goals=(turn_goal(target, angle_deg, position_m=TOLERANCE_M),),
+        goals=(rotation_goal(target, angle_deg, position_m=TOLERANCE_M),),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
     )

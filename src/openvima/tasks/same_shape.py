@@ -30,10 +30,10 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_dragged: Objects that belong into the base, 1 … 3; by default as many as the difficulty says.
-        num_distractors: Further objects, 0 … 3; by default as many as the difficulty says.
-        after_bowl: Whether the bowl's tolerance holds for every base; see `gathering_problem`.
+        table: Sampler of the scene.
+        num_dragged: Objects to put into the base, 1 … 3; by default that of the difficulty.
+        num_distractors: Distractors, 0 … 3; by default that of the difficulty.
+        after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
     counts = object_counts(difficulty, num_dragged, num_distractors)
@@ -46,7 +46,7 @@ def sample(
         table,
         TEMPLATE,
         base=base,
-        dragged_looks=(alike, pool.dragged_textures),
+        dragged_appearances=(alike, pool.dragged_textures),
         distractor_objects=different,
         counts=counts,
         after_bowl=after_bowl,
@@ -54,7 +54,7 @@ def sample(
 
 
 def _by_profile(pool: Pool, base_object: str) -> tuple[list[str], list[str]]:
-    """Part the dragged objects into those with the profile of a base and those with another one."""
+    """Split the dragged objects by whether they have the profile of a base."""
     profile = object_spec(base_object).profile
     alike = [name for name in pool.dragged_objects if object_spec(name).profile == profile]
     different = [name for name in pool.dragged_objects if object_spec(name).profile != profile]

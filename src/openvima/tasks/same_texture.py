@@ -27,10 +27,10 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_dragged: Objects that belong into the base, 1 … 3; by default as many as the difficulty says.
-        num_distractors: Further objects, 0 … 3; by default as many as the difficulty says.
-        after_bowl: Whether the bowl's tolerance holds for every base; see `gathering_problem`.
+        table: Sampler of the scene.
+        num_dragged: Objects to put into the base, 1 … 3; by default that of the difficulty.
+        num_distractors: Distractors, 0 … 3; by default that of the difficulty.
+        after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """
     counts = object_counts(difficulty, num_dragged, num_distractors)
@@ -41,7 +41,7 @@ def sample(
         table,
         TEMPLATE,
         base=base,
-        dragged_looks=(pool.dragged_objects, (texture,)),
+        dragged_appearances=(pool.dragged_objects, (texture,)),
         distractor_objects=pool.dragged_objects,
         counts=counts,
         after_bowl=after_bowl,

@@ -1,7 +1,7 @@
-"""`scene_understanding`: put the object of one texture, shown in a picture, into the base of another texture.
+"""`scene_understanding`: put the object of one texture in a scene image into the base of another texture.
 
 Scene:    a base, an object to move, and distractors: another shape in the object's texture, which only the
-          picture tells from the object, or a base of the same shape in another texture.
+          image excludes, or a base of the same shape in another texture.
 Prompt:   "Put the red swirl object in {scene} into the tiles object."
 Success:  object within 0.1 m of the base's origin, while no distractor is as near to either of them.
 Source:   VIMA paper, task list of the appendix, "Scene understanding".
@@ -23,19 +23,19 @@ def sample(
     table: TableSampler,
     *,
     num_distractors: int = 1,
-    num_pictured_distractors: int = 1,
+    num_prompt_distractors: int = 1,
     difficulty: str = "easy",
 ) -> Problem:
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        num_distractors: Further objects on the table, 0 … 3.
-        num_pictured_distractors: Further objects in the picture, 0 … 3.
-        difficulty: "easy", or "medium" and "hard", which mix and exchange the textures of the two roles.
+        table: Sampler of the scene.
+        num_distractors: Distractors on the table, 0 … 3.
+        num_prompt_distractors: Distractors in the scene image, 0 … 3.
+        difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
     check_count("num_distractors", num_distractors, high=3)
-    check_count("num_pictured_distractors", num_pictured_distractors, high=3)
+    check_count("num_prompt_distractors", num_prompt_distractors, high=3)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     textures = (*dragged_textures, *base_textures)
 
@@ -59,23 +59,23 @@ def sample(
     prompt = Prompt.parse(
         TEMPLATE,
         dragged_texture=target.texture,
-        scene=_picture(table, target, textures, num_pictured_distractors),
+        scene=_prompt_scene(table, target, textures, num_prompt_distractors),
         base_texture=base.texture,
     )
     return into_base(table, prompt, target=target, base=base, distractors=distractors)
 
 
-def _picture(
+def _prompt_scene(
     table: TableSampler, target: Placement, textures: tuple[str, ...], num_distractors: int
 ) -> SceneImage:
-    """Show the object to move somewhere else, among anything that has not its texture."""
-    shown, objects = table.blank(), (*table.pool.dragged_objects, *table.pool.base_objects)
+    """Sample an image of the target among objects of other textures."""
+    sampler, objects = table.blank(), (*table.pool.dragged_objects, *table.pool.base_objects)
     others = [texture for texture in textures if texture != target.texture]
-    shown.place_one("pictured object", lambda: (target.object, target.texture), size=target.size)
-    shown.place(
-        "pictured distractor",
-        lambda: (shown.choose(objects), shown.choose(others)),
+    sampler.place_one("prompt object", lambda: (target.object, target.texture), size=target.size)
+    sampler.place(
+        "prompt distractor",
+        lambda: (sampler.choose(objects), sampler.choose(others)),
         count=num_distractors,
         tries=num_distractors + 10,
     )
-    return SceneImage.of(shown.placements)
+    return SceneImage.of(sampler.placements)

@@ -1,4 +1,4 @@
-"""Random generators: one for each domain, task, level, seed and purpose, none related to another."""
+"""Independent random generators for each domain, task, level, seed and purpose."""
 
 import functools
 import hashlib
@@ -25,7 +25,7 @@ def make_rng(
         task: Name of the task.
         level: "train" or "L1" to "L4".
         seed: The episode's number, 0 … 2⁶³ − 1.
-        purpose: What the draws are for, such as "scene", "ids" or "oracle"; purposes share no draws.
+        purpose: Use of the draws, such as "scene", "ids" or "oracle"; purposes are independent.
         attempt: Number of the redraw, 0 for the first try.
 
     Returns:
@@ -57,6 +57,6 @@ def checked_seed(seed: object) -> int:
 
 @functools.lru_cache(maxsize=256)
 def _name_words(name: str) -> tuple[int, int]:
-    """Two 32-bit words that stand for a name; unlike `hash`, the same in every process."""
+    """Two 32-bit words of a stable hash of a name."""
     digest = hashlib.sha256(name.encode("utf-8")).digest()
     return int.from_bytes(digest[:4], "little"), int.from_bytes(digest[4:8], "little")

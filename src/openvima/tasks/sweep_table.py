@@ -1,4 +1,4 @@
-"""What the two sweeping tasks share: who takes part, area and line, and the problem made of them."""
+"""Shared parts of the sweeping tasks: roles, area, line and problem."""
 
 import math
 from dataclasses import dataclass
@@ -25,21 +25,21 @@ MAGNIFICATION = 7  # of the small block in the prompt
 CORNERS: tuple[Corner, Corner] = (
     (0.57, -0.22),
     (0.58, 0.03),
-)  # m, lower ones of the squares that hold blocks
+)  # m, lower corners of the squares of blocks
 SWEPT_SPREAD_M = 0.18
 NUM_SWEPT_WEIGHTS = {"easy": (0.5, 0.25, 0.25), "medium": (0.25, 0.5, 0.25), "hard": (0.25, 0.25, 0.5)}
 NUMBER_WORDS = ("one", "two", "three")
-_FACING = -math.pi / 2  # the area opens to its own +y, which has to point to the world's +x
+_FACING = -math.pi / 2  # rotates the area's open side, +y, to +x
 
 
 @dataclass(frozen=True, slots=True)
-class Cast:
-    """Who takes part.
+class Roles:
+    """Objects of a sweeping task.
 
     Args:
         num_swept: Number of blocks to sweep; there are as many distractors.
-        swept_texture, bounds_texture, line_texture, distractor_texture: What they look like.
-        swept_corner, distractor_corner: Lower corners, x and y in metres, of where the blocks lie.
+        swept_texture, bounds_texture, line_texture, distractor_texture: Their textures.
+        swept_corner, distractor_corner: Lower corners of the blocks' squares, x and y in metres.
     """
 
     num_swept: int
@@ -51,12 +51,12 @@ class Cast:
     distractor_corner: Corner
 
 
-def draw_cast(table: TableSampler, difficulty: str) -> Cast:
-    """Draw how many blocks there are, what everything looks like and which blocks lie on which side.
+def sample_roles(table: TableSampler, difficulty: str) -> Roles:
+    """Draw the number of blocks, the textures and the sides.
 
     Args:
-        table: The table to lay.
-        difficulty: "easy", "medium" or "hard": more and more often two or three blocks.
+        table: Sampler of the scene.
+        difficulty: "easy", "medium" or "hard": increasing probability of two or three blocks.
 
     Raises:
         ConfigError: There is no such difficulty.
@@ -69,19 +69,19 @@ def draw_cast(table: TableSampler, difficulty: str) -> Cast:
     line = table.choose([texture for texture in pool.base_textures if texture != bounds])
     corners = CORNERS if rng.random() < 0.5 else CORNERS[::-1]
     distractor = table.choose([texture for texture in pool.dragged_textures if texture != swept])
-    return Cast(num_swept, swept, bounds, line, distractor, *corners)
+    return Roles(num_swept, swept, bounds, line, distractor, *corners)
 
 
-def lay_flat(
+def place_flat(
     table: TableSampler, object_name: str, texture: str, *, x: float, scale: tuple[float, float]
 ) -> Placement:
-    """Lay area or line across the table's middle, so that the area opens away from the robot.
+    """Place area or line across the table's middle; the area opens away from the robot.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         object_name: Name in the catalogue.
         texture: Name in the catalogue.
-        x: Where its centre goes, in metres.
+        x: Its centre in metres.
         scale: Factors on its first two nominal sizes: depth and width of the area, length and width of the
             line.
     """
@@ -92,7 +92,7 @@ def lay_flat(
 
 def sweep_problem(
     table: TableSampler,
-    cast: Cast,
+    roles: Roles,
     *,
     template: str,
     bounds: Placement,
@@ -101,30 +101,30 @@ def sweep_problem(
     zone_marker: Placement,
     distractor_spread_m: float,
 ) -> Problem:
-    """Scatter the blocks, draw how many of them are to be swept, and put the problem together.
+    """Scatter the blocks, draw the quantifier and build the problem.
 
     Args:
-        table: The table, area and line on it.
-        cast: Who takes part.
+        table: Sampler of the scene, with area and line placed.
+        roles: Objects of the task.
         template: The prompt with its slots.
         bounds: The area.
         line: The line that no block to sweep may touch.
-        zone: Where blocks have to go.
-        zone_marker: `bounds` or `line`, whichever the zone moves with.
-        distractor_spread_m: Side of the square in which the distractors lie.
+        zone: Goal of the blocks.
+        zone_marker: `bounds` or `line`: the object that the zone is relative to.
+        distractor_spread_m: Side of the distractors' square.
 
     Raises:
-        SamplingError: The blocks found no place.
+        SamplingError: No valid group of blocks was found.
     """
 
     def scatter(texture: str, corner: Corner, spread_m: float) -> list[Placement]:
         return scattered_blocks(
-            table, texture, corner=corner, spread_m=spread_m, count=cast.num_swept, outside=zone
+            table, texture, corner=corner, spread_m=spread_m, count=roles.num_swept, outside=zone
         )
 
-    swept = scatter(cast.swept_texture, cast.swept_corner, SWEPT_SPREAD_M)
-    distractors = scatter(cast.distractor_texture, cast.distractor_corner, distractor_spread_m)
-    words = ("any", *NUMBER_WORDS[: cast.num_swept], "all")
+    swept = scatter(roles.swept_texture, roles.swept_corner, SWEPT_SPREAD_M)
+    distractors = scatter(roles.distractor_texture, roles.distractor_corner, distractor_spread_m)
+    words = ("any", *NUMBER_WORDS[: roles.num_swept], "all")
     word = table.choose(words)
     ids = tuple(block.id for block in swept)
     forbidden = Zone(line.pose.x, line.pose.y, line.size[1], line.size[0])
@@ -142,5 +142,5 @@ def sweep_problem(
             NeverTouches(ids, forbidden, "line"),
             ZoneKeptClear(tuple(block.id for block in distractors), zone),
         ),
-        num_required={"any": 1, "all": cast.num_swept}.get(word) or words.index(word),
+        num_required={"any": 1, "all": roles.num_swept}.get(word) or words.index(word),
     )

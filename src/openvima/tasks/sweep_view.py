@@ -1,4 +1,4 @@
-"""What a planner of sweeps sees of a scene: blocks, lines, and which pushes keep clear of them."""
+"""Blocks and lines of a scene, and collision checks of pushes, for planning sweeps."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -8,21 +8,21 @@ from openvima.tasks.footprints import Rectangle
 from openvima.tasks.pushes import Point, Push
 
 _END_STEP_M = 0.015
-_COLUMN_STEP_M = 0.05  # two blocks pushed one after the other along the same way have room
-_END_EDGE_M = 0.03  # ends keep this far from the zone's edge
+_COLUMN_STEP_M = 0.05  # room for two blocks pushed along the same line
+_END_EDGE_M = 0.03  # distance of ends from the zone's edge
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Blocks and lines of a scene, as far as sweeps care.
+    """Blocks and lines of a scene.
 
     Args:
         goals: The open goals, those with the block nearest to its zone first.
-        footprints: Ids of all blocks, and where they lie.
+        footprints: Footprints of all blocks, by id.
         met_ids: Blocks of goals that are met.
-        lines: What no block of a goal may touch.
-        overlap_m: How far a way may overlap blocks that were swept already, in metres. They stay counted, and
-            the blade stops too far before a line to push them onto it.
+        lines: Forbidden zones of the goals' blocks.
+        overlap_m: Allowed overlap of a push with blocks swept already, in metres. Their goals stay met, and
+            the spatula stops too early to push them onto a line.
     """
 
     goals: tuple[InZone, ...]
@@ -33,7 +33,7 @@ class View:
 
     @staticmethod
     def of(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
-        """Look at a scene with these open goals."""
+        """Build the view of a scene with these open goals."""
 
         def distance(goal: InZone) -> float:
             return scene[goal.object_id].pose.planar_distance(Pose.planar(goal.zone.x, goal.zone.y))
@@ -47,21 +47,21 @@ class View:
         )
 
     def place(self, goal: InZone) -> Point:
-        """Where the centre of a goal's block is."""
+        """Centre of a goal's block."""
         footprint = self.footprints[goal.object_id]
         return footprint.x, footprint.y
 
     def after(self, goal: InZone, push: Push) -> "View":
-        """Return what one will see once the goal's block was pushed."""
+        """Return the view after a push of the goal's block."""
         block = replace(self.footprints[goal.object_id], x=push.end[0], y=push.end[1], yaw_rad=push.yaw_rad)
         return replace(self, footprints=self.footprints | {goal.object_id: block})
 
     def only(self, goal: InZone) -> "View":
-        """Return the same with no other goal open."""
+        """Return the same with no other goal."""
         return replace(self, goals=(goal,))
 
     def alone(self, goal: InZone) -> "View":
-        """Return the same with no other goal open and no other block there."""
+        """Return the same with no other goal and no other block."""
         return replace(self.only(goal), footprints={goal.object_id: self.footprints[goal.object_id]})
 
     def others(self, goal: InZone) -> Iterator[tuple[int, Rectangle]]:
@@ -69,10 +69,10 @@ class View:
         return ((i, block) for i, block in self.footprints.items() if i != goal.object_id)
 
     def cleared(self, goal: InZone, push: Push) -> Push | None:
-        """Make a push of the goal's block move no other one, beyond `overlap_m`, and touch no line.
+        """Find a variant of a push of the goal's block without collisions, except for `overlap_m`.
 
         Returns:
-            The push, if need be with the blade a little aside; None if it is in any case in the way.
+            The push, possibly with the spatula off-centre; None if every variant collides.
         """
         if touches_line(push, self.lines):
             return None
@@ -80,28 +80,28 @@ class View:
             (block, -self.overlap_m if object_id in self.met_ids else 0.0)
             for object_id, block in self.others(goal)
         ]
-        block_way = push.block_way()
-        if any(block_way.comes_near(other, margin) for other, margin in others):
+        block_area = push.block_area()
+        if any(block_area.comes_near(other, margin) for other, margin in others):
             return None
         for shifted in push.variants():
-            blade, blade_way = shifted.blade_at_start(), shifted.blade_way()
-            if not any(blade_way.comes_near(o, m) or blade.meets_box_around(o) for o, m in others):
+            spatula, spatula_area = shifted.spatula_at_start(), shifted.spatula_area()
+            if not any(spatula_area.comes_near(o, m) or spatula.meets_box_around(o) for o, m in others):
                 return shifted
         return None
 
 
 def touches_line(push: Push, lines: Sequence[Zone]) -> bool:
-    """Whether a block that is pushed may touch one of the lines."""
-    way = push.block_way()
-    return any(way.comes_near(Rectangle.of_zone(line)) for line in lines)
+    """Whether a pushed block may touch a line."""
+    area = push.block_area()
+    return any(area.comes_near(Rectangle.of_zone(line)) for line in lines)
 
 
 def ends(zone: Zone, start: Point) -> Iterator[Point]:
-    """Points in a zone to push a block to: the middle, then ever farther beside it, then deeper and nearer.
+    """Points in a zone to push a block to: the middle, then farther to the sides, then deeper and nearer.
 
     Args:
         zone: The zone.
-        start: Where the block is; of two points to the left and to the right, its own side comes first.
+        start: Position of the block; its own side comes first.
     """
     side = 1 if start[1] >= zone.y else -1
     num_steps = int((zone.size_y / 2 - _END_EDGE_M) / _END_STEP_M + 1e-9)

@@ -2,20 +2,20 @@
 
 Scene:    one to three blocks to sweep, as many of another texture, the area open towards the blocks, a line.
 Prompt:   "Sweep two {swept_obj} into {bounds} without exceeding {constraint}."
-Success:  exactly the asked number lies between the line and the mouth of the area, while no such block ever
+Success:  exactly the requested number is between the line and the mouth of the area, while no such block ever
           touched the line and no other block is there. "Any" means one, "all" all of one texture.
 Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction".
 """
 
 from openvima.scene import Placement, Problem, Zone
 from openvima.tasks.registry import register_task
-from openvima.tasks.sweep_table import draw_cast, lay_flat, sweep_problem
+from openvima.tasks.sweep_table import place_flat, sample_roles, sweep_problem
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without exceeding {constraint}."
 AREA_X = 0.41  # m, centre of the area
 AREA_SCALE, LINE_SCALE = (1.35, 1.35), (1.35, 1.0)
-LINE_RANGE = (0.25, 0.6)  # where the line may lie, as shares of the area's depth from its back
+LINE_RANGE = (0.25, 0.6)  # position of the line, as fractions of the area's depth from its back
 ZONE_SHIFT_M = 0.015  # of the zone towards the blocks, against what is drawn; published results depend on it
 DISTRACTOR_SPREAD_M = 0.09
 
@@ -31,16 +31,16 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         difficulty: "easy", "medium" or "hard": more and more often two or three blocks.
     """
-    cast = draw_cast(table, difficulty)
-    bounds = lay_flat(table, table.pool.base_objects[0], cast.bounds_texture, x=AREA_X, scale=AREA_SCALE)
-    low, high = (AREA_X + (share - 0.5) * bounds.size[0] for share in LINE_RANGE)
-    line = lay_flat(table, "line", cast.line_texture, x=table.rng.uniform(low, high), scale=LINE_SCALE)
+    roles = sample_roles(table, difficulty)
+    bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
+    low, high = (AREA_X + (fraction - 0.5) * bounds.size[0] for fraction in LINE_RANGE)
+    line = place_flat(table, "line", roles.line_texture, x=table.rng.uniform(low, high), scale=LINE_SCALE)
     return sweep_problem(
         table,
-        cast,
+        roles,
         template=TEMPLATE,
         bounds=bounds,
         line=line,

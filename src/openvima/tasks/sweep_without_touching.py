@@ -3,14 +3,14 @@
 Scene:    one to three blocks to sweep, as many of another texture, the area open towards the blocks, a line
           across its mouth.
 Prompt:   "Sweep two {swept_obj} into {bounds} without touching {constraint}."
-Success:  exactly the asked number lies in the area, while no such block ever touched the line and no other
+Success:  exactly the requested number is in the area, while no such block ever touched the line and no other
           block is there. "Any" means one, "all" all of one texture. What bounds the area is drawn, not solid.
 Source:   VIMA paper, task list of the appendix, "Visual constraint satisfaction".
 """
 
 from openvima.scene import Problem, Zone
 from openvima.tasks.registry import register_task
-from openvima.tasks.sweep_table import draw_cast, lay_flat, sweep_problem
+from openvima.tasks.sweep_table import place_flat, sample_roles, sweep_problem
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Sweep {det} {swept_obj} into {bounds} without touching {constraint}."
@@ -32,16 +32,16 @@ def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        difficulty: "easy": the line leaves a gap at either end of the mouth; "medium" and "hard": it is
-            longer than the mouth is wide, and there are more often two or three blocks.
+        table: Sampler of the scene.
+        difficulty: "easy": the line leaves gaps on both sides of the mouth; "medium" and "hard": it is
+            wider than the mouth, and two or three blocks are more frequent.
     """
-    cast = draw_cast(table, difficulty)
-    bounds = lay_flat(table, table.pool.base_objects[0], cast.bounds_texture, x=AREA_X, scale=AREA_SCALE)
-    line = lay_flat(table, "line", cast.line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
+    roles = sample_roles(table, difficulty)
+    bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
+    line = place_flat(table, "line", roles.line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
     return sweep_problem(
         table,
-        cast,
+        roles,
         template=TEMPLATE,
         bounds=bounds,
         line=line,

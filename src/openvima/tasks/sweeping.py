@@ -1,9 +1,9 @@
-"""Planning of sweeps: which block to push, from where and how far, so that nothing else is moved.
+"""Planning of sweeps that push one block without moving others.
 
-The plan is pure geometry: a sweep is clear if its way comes near no other block and the block's track near
-no line. Of the first sweeps of 500 episodes of `sweep_without_exceeding`, 95 % take the nearest block
-straight to the middle of the zone; the others go elsewhere in it, move a block aside or part a tight group.
-A line at the zone's mouth is passed in one sweep where there is room, else with one stop beside the line.
+The plan is geometric: a sweep is clear if its area is not near another block, nor that of the block near a
+line. Of the first sweeps of 500 episodes of `sweep_without_exceeding`, 95 % push the nearest block straight
+to the middle of the zone; the others push elsewhere in it, move a block aside or separate a group. A line
+at the zone's mouth is passed in one sweep where there is room, else with one waypoint beside the line.
 """
 
 import itertools
@@ -13,22 +13,22 @@ from dataclasses import replace
 
 from openvima.scene import InZone, Problem, Scene
 from openvima.tasks.detours import waypoints
-from openvima.tasks.parting import parking_pushes, parting_sweeps
 from openvima.tasks.published_sweeps import published_sweep
 from openvima.tasks.pushes import Push, Sweep
+from openvima.tasks.separation import parking_pushes, separating_sweeps
 from openvima.tasks.sweep_view import View, ends
 
-_NUDGE_M, _SHOVE_M = 0.012, 0.03  # how far a way may overlap a block that counts already
+_NUDGE_M, _SHOVE_M = 0.012, 0.03  # allowed overlap with blocks of goals already met
 
 
 def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compat: bool = False) -> Sweep:
-    """Choose the next sweep, the first of as few as possible.
+    """Choose the next sweep of a short plan.
 
     Args:
         goals: The open goals, at least one.
-        scene: Where the objects are now.
+        scene: The current scene.
         problem: The episode's problem.
-        compat: Follow the original benchmark: push the first open block by its rule, whatever is in the way.
+        compat: Push the first open block by VIMA-Bench's rule and ignore obstacles.
     """
     if compat:
         return published_sweep(goals[0], scene, problem)
@@ -41,14 +41,14 @@ def plan_sweep(goals: Sequence[InZone], scene: Scene, problem: Problem, *, compa
         _aside_sweeps(view),
         _direct_sweeps(shoving),
         _detours(shoving),
-        parting_sweeps(view),
+        separating_sweeps(view),
         _last_resort(view),
     )
     return next(sweeps)
 
 
 def _direct_sweeps(view: View) -> Iterator[Sweep]:
-    """Clear sweeps that bring one block into the zone: to its middle, else beside it, the near side first."""
+    """Clear sweeps of one block into the zone: to its middle, else beside it, the near side first."""
     if view.overlap_m and not view.met_ids:
         return  # nothing can be overlapped
     for pushes in itertools.zip_longest(*(_pushes_into_zone(view, goal) for goal in view.goals)):
@@ -64,7 +64,7 @@ def _pushes_into_zone(view: View, goal: InZone) -> Iterator[Push]:
 
 
 def _detours(view: View) -> Iterator[Sweep]:
-    """Clear sweeps to a stop beside the line from where the same block can go straight on, shortest first."""
+    """Clear sweeps to a waypoint beside the line that has a clear sweep into the zone, shortest first."""
     stops = [
         (math.dist(view.place(goal), waypoint.point) + waypoint.rest_m, rank, waypoint.point)
         for rank, goal in enumerate(view.goals)
@@ -78,7 +78,7 @@ def _detours(view: View) -> Iterator[Sweep]:
 
 
 def _aside_sweeps(view: View) -> Iterator[Sweep]:
-    """Clear sweeps that park a block elsewhere, so that a direct sweep becomes possible."""
+    """Clear sweeps that park a block so that a direct sweep becomes possible."""
     for goal, push in parking_pushes(view):
         clear = view.cleared(goal, push)
         if clear and _can_finish(view.after(goal, clear)):
@@ -90,7 +90,7 @@ def _can_finish(view: View) -> bool:
 
 
 def _last_resort(view: View) -> Iterator[Sweep]:
-    """Sweeps of the nearest block as if there were no others, at the very end over the line."""
+    """Sweeps of the nearest block with the others ignored, finally across the line."""
     goal = view.goals[0]
     alone = view.alone(goal)
     yield from _direct_sweeps(alone)

@@ -1,4 +1,4 @@
-"""A table being laid: free places, sizes, and who stands in whose way."""
+"""Sampling of object placements on the table."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,34 +18,34 @@ from openvima.scene import (
     Pose,
     Scene,
 )
-from openvima.tasks.circles import middle_of_smallest_circle
+from openvima.tasks.circles import smallest_circle_centre
 
 T = TypeVar("T")
 Reject = Callable[[Placement], bool]
 
 CELL_M = 0.003125  # side of a raster cell; the benchmark's resolution for placing and picking
 NO_SCALE = (1.0, 1.0, 1.0)
-HOLLOW_OBJECTS = ("frame", "square")  # bases whose inside looks free from above
+HOLLOW_OBJECTS = ("frame", "square")  # bases whose inside counts as free
 _CROWDING_MARGIN_M = 0.01
 _FOOTPRINT_TRIES = 20
 
 
 def never(placement: Placement) -> bool:
-    """Accept every place: the default of `reject`."""
+    """Accept every placement: the default of `reject`."""
     return False
 
 
 class TableSampler:
-    """A table being laid: draws objects and places from one generator and remembers what stands where.
+    """Samples objects and their placements with one generator.
 
-    Objects of the pool's base list are fixed, all others can be moved.
+    Objects of the pool's base list are fixed, all others are movable.
 
     Args:
-        rng: Every draw comes from here.
-        pool: What the task may draw from.
-        assets: Where shapes come from.
-        end_effector: Tool of the arm; it decides the first object's id.
-        compat: Sample as the original benchmark does.
+        rng: Generator of all draws.
+        pool: Objects and textures of the task at its level.
+        assets: Asset pack.
+        end_effector: Tool of the arm; determines the first object's id.
+        compat: Sample as VIMA-Bench does.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class TableSampler:
         end_effector: EndEffector = "suction",
         compat: bool = False,
     ) -> None:
-        from openvima.render.labels import empty_labels  # compiled code: not for a mere list of tasks
+        from openvima.render.labels import empty_labels  # imports Numba, which a list of tasks does not need
 
         self.rng = rng
         self.pool = pool
@@ -68,11 +68,11 @@ class TableSampler:
         self._labels, self._heights = empty_labels()
 
     def choose(self, options: Sequence[T]) -> T:
-        """Draw one of several things with equal probability."""
+        """Draw one option uniformly."""
         return options[int(self.rng.integers(len(options)))]
 
     def sample_size(self, object_name: str) -> Vector3:
-        """Draw a nominal size in metres, each axis on its own."""
+        """Draw a nominal size in metres, each axis independently."""
         spec = object_spec(object_name)
         x, y, z = self.rng.uniform(spec.size_min, spec.size_max).tolist()
         return (x, y, z)
@@ -89,17 +89,17 @@ class TableSampler:
         apart_m: float = 0.0,
         reject: Reject = never,
     ) -> list[Placement]:
-        """Put objects on free places of the table, at any heading.
+        """Place objects at random free poses.
 
         Args:
             what: Role of the objects, for the message of an error.
-            draw: Draws an object's name and texture, anew in each try.
-            count: How many objects to place.
+            draw: Draws the name and texture of an object in each try.
+            count: Number of objects.
             tries: Tries for all of them together.
             size: Nominal size in metres; by default drawn for each object.
             scale: Factor per axis on top of the size.
-            apart_m: Keep the link frames this far from those of all other objects; not with `compat`.
-            reject: Whether a place that was drawn will not do.
+            apart_m: Smallest distance to the link frames of other objects; ignored with `compat`.
+            reject: Whether to reject a placement.
 
         Returns:
             The objects placed.
@@ -134,7 +134,7 @@ class TableSampler:
         apart_m: float = 0.0,
         reject: Reject = never,
     ) -> Placement:
-        """Put one object on a free place; see `place`."""
+        """Place one object; see `place`."""
         placed = self.place(what, draw, tries=tries, size=size, scale=scale, apart_m=apart_m, reject=reject)
         return placed[0]
 
@@ -147,19 +147,17 @@ class TableSampler:
         apart_m: float = 0.0,
         reject: Reject = never,
     ) -> Placement:
-        """Look for another free place of an object, and a new heading; the table stays as it is.
-
-        Where the object stands now is not free, as if another one of its kind stood there.
+        """Sample another free pose of an object without moving it; its current place is not free.
 
         Args:
             what: Role of the object, for the message of an error.
             placement: The object.
-            tries: How often to draw a place.
+            tries: Number of tries.
             apart_m: As for `place`.
             reject: As for `place`.
 
         Returns:
-            The object at the place found.
+            The object at the new pose.
 
         Raises:
             SamplingError: The tries were used up.
@@ -172,7 +170,7 @@ class TableSampler:
         raise SamplingError(f"{what} found no other place in {tries} tries.")
 
     def move(self, placement: Placement, place: Placement) -> Placement:
-        """Take an object of the table to another place, as `find_place` returned it; returns it there."""
+        """Move an object to a pose from `find_place`; return it there."""
         self.placements[self.placements.index(placement)] = place
         self._labels, self._heights = self._stamped(self.placements)
         return place
@@ -189,18 +187,18 @@ class TableSampler:
         z: float | None = None,
         on_top: bool = False,
     ) -> Placement:
-        """Put an object at a given pose.
+        """Place an object at a given pose.
 
         Args:
             object_name: Display name in the catalogue.
             texture: Display name in the catalogue.
             size: Nominal size in metres.
-            pose: Where it goes; its height does not count.
-            fixed: Whether it is welded to the table; by default if the pool lists it as a base.
+            pose: Its pose; the height is ignored.
+            fixed: Whether it is fixed to the table; by default if it is a base of the pool.
             scale: Factor per axis on top of the size.
             z: Height of its link frame in metres; by default that of rest on the table (with `compat`: half
                 the nominal height).
-            on_top: It lies on whatever is already there, instead of on the table.
+            on_top: Place it on top of the objects below instead of on the table.
 
         Returns:
             The object.
@@ -212,43 +210,40 @@ class TableSampler:
         return self._put(new if z is None else new.at(Pose((pose.x, pose.y, z), pose.quaternion)))
 
     def centred_in(self, base: Placement, object_name: str, size: Vector3) -> Pose:
-        """Return where to put an object, unturned, so that it lies evenly in a round base.
+        """Return the unrotated pose of an object that rests level in a round base.
 
-        The smallest circles around what is drawn of the two have the same middle, so all points at which the
-        object may touch the slope are equally high.
+        The smallest enclosing circles of their meshes are concentric, so the object touches the slope at
+        equal heights.
 
         Args:
-            base: The base, unturned.
+            base: The base, unrotated.
             object_name: Display name in the catalogue.
             size: Nominal size in metres.
         """
-        base_x, base_y = _middle_m(self._assets, base.object, base.size)
-        x, y = _middle_m(self._assets, object_name, size)
+        base_x, base_y = _circle_centre_m(self._assets, base.object, base.size)
+        x, y = _circle_centre_m(self._assets, object_name, size)
         return Pose.planar(base.pose.x + base_x - x, base.pose.y + base_y - y)
 
     def blank(self) -> "TableSampler":
-        """Return an empty table for a scene of the prompt, with the same generator and assets.
-
-        Nothing is fixed there, for nothing is done there.
-        """
+        """Return an empty sampler for a prompt scene with the same generator; nothing is fixed."""
         pool = replace(self.pool, base_objects=())
         return TableSampler(
             self.rng, pool, assets=self._assets, end_effector=self._end_effector, compat=self.compat
         )
 
     def free_pose(self, object_name: str, size: Vector3) -> Pose | None:
-        """Draw a place whose surroundings are free, and a heading.
+        """Draw a free position and a heading.
 
-        A square window around the place, as wide as the diagonal of the nominal footprint, holds no object
-        and stays clear of the table's edge. What is drawn of some bases is larger than their nominal
-        footprint; for these the cells that they would cover must be free as well (not with `compat`).
+        A square window around the position, as wide as the diagonal of the nominal footprint, contains no
+        object and not the table's edge. Some bases are larger than their nominal footprint; the cells that
+        they cover must be free as well (not with `compat`).
 
         Args:
             object_name: Display name in the catalogue.
             size: Nominal size in metres.
 
         Returns:
-            The pose, its height 0, or None if no place is left.
+            The pose at height 0, or None without a free position.
         """
         from openvima.tasks.kernels import mark_free_centres, nth_centre
 
@@ -271,7 +266,7 @@ class TableSampler:
         return None
 
     def scene(self) -> Scene:
-        """Return everything placed so far."""
+        """Return the scene placed so far."""
         return Scene(tuple(self.placements), self._end_effector)
 
     def _at_rest(
@@ -306,7 +301,7 @@ class TableSampler:
         stamp(labels, heights, placement, self._assets)
 
     def _stamped(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
-        """Labels and heights of a table with these objects."""
+        """Labels and heights of these objects."""
         from openvima.render.labels import empty_labels
 
         labels, heights = empty_labels()
@@ -315,14 +310,14 @@ class TableSampler:
         return labels, heights
 
     def _covered(self, placement: Placement) -> np.ndarray:
-        """Cells that an object covers, wherever its link frame's height puts it; shape (320, 160), bool."""
+        """Cells that an object covers from above, whatever its height; shape (320, 160), bool."""
         geometry = self._assets.geometry(placement.object, placement.size, placement.scale)
         pose = placement.pose
         raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
         return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
 
     def _height_below(self, placement: Placement) -> float:
-        """Height in metres of the highest point of the table's objects under an object."""
+        """Height in metres of the highest point under an object."""
         return float(self._heights[self._covered(placement)].max(initial=0.0))
 
     def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
@@ -347,19 +342,19 @@ class TableSampler:
 
 
 def is_in_hollow(placement: Placement, base: Placement) -> bool:
-    """Whether an object counts as inside a frame or a square, whose inside looks free from above.
+    """Whether an object counts as inside a frame or a square.
 
     Args:
-        placement: The object; its nominal size and its place count.
+        placement: The object.
         base: The base; only frame and square are hollow.
     """
     return base.object in HOLLOW_OBJECTS and is_in_the_way(placement, base)
 
 
 def is_in_the_way(placement: Placement, other: Placement) -> bool:
-    """Whether two objects count as crowding each other, by their nominal sizes and places alone.
+    """Whether two objects crowd each other, by nominal size and position alone.
 
-    Source: the benchmark's test; its square windows are not turned with the objects.
+    Source: VIMA-Bench; its square windows ignore the headings.
     """
     reach = max((placement.size[axis] + other.size[axis]) / 2 + _CROWDING_MARGIN_M for axis in (0, 1))
     return placement.pose.planar_distance(other.pose) <= reach
@@ -367,13 +362,13 @@ def is_in_the_way(placement: Placement, other: Placement) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def _reach_m(assets: Assets, object_name: str, size: Vector3) -> float:
-    """Largest planar distance of anything drawn of an object from its link frame, in metres."""
+    """Largest planar distance of an object's mesh from its link frame, in metres."""
     vertices = assets.geometry(object_name, size).visual.vertices
     return float(np.hypot(vertices[..., 0], vertices[..., 1]).max())
 
 
 @functools.lru_cache(maxsize=256)
-def _middle_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
-    """Middle of the smallest circle around all that is drawn of an object, in its link frame, in metres."""
+def _circle_centre_m(assets: Assets, object_name: str, size: Vector3) -> tuple[float, float]:
+    """Centre of the smallest circle around an object's mesh, in its link frame, in metres."""
     vertices = assets.geometry(object_name, size).visual.vertices
-    return middle_of_smallest_circle(vertices.reshape(-1, 3)[:, :2])
+    return smallest_circle_centre(vertices.reshape(-1, 3)[:, :2])

@@ -1,11 +1,10 @@
-"""`twist`: see from pictures by how much "twist" turns an object, then turn all objects of one texture so.
+"""`twist`: infer the angle of "twist" from image pairs, then rotate all objects of one texture by it.
 
-Scene:    one or more objects of one texture to turn, distractors of other textures; no shape has a rotational
-          symmetry.
+Scene:    one or more targets of one texture, distractors of other textures; no shape has symmetries.
 Prompt:   '"Twist" is defined as rotating object a specific angle. For examples: From {before_twist_1} to
-          {after_twist_1}. … Now twist all red swirl objects.' Each pair shows an object of the shape, but not
-          of the texture, of one to turn.
-Success:  each yaw within 15 degrees of the asked one, position within 0.05 m of the start.
+          {after_twist_1}. … Now twist all red swirl objects.' Each pair shows an object with the
+          shape, but not the texture, of a target.
+Success:  each yaw within 15 degrees of the target, position within 0.05 m of the start.
 Source:   VIMA paper, task list of the appendix, "Twist".
 """
 
@@ -15,8 +14,14 @@ from collections.abc import Sequence
 from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
 from openvima.tasks.options import check_count, check_difficulty
 from openvima.tasks.registry import register_task
+from openvima.tasks.rotation import (
+    ANGLES_DEG,
+    check_angles,
+    check_asymmetric,
+    rotated_clockwise,
+    rotation_goal,
+)
 from openvima.tasks.table import TableSampler
-from openvima.tasks.turning import ANGLES_DEG, check_angles, check_turnable, turn_goal, turned
 
 TEMPLATE = (
     '"Twist" is defined as rotating object a specific angle. For examples: {examples} '
@@ -52,11 +57,11 @@ def sample(
     """Sample one problem.
 
     Args:
-        table: The table to lay.
-        angles_deg: Angles to choose from; positive turns clockwise seen from above.
-        num_examples: Pairs of pictures in the prompt, 1 … 6.
-        num_objects: Objects on the table, 2 … 6; by default as many as the difficulty says. At least one has
-            to be turned and at least one is a distractor.
+        table: Sampler of the scene.
+        angles_deg: Possible angles; positive is clockwise seen from above.
+        num_examples: Image pairs in the prompt, 1 … 6.
+        num_objects: Objects on the table, 2 … 6; by default that of the difficulty. At least one is a
+            target and at least one a distractor.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects.
     """
     check_difficulty(difficulty)
@@ -64,7 +69,7 @@ def sample(
     check_count("num_objects", num_objects, low=2, high=6)
     check_count("num_examples", num_examples, low=1, high=6)
     check_angles(angles_deg)
-    check_turnable(table.pool)
+    check_asymmetric(table.pool)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     num_targets = int(table.rng.integers(1, num_objects))
@@ -72,7 +77,7 @@ def sample(
     angle_deg, texture = table.choose(angles_deg), table.choose(textures)
     others = [other for other in textures if other != texture]
     targets = table.place(
-        "object to turn",
+        "object to rotate",
         lambda: (table.choose(objects), texture),
         count=num_targets,
         tries=num_targets + 10,
@@ -87,18 +92,18 @@ def sample(
     for n in range(1, num_examples + 1):
         before = _example(table.blank(), table.choose(targets).object, table.choose(others))
         examples[f"before_twist_{n}"] = SceneImage.of([before])
-        examples[f"after_twist_{n}"] = SceneImage.of([before.at(turned(before.pose, angle_deg))])
+        examples[f"after_twist_{n}"] = SceneImage.of([before.at(rotated_clockwise(before.pose, angle_deg))])
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(template(num_examples), twist_obj_texture=texture, **examples),
-        goals=tuple(turn_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
+        goals=tuple(rotation_goal(target, angle_deg, position_m=TOLERANCE_M) for target in targets),
         constraints=(DistractorsApart(tuple(d.id for d in distractors)),),
         oracle_max_steps=num_objects + 2,
     )
 
 
 def _example(table: TableSampler, object_name: str, texture: str) -> Placement:
-    """Lay an object anywhere near the middle of an empty table, at any heading."""
+    """Place an object near the middle of an empty table, at a random heading."""
     x, y = table.rng.uniform(EXAMPLE_LOW, EXAMPLE_HIGH).tolist()
     pose = Pose.planar(x, y, table.rng.uniform(0.0, 2 * math.pi))
     return table.add(object_name, texture, size=table.sample_size(object_name), pose=pose, z=0.0)

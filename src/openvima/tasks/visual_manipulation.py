@@ -1,7 +1,7 @@
-"""`visual_manipulation`: put the pictured object into the pictured base.
+"""`visual_manipulation`: put one object into another; images specify both.
 
 Scene:    a base, an object to move, and distractors. A distractor may share the shape or the texture of the
-          object or of the base, but not both; it may itself look like a base.
+          object or of the base, but not both; it may be a base.
 Prompt:   "Put the {dragged_obj_1} into the {base_obj}."
 Success:  object within 0.1 m of the base's origin, while no distractor is as near to either of them.
 Source:   VIMA paper, task list of the appendix, "Simple object manipulation".
@@ -23,9 +23,9 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
     """Sample one problem.
 
     Args:
-        table: The table to lay.
+        table: Sampler of the scene.
         num_distractors: Further objects, 0 … 3.
-        difficulty: "easy", or "medium" and "hard", which mix and exchange the textures of the two roles.
+        difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
     check_count("num_distractors", num_distractors, high=3)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
@@ -38,9 +38,9 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
 
     def draw_distractor() -> tuple[str, str]:
         while True:
-            look = (table.choose(objects), table.choose(textures))
-            if look not in taken:
-                return look
+            appearance = (table.choose(objects), table.choose(textures))
+            if appearance not in taken:
+                return appearance
 
     distractors = place_distractors(table, draw_distractor, count=num_distractors)
     prompt = Prompt.parse(TEMPLATE, dragged_obj_1=ObjectImage(target), base_obj=ObjectImage(base))

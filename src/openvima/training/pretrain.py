@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
-from openvima.catalog.random_pack import RandomLooks, shows_heading
+from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
 from openvima.catalog.textures import NEUTRAL_TEXTURE
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.object_encoder import ObjectEncoder
@@ -138,7 +138,7 @@ def render_pairs(
         report: Called with scenes done, scenes in all, and a note.
     """
     pack = load_assets(assets)
-    rasteriser = Rasteriser(RandomLooks(pack))
+    rasteriser = Rasteriser(RandomAppearanceAssets(pack))
     shades = {name for task in tasks for name in pool(task, "train").dragged_textures}
     looks: dict[tuple, int] = {}
     columns: list[tuple] = []
@@ -347,7 +347,7 @@ def pairs_of_scene(
         if again and moved:
             from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
             turns = np.array([from_prompt, again[1][placement.id]], dtype=np.float32)
-            turns = turns if shows_heading(placement.object) else np.full_like(turns, np.nan)
+            turns = turns if has_visible_heading(placement.object) else np.full_like(turns, np.nan)
             pair = (*pair, moved.crops[:, slot], moved.masks[:, slot], turns)
         pairs.append(pair)
     return pairs

@@ -16,7 +16,7 @@ from openvima.catalog.random_pack import is_random, random_name
 from openvima.catalog.textures import texture_spec
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Placement, Pose, Scene
 
-_MOVABLE, _VESSELS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
+_MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
 _NUM_PALETTE = 3  # random textures of a scene, so that some of its objects share one
 _STRETCH = (1.35, 2.2)  # factor between the heights of twins
 _TWIN_TRIES = 20
@@ -97,11 +97,13 @@ def laid_again(scene: Scene, rng: np.random.Generator) -> tuple[Scene, dict[int,
 def _with_random_shape(
     placement: Placement, assets: Assets, rng: np.random.Generator, common: dict[str, str] | None
 ) -> Placement:
-    kind = "shape" if placement.object in _MOVABLE else "vessel" if placement.object in _VESSELS else None
+    kind = (
+        "shape" if placement.object in _MOVABLE else "container" if placement.object in _CONTAINERS else None
+    )
     if kind is None:
         return placement
     name = random_name(kind, rng)
-    if common is not None and kind == "vessel":
+    if common is not None and kind == "container":
         name = common.setdefault(placement.object, name)
     return _at_rest(replace(placement, object=name), assets)
 

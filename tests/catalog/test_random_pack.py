@@ -5,8 +5,8 @@ import pytest
 
 from openvima.catalog import outlines
 from openvima.catalog.packs import load_assets
-from openvima.catalog.random_pack import RandomLooks, is_random, random_name, shows_heading
-from openvima.catalog.random_shapes import has_heading, random_outline, random_vessel
+from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random, random_name
+from openvima.catalog.random_shapes import has_heading, random_container, random_outline
 from openvima.catalog.random_textures import darkened_texture, random_texture
 from openvima.catalog.triangulation import signed_area
 from openvima.errors import UnknownTextureError
@@ -15,12 +15,12 @@ SIZE = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
-def looks() -> RandomLooks:
-    return RandomLooks(load_assets("procedural"))
+def looks() -> RandomAppearanceAssets:
+    return RandomAppearanceAssets(load_assets("procedural"))
 
 
 def test_a_name_always_stands_for_the_same_look(looks):
-    again = RandomLooks(load_assets("procedural"))
+    again = RandomAppearanceAssets(load_assets("procedural"))
     names = [random_name("texture", np.random.default_rng(k)) for k in range(20)]
     assert len(set(names)) == 20
     assert all(np.array_equal(looks.texture(name), again.texture(name)) for name in names)
@@ -56,9 +56,9 @@ def test_random_outlines_are_whole_and_of_the_size_of_kit_objects(looks):
 
 def test_random_vessels_stand_on_the_table():
     for seed in range(40):
-        vessel = random_vessel(np.random.default_rng(seed))
-        assert abs(vessel.visual.vertices[..., 2].min() + vessel.rest_z_m) < 0.0025
-        assert 0.08 < np.ptp(vessel.visual.vertices[..., :2].reshape(-1, 2), axis=0).max() < 0.3
+        container = random_container(np.random.default_rng(seed))
+        assert abs(container.visual.vertices[..., 2].min() + container.rest_z_m) < 0.0025
+        assert 0.08 < np.ptp(container.visual.vertices[..., :2].reshape(-1, 2), axis=0).max() < 0.3
 
 
 def test_stretched_random_shapes_are_as_much_higher(looks):
@@ -70,18 +70,18 @@ def test_stretched_random_shapes_are_as_much_higher(looks):
 @pytest.mark.parametrize("name", ["letter A", "letter R", "letter G", "heart", "L-shaped block"])
 def test_shapes_without_symmetry_show_their_heading(name):
     assert has_heading(outlines.outline(name))
-    assert shows_heading(name)
+    assert has_visible_heading(name)
 
 
 @pytest.mark.parametrize("name", ["cross", "flower", "hexagon", "ring", "diamond", "star"])
 def test_symmetric_shapes_do_not_show_their_heading(name):
     assert not has_heading(outlines.outline(name))
-    assert not shows_heading(name)
+    assert not has_visible_heading(name)
 
 
 def test_vessels_count_as_shapes_without_heading():
-    assert not shows_heading("random vessel 4")
-    assert sum(shows_heading(f"random shape {seed}") for seed in range(40)) > 20
+    assert not has_visible_heading("random container 4")
+    assert sum(has_visible_heading(f"random shape {seed}") for seed in range(40)) > 20
 
 
 def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkeypatch):
@@ -93,9 +93,9 @@ def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkey
         geometry = texture = refused
 
     monkeypatch.setattr(outlines, "_OUTLINES", {})
-    looks = RandomLooks(Empty())
+    looks = RandomAppearanceAssets(Empty())
     rng = np.random.default_rng(0)
-    for kind in ("shape", "vessel", "texture"):
+    for kind in ("shape", "container", "texture"):
         for _ in range(20):
             name = random_name(kind, rng)
             assert is_random(name)

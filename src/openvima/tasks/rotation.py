@@ -1,4 +1,4 @@
-"""What tasks share that ask for an object to be turned on the spot."""
+"""Shared parts of the tasks that rotate objects in place."""
 
 import math
 from collections.abc import Sequence
@@ -12,28 +12,30 @@ ANGLES_DEG = (30, 60, 90, 120, 150)  # clockwise seen from above, i.e. negative 
 TOLERANCE_DEG = 15
 
 
-def turned(pose: Pose, angle_deg: float) -> Pose:
-    """Turn a pose on the spot, clockwise seen from above for positive angles."""
+def rotated_clockwise(pose: Pose, angle_deg: float) -> Pose:
+    """Rotate a pose in place, clockwise seen from above for positive angles."""
     return pose.rotated(-math.radians(angle_deg))
 
 
-def turn_goal(placement: Placement, angle_deg: float, *, position_m: float) -> AtPose:
-    """Ask for an object to be turned on the spot, within 15 degrees.
+def rotation_goal(placement: Placement, angle_deg: float, *, position_m: float) -> AtPose:
+    """Return the goal of a rotation in place, within 15 degrees.
 
     Args:
         placement: The object at its start.
-        angle_deg: Positive turns clockwise seen from above.
-        position_m: How far in metres it may end up from its start.
+        angle_deg: Positive is clockwise seen from above.
+        position_m: Position tolerance in metres.
     """
     tolerance = Tolerance(position_m, yaw_rad=math.radians(TOLERANCE_DEG))
-    return AtPose(placement.id, turned(placement.pose, angle_deg), tolerance, relative_to=placement.id)
+    return AtPose(
+        placement.id, rotated_clockwise(placement.pose, angle_deg), tolerance, relative_to=placement.id
+    )
 
 
 def check_angles(angles_deg: object) -> None:
-    """Refuse angles that are no numbers, and those that are met, or nearly met, before anything is turned.
+    """Check that all angles are numbers beyond the tolerance.
 
     Raises:
-        ConfigError: An angle is within 15 degrees of no turn at all, or what was given is no list of numbers.
+        ConfigError: An angle is within 15 degrees of 0, or this is not a list of numbers.
     """
     if not isinstance(angles_deg, Sequence) or isinstance(angles_deg, str):
         raise ConfigError(
@@ -41,9 +43,9 @@ def check_angles(angles_deg: object) -> None:
         )
     wrong = [str(angle) for angle in angles_deg if not _is_large(angle)]
     if wrong or not angles_deg:
-        shown = ", ".join(wrong) or "nothing"
+        given = ", ".join(wrong) or "nothing"
         raise ConfigError(
-            f"angles_deg holds {shown}; each angle must turn by more than {TOLERANCE_DEG} degrees."
+            f"angles_deg holds {given}; each angle must be larger than {TOLERANCE_DEG} degrees."
         )
 
 
@@ -53,8 +55,8 @@ def _is_large(angle: object) -> bool:
     return abs(math.remainder(angle, 360)) > TOLERANCE_DEG
 
 
-def check_turnable(pool: Pool) -> None:
-    """Refuse a pool whose objects do not show how they were turned, or cannot be told apart by texture.
+def check_asymmetric(pool: Pool) -> None:
+    """Check that the objects of a pool have no rotational symmetry and at least two textures.
 
     Raises:
         ConfigError: An object has a rotational symmetry, or there are fewer than two textures.
@@ -62,8 +64,7 @@ def check_turnable(pool: Pool) -> None:
     symmetric = [name for name in pool.dragged_objects if object_spec(name).symmetry_rad != NO_SYMMETRY]
     if symmetric:
         raise ConfigError(
-            f"{', '.join(symmetric)} may look the same after a turn; draw from objects without rotational "
-            f"symmetry, such as letters."
+            f"{', '.join(symmetric)} have a rotational symmetry; give objects without one, such as letters."
         )
     if len(set(pool.dragged_textures)) < 2:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Blocks that stand too close to be swept one by one: where to park one, and how to part a tight group."""
+"""Sweeps that separate blocks too close to be swept one by one."""
 
 import math
 from collections.abc import Iterator
@@ -25,10 +25,10 @@ def parking_pushes(view: View) -> Iterator[tuple[InZone, Push]]:
                     yield goal, Push.between((x, y), end)
 
 
-def parting_sweeps(view: View) -> Iterator[Sweep]:
+def separating_sweeps(view: View) -> Iterator[Sweep]:
     """Sweeps that park a block of a tight group, at which other blocks to sweep may be pushed along.
 
-    The blade still comes down on free ground. First come the sweeps that push nothing along at the edge of
+    The spatula still comes down on free ground. First come the sweeps that push nothing along at the edge of
     the workspace, and of these the ones whose ways cover least of the others' width.
     """
     open_ids = {goal.object_id for goal in view.goals}
@@ -54,13 +54,13 @@ def _may_park(point: Point, zone: Zone) -> bool:
 
 
 def _comes_down_on(push: Push, blocks: list[Rectangle]) -> bool:
-    blade = push.blade_at_start()
-    return any(blade.meets_box_around(block) for block in blocks)
+    spatula = push.spatula_at_start()
+    return any(spatula.meets_box_around(block) for block in blocks)
 
 
 def _come_near(push: Push, others: list[Rectangle], *, margin_m: float = 0.0) -> bool:
-    """Whether blade or block come near one of the others."""
-    return any(way.comes_near(other, margin_m) for way in push.ways() for other in others)
+    """Whether spatula or block come near one of the others."""
+    return any(way.comes_near(other, margin_m) for way in push.swept_areas() for other in others)
 
 
 def _stays(block: Rectangle, push: Push) -> bool:
@@ -73,9 +73,9 @@ def _stays(block: Rectangle, push: Push) -> bool:
 
 
 def _cover(push: Push, block: Rectangle) -> float:
-    """Width of a block, in metres, that is in the way of blade or block."""
+    """Width of a block, in metres, that is in the way of spatula or block."""
     across = push.yaw_rad + math.pi / 2
     cos, sin = math.cos(across), math.sin(across)
     reach = block.half_width(across)
-    offsets = ((way, abs((block.x - way.x) * cos + (block.y - way.y) * sin)) for way in push.ways())
+    offsets = ((way, abs((block.x - way.x) * cos + (block.y - way.y) * sin)) for way in push.swept_areas())
     return max(way.half_y + reach - offset for way, offset in offsets)

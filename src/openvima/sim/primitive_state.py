@@ -1,4 +1,4 @@
-"""What a primitive acts on: the bodies, the arm, and those who look on."""
+"""State of one primitive: bodies, arm and monitor."""
 
 import math
 from collections.abc import Callable
@@ -10,72 +10,72 @@ from openvima.sim.bodies import Bodies
 from openvima.sim.contacts import body_gap
 from openvima.sim.model import FLOOR_Z_M
 
-RESTING_GAP_M = 5e-4  # bodies nearer than this may bear one another
+RESTING_GAP_M = 5e-4  # bodies nearer than this may support each other
 LEVEL_RAD = 0.03  # the pan rests tilted by 0.01
-STILL_M = 5e-5  # a body that physics moved by less than this, and turned by less than …
-STILL_RAD = 5e-4  # … this, keeps its pose: nothing creeps, however many steps an episode has
+STILL_M = 5e-5  # a body that moved by less than this, and rotated by less than …
+STILL_RAD = 5e-4  # … this, keeps its pose, so that nothing creeps over many steps
 
 
-class Stage:
-    """The bodies, the arm and the onlookers during one primitive.
+class PrimitiveState:
+    """Bodies, arm and monitor during one primitive.
 
     Args:
-        scene: Poses at the start.
-        bodies: The same in physics.
-        path: The arm's way so far.
-        watch: Called with the scene at least every 25 ticks of physics, or None.
+        scene: The scene at the start.
+        bodies: Its bodies.
+        path: Path of the arm.
+        monitor: Called with the scene at least every 25 ticks of physics, or None.
     """
 
     def __init__(
-        self, scene: Scene, bodies: Bodies, path: ArmPath, watch: Callable[[Scene], None] | None
+        self, scene: Scene, bodies: Bodies, path: ArmPath, monitor: Callable[[Scene], None] | None
     ) -> None:
         self.start = scene
         self.bodies = bodies
         self.path = path
         self.num_ticks = 0
         self.completed = True
-        self._watch = watch
-        self._unwatched_ticks = 0
+        self._monitor = monitor
+        self._unmonitored_ticks = 0
 
     def placement(self, index: int) -> Placement:
-        """One placement as it was at the start."""
+        """A placement at the start."""
         return self.start.placements[index]
 
     def scene(self, held: tuple[int, Pose] | None = None) -> Scene:
-        """The scene now; `held` gives the index and pose of a body that is out of the physics."""
+        """The current scene; `held` is the index and pose of a body out of the physics."""
         poses = {self.placement(i).id: self.bodies.pose(i) for i in self.bodies.rigid}
         if held is not None:
             poses[self.placement(held[0]).id] = held[1]
         return self.start.with_poses(poses)
 
     def count_ticks(self, num_ticks: int, held: tuple[int, Pose] | None = None) -> None:
-        """Note that physics ran, for up to `STRIDE_TICKS`; let the onlooker look before it is too late."""
+        """Count up to `STRIDE_TICKS` physics ticks, and call the monitor when it is due."""
         self.num_ticks += num_ticks
-        self._unwatched_ticks += num_ticks
-        is_time = self._unwatched_ticks + settling.STRIDE_TICKS > settling.WATCH_TICKS
-        if is_time and self._watch is not None:
-            self._unwatched_ticks = 0
-            self._watch(self.scene(held))
+        self._unmonitored_ticks += num_ticks
+        is_time = self._unmonitored_ticks + settling.STRIDE_TICKS > settling.MONITOR_TICKS
+        if is_time and self._monitor is not None:
+            self._unmonitored_ticks = 0
+            self._monitor(self.scene(held))
 
-    def look(self) -> None:
-        """Let the onlooker look now: bodies move without physics."""
-        if self._watch is not None:
-            self._unwatched_ticks = 0
-            self._watch(self.scene())
+    def notify(self) -> None:
+        """Call the monitor now: bodies move without physics."""
+        if self._monitor is not None:
+            self._unmonitored_ticks = 0
+            self._monitor(self.scene())
 
-    def settle(self, held: tuple[int, Pose] | None = None, *, top_speed: float | None = None) -> None:
-        """Run physics until all is at rest; the arm's next move happens meanwhile."""
+    def settle(self, held: tuple[int, Pose] | None = None, *, max_speed: float | None = None) -> None:
+        """Run physics until everything is at rest; the arm's next move happens meanwhile."""
 
         def each(num_ticks: int) -> None:
             self.count_ticks(num_ticks, held)
             self.path.store(num_ticks, scene=lambda: self.scene(held))
 
         held_index = held[0] if held else None
-        _, completed = settling.settle(self.bodies, apart_from=held_index, top_speed=top_speed, each=each)
+        _, completed = settling.settle(self.bodies, apart_from=held_index, max_speed=max_speed, each=each)
         self.completed = self.completed and completed
 
     def finish(self) -> Scene:
-        """Put bodies that hardly moved back where they were; return the final scene, watched once more."""
+        """Reset bodies that hardly moved; monitor and return the final scene."""
         poses = {}
         for index in self.bodies.rigid:
             before, after = self.placement(index).pose, self.bodies.pose(index)
@@ -85,8 +85,8 @@ class Stage:
                 poses[self.placement(index).id] = after
         self.bodies.refresh()
         final = self.start.with_poses(poses)
-        if self._watch is not None:
-            self._watch(final)
+        if self._monitor is not None:
+            self._monitor(final)
         return final
 
 
@@ -98,13 +98,13 @@ def _is_still(before: Pose, after: Pose) -> bool:
 
 
 def is_level(pose: Pose) -> bool:
-    """Whether a body lies flat, either way up; one on edge may have leaned on something."""
+    """Whether a body lies flat, either way up."""
     x, y, _, _ = pose.quaternion
     return abs(1 - 2 * (x * x + y * y)) > math.cos(LEVEL_RAD)
 
 
 def is_at_rest(bodies: Bodies) -> bool:
-    """Whether every free body lies flat on the floor and overlaps no other: nothing would move."""
+    """Whether every free body lies flat on the floor and overlaps no other."""
     for index in bodies.rigid:
         pose = bodies.pose(index)
         if not is_level(pose):
