@@ -75,17 +75,17 @@ def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
     """Return a function that does one step of training on some of the frames."""
     torch.manual_seed(0)
     network = MaskRCNN(detector_config(preset))
-    learner = DetectorLearner(network, sampled=DEFAULTS.sampled).train()
+    learner = DetectorLearner(network, sampled=DEFAULTS.proposals_per_frame).train()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-    optimizer = torch.optim.AdamW(learner.parameters(), lr=DEFAULTS.learning_rate)
+    optimizer = torch.optim.AdamW(learner.parameters(), lr=DEFAULTS.optimizer.learning_rate)
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
-    chosen = [frames[number % len(frames)] for number in range(DEFAULTS.batch)]
+    chosen = [frames[number % len(frames)] for number in range(DEFAULTS.loader.batch_size)]
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
         loss, _ = learner(FrameBatch.of([augmented(frame, rng) for frame in chosen], generator))
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(learner.parameters(), DEFAULTS.clip_norm)
+        torch.nn.utils.clip_grad_norm_(learner.parameters(), DEFAULTS.optimizer.max_grad_norm)
         optimizer.step()
 
     return step

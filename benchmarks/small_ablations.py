@@ -39,21 +39,15 @@ from openvima.training.recipes import RECIPES
 
 _CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
 _SETTINGS = {
-    "learning_rate": 4e-4,
-    "warmup_steps": 100,
-    "motion_share": 0.2,
-    "bystander_share": 0.35,
-    "naming_share": 0.3,
-    "reordering_share": 0.3,
-    "stranger_share": 0.6,
-    "validation_share": 0.02,
-    "validation_episodes": 500,
-    "tensorboard": False,
+    **{name: value for name, value in RECIPES["small"].items() if not name.startswith("pretraining.")},
+    "pretraining.steps": 0,
+    "loader.batch_size": 64,
+    "runtime.tensorboard": False,
 }
-_MATCHING = {
-    **{name: value for name, value in RECIPES["small"].items() if name.startswith("pretraining_")},
-    "pretraining_steps": 1000,
-    "pretraining_scenes": 4000,
+_PRETRAINING = {
+    **{name: value for name, value in RECIPES["small"].items() if name.startswith("pretraining.")},
+    "pretraining.steps": 1000,
+    "pretraining.num_scenes": 4000,
 }
 
 
@@ -120,21 +114,29 @@ VARIANTS = {
     "no-looks": Variant("no loss of picking by looks alone", _without_loss_of_looks),
     "no-referents": Variant("words do not bring pictures along", _without_referents),
     "no-turns": Variant("turns between two images are not estimated", _without_turns),
-    "no-motions": Variant("no demonstrations as motions", settings={"motion_share": 0.0}),
-    "no-names": Variant("no invented nouns but those of the tasks", settings={"naming_share": 0.0}),
-    "no-reordering": Variant("prompts in the order of the tasks", settings={"reordering_share": 0.0}),
-    "no-strangers": Variant("no objects of other demonstrations in view", settings={"stranger_share": 0.0}),
+    "no-motions": Variant(
+        "no demonstrations as motions", settings={"augmentation.inverse_dynamics_prob": 0.0}
+    ),
+    "no-names": Variant(
+        "no invented nouns but those of the tasks", settings={"augmentation.rename_objects_prob": 0.0}
+    ),
+    "no-reordering": Variant(
+        "prompts in the order of the tasks", settings={"augmentation.shuffle_sentences_prob": 0.0}
+    ),
+    "no-strangers": Variant(
+        "no objects of other demonstrations in view", settings={"augmentation.distractor_prob": 0.0}
+    ),
     "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
-    "short-matching": Variant("looks matched in 1,000 steps of its own", settings=_MATCHING, crops=False),
+    "short-matching": Variant("looks matched in 1,000 steps of its own", settings=_PRETRAINING, crops=False),
     "no-random-looks": Variant(
         "the same without random looks",
-        settings={**_MATCHING, "pretraining_random_looks": 0.0},
+        settings={**_PRETRAINING, "pretraining.appearance_randomization_prob": 0.0},
         crops=False,
     ),
     "vima": Variant(
         "VIMA's architecture, table bins, vision transformer trained along",
         _vima,
-        {"learning_rate": 5e-4, "motion_share": 0.0},
+        {"optimizer.learning_rate": 5e-4, "augmentation.inverse_dynamics_prob": 0.0},
         crops=False,
     ),
 }
@@ -168,18 +170,12 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
     variant, folder = VARIANTS[name], given.out / (given.name or name)
     preset = f"small-{name}"
     PRESETS[preset] = variant.sizes
-    settings = {"pretraining_steps": 0, **_SETTINGS, **variant.settings}
+    settings = {**_SETTINGS, **variant.settings}
     if variant.crops:
-        settings |= {"init": str(_begin(variant.sizes(), given.crops, folder / "init", given.seed))}
-    config = TrainingConfig(
-        data=given.data,
-        out=folder / "run",
-        preset=preset,
-        seed=given.seed,
-        steps=given.steps,
-        checkpoint_every=min(200, given.steps),
-        **settings,
-    )
+        settings |= {"init_from": str(_begin(variant.sizes(), given.crops, folder / "init", given.seed))}
+    settings |= {"data": given.data, "out": folder / "run", "preset": preset, "seed": given.seed}
+    settings |= {"schedule.steps": given.steps, "schedule.checkpoint_every": min(200, given.steps)}
+    config = TrainingConfig.of(settings)
     started = time.process_time()
     with progress_bar(f"training {name}") as report:
         run = train(config, report)

@@ -37,11 +37,11 @@ class Killed(BaseException):
 
 def train_until(config: TrainingConfig, step: int) -> None:
     """Train and be killed when so many steps have been begun; nothing is tidied up."""
-    from openvima.training import loop
+    from openvima.training import loop, policy
 
     begun = 0
 
-    class Trainer(loop._Trainer):
+    class Trainer(loop.Trainer):
         def _step(self, *arguments):
             nonlocal begun
             begun += 1
@@ -49,9 +49,6 @@ def train_until(config: TrainingConfig, step: int) -> None:
                 raise Killed
             return super()._step(*arguments)
 
-    original, loop._Trainer = loop._Trainer, Trainer
-    try:
-        with pytest.raises(Killed):
-            train(config)
-    finally:
-        loop._Trainer = original
+    with pytest.MonkeyPatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(policy, "Trainer", Trainer)
+        train(config)

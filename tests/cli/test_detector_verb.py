@@ -41,8 +41,15 @@ def detector(tiny, tmp_path) -> Path:
 def test_train_makes_a_run_that_evaluate_and_show_take(data, tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
     run = tmp_path / "run"
-    words = ["--data", str(data), "--out", str(run), "--steps", "1", "--batch", "2"]
-    more = ["--validation-share", "0.4", "--validation-frames", "2", "--device", "cpu"]
+    words = ["--data", str(data), "--out", str(run), "--schedule.steps", "1", "--loader.batch-size", "2"]
+    more = [
+        "--loader.validation-fraction",
+        "0.4",
+        "--loader.validation-frames",
+        "2",
+        "--runtime.device",
+        "cpu",
+    ]
     assert main(["detector", "train", *words, *more]) == 0
     assert capsys.readouterr().out == f"{run}\n"
     assert load_network(run).config == tiny

@@ -20,8 +20,11 @@ from openvima.detector import config as sizes  # noqa: E402
 from openvima.detector import load_detector  # noqa: E402
 from openvima.detector.checkpoint import load_network, save_network  # noqa: E402
 from openvima.detector.network import MaskRCNN  # noqa: E402
+from openvima.training.config import RuntimeConfig, ScheduleConfig  # noqa: E402
 from openvima.training.detector import DetectorTrainingConfig, train_detector  # noqa: E402
+from openvima.training.detector.config import FrameLoaderConfig  # noqa: E402
 from openvima.training.detector.split import split_episodes  # noqa: E402
+from openvima.training.validation import flattened  # noqa: E402
 
 
 @pytest.fixture
@@ -31,13 +34,10 @@ def settings(data: Path, tmp_path: Path, tiny, monkeypatch) -> DetectorTrainingC
     return DetectorTrainingConfig(
         data,
         tmp_path / "run",
-        steps=2,
-        batch=4,
-        sampled=8,
-        validation_share=0.4,
-        validation_frames=4,
-        checkpoint_every=1,
-        device="cpu",
+        proposals_per_frame=8,
+        loader=FrameLoaderConfig(batch_size=4, validation_fraction=0.4, validation_frames=4),
+        schedule=ScheduleConfig(steps=2, warmup_steps=100, checkpoint_every=1),
+        runtime=RuntimeConfig(device="cpu"),
     )
 
 
@@ -53,7 +53,7 @@ def test_a_run_leaves_a_detector_and_its_metrics(settings):
     seen = []
     run = train_detector(settings, lambda *progress: seen.append(progress))
     assert seen[-1][:2] == (2, 2)
-    names = {"loss", "proposal_score", "proposal_box", "kind", "box", "mask"}
+    names = {"loss", *(f"loss/{name}" for name in ("proposal_score", "proposal_box", "kind", "box", "mask"))}
     trained = [line for line in lines(run) if "loss" in line]
     held_out = [line for line in lines(run) if "validation_loss" in line]
     assert names <= trained[-1].keys() and {f"validation_{name}" for name in names} <= held_out[-1].keys()
@@ -64,15 +64,15 @@ def test_a_run_leaves_a_detector_and_its_metrics(settings):
 
 def test_an_interrupted_run_ends_with_the_weights_of_one_that_was_not(settings, tmp_path, monkeypatch):
     whole = train_detector(replace(settings, out=tmp_path / "whole"))
-    from openvima.training.detector import loop
+    from openvima.training import loop
 
-    def stops(trainer, step, do=loop._Trainer._step):
+    def stops(trainer, stage, optimizer, step, num_steps, do=loop.Trainer._step):
         if step == 1:
             raise KeyboardInterrupt
-        return do(trainer, step)
+        return do(trainer, stage, optimizer, step, num_steps)
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(loop._Trainer, "_step", stops)
+        patched.setattr(loop.Trainer, "_step", stops)
         train_detector(settings)
     run = train_detector(settings)
     last = "checkpoints/detector-000002"
@@ -99,14 +99,15 @@ def dying(*arguments):
         os.kill(os.getpid(), signal.SIGKILL)
 
 learner.write_network = dying
-folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
-train_detector(DetectorTrainingConfig(**folders, **settings))
+settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
+train_detector(DetectorTrainingConfig.of(settings))
 """
 
 
 def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
     plain = {
-        name: str(value) if isinstance(value, Path) else value for name, value in asdict(settings).items()
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in flattened(asdict(settings)).items()
     }
     argument = json.dumps([tiny.to_dict(), plain])
     killed = subprocess.run([sys.executable, "-c", TRAIN, argument], capture_output=True, check=False)
@@ -125,16 +126,18 @@ def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(setting
 
 def test_other_settings_do_not_continue_a_run(settings):
     train_detector(settings)
+    optimizer = replace(settings.optimizer, learning_rate=0.01)
     with pytest.raises(ConfigError, match=r"learning_rate is 0\.001 there and 0\.01 here"):
-        train_detector(replace(settings, learning_rate=0.01))
-    train_detector(replace(settings, learning_rate=0.01, force=True))
+        train_detector(replace(settings, optimizer=optimizer))
+    train_detector(replace(settings, optimizer=optimizer, force=True))
 
 
 def test_training_begins_with_the_weights_of_another_detector(settings, tiny, tmp_path):
     torch.manual_seed(5)
     first = MaskRCNN(replace(tiny, proposals=7))
     save_network(first, tmp_path / "first")
-    run = train_detector(replace(settings, init=tmp_path / "first", learning_rate=0.0))
+    optimizer = replace(settings.optimizer, learning_rate=0.0)
+    run = train_detector(replace(settings, init_from=tmp_path / "first", optimizer=optimizer))
     assert load_network(run).config.proposals == 7
     assert torch.equal(weights(run)["box_head.kinds.weight"], first.state_dict()["box_head.kinds.weight"])
 
@@ -148,22 +151,28 @@ def test_every_demonstration_is_on_one_side_and_stays_there(data):
 
 def test_too_few_demonstrations_are_told(settings):
     with pytest.raises(DatasetError, match="a batch of 400 frames needs 200"):
-        train_detector(replace(settings, batch=400))
+        train_detector(replace(settings, loader=replace(settings.loader, batch_size=400)))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"preset": "smal"}, "Did you mean 'small'"),
-        ({"batch": 5}, "must be even"),
-        ({"batch": 4.0}, "batch is 4.0; it must be a whole number"),
-        ({"learning_rate": "high", "augment": 1}, r"learning_rate is 'high'.*augment is 1; .* true or false"),
-        ({"learning_rate": float("nan")}, "learning_rate is nan; it must be between 0 and 1"),
-        ({"clip_norm": 0.0}, "clip_norm is 0"),
+        ({"loader.batch_size": 5}, "must be even"),
+        ({"loader.batch_size": 4.0}, "loader.batch_size is 4.0; it must be a whole number"),
+        (
+            {"optimizer.learning_rate": "high", "loader.augment": 1},
+            r"optimizer\.learning_rate is 'high'.*loader\.augment is 1; .* true or false",
+        ),
+        (
+            {"optimizer.learning_rate": float("nan")},
+            "optimizer.learning_rate is nan; it must be between 0 and 1",
+        ),
+        ({"optimizer.max_grad_norm": 0.0}, "optimizer.max_grad_norm is 0"),
         ({"preset": None}, "preset is None; it must be text"),
-        ({"learning_rate": -1.0, "steps": 0}, r"steps is 0.*learning_rate is -1"),
+        ({"optimizer.learning_rate": -1.0, "schedule.steps": 0}, r"learning_rate is -1.*steps is 0"),
     ],
 )
 def test_settings_that_cannot_be_are_told(data, tmp_path, changes, message):
     with pytest.raises(ConfigError, match=message):
-        DetectorTrainingConfig(data, tmp_path, **changes)
+        DetectorTrainingConfig.of({"data": data, "out": tmp_path, **changes})

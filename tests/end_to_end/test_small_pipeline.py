@@ -38,8 +38,29 @@ def run(*words: object) -> None:
 def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, capsys) -> None:
     demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
     run("generate", "--tasks", TASKS, "--episodes", 3, "--out", demos)
-    train = ["train", "--data", demos, "--preset", tiny, "--out", trained, "--batch", 4, "--steps", 3]
-    train += ["--recipe", "nano", "--pretraining-steps", 0, "--checkpoint-every", 2, "--threads", 1]
+    train = [
+        "train",
+        "--data",
+        demos,
+        "--preset",
+        tiny,
+        "--out",
+        trained,
+        "--loader.batch-size",
+        4,
+        "--schedule.steps",
+        3,
+    ]
+    train += [
+        "--recipe",
+        "nano",
+        "--pretraining.steps",
+        0,
+        "--schedule.checkpoint-every",
+        2,
+        "--runtime.threads",
+        1,
+    ]
     run(*train)
     policies = f"mine={trained},oracle,random"
     evaluate = ["evaluate", "--policy", policies, "--tasks", TASKS, "--levels", "L1", "--episodes", 2]
@@ -98,8 +119,8 @@ def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], 
 def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, capsys) -> None:
     demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
     run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
-    train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--batch", 2]
-    train += ["--steps", 12, "--checkpoint-every", 1, "--threads", 1]
+    train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--loader.batch-size", 2]
+    train += ["--schedule.steps", 12, "--schedule.checkpoint-every", 1, "--runtime.threads", 1]
     words = [sys.executable, "-m", "openvima", *(str(word) for word in train)]
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120

@@ -41,8 +41,8 @@ def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
     assert f"{size.whole.total / 1e6:.1f} million parameters" in TEXT
     assert f"text encoder of {size.parts['prompt'].total / 1e6:.1f} M parameters" in TEXT
     assert f"{len(FreePoints(1).points_mm)} free points" in TEXT
-    assert f"{100 * recipe['motion_share']:g} % of them read as" in TEXT
-    page, looks = " ".join(TEXT.split()), recipe["pretraining_random_looks"]
+    assert f"{100 * recipe['augmentation.inverse_dynamics_prob']:g} % of them read as" in TEXT
+    page, looks = " ".join(TEXT.split()), recipe["pretraining.appearance_randomization_prob"]
     assert (
         f"probability {looks:g} an object there has a random shape, and with {looks:g} a random texture"
         in page

@@ -154,7 +154,9 @@ def test_it_is_filmed_and_listed_and_shown(packaged: Path, capsys) -> None:
 
 def test_training_begins_with_it(packaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(presets.PRESETS, "narrow", narrow_small)
-    learner = build_learner(TrainingConfig(data=Path("data"), out=Path("out"), preset="narrow", init=SMALL))
+    learner = build_learner(
+        TrainingConfig(data=Path("data"), out=Path("out"), preset="narrow", init_from=SMALL)
+    )
     expected = load_checkpoint(packaged).state_dict()
     weights = learner.network.state_dict()
     assert {tensor.dtype for tensor in weights.values()} == {torch.float32}

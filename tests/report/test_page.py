@@ -291,14 +291,14 @@ def test_curves_are_grouped_by_kind(metrics):
 def test_stages_have_charts_of_their_own_and_many_curves_are_thinned(tmp_path):
     kinds = ("accuracy", "pick_accuracy", "yaw_accuracy")
     lines = [
-        {"step": 5, "name": "1-matching", "loss": 2.0, "stage": 0},
+        {"step": 5, "name": "1-pretraining", "loss": 2.0, "stage": 0},
         {"step": 5, "name": "cloning", **dict.fromkeys(kinds, 0.5)},
         {"step": 5, "name": "cloning", **{f"validation_{kind}": 0.4 for kind in kinds}},
     ]
     path = tmp_path / "metrics.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     matching, cloning = read_charts(path)
-    assert (matching.title, matching.curves) == ("Matching: loss", {"training data": [(5.0, 2.0)]})
+    assert (matching.title, matching.curves) == ("Pretraining: loss", {"training data": [(5.0, 2.0)]})
     assert list(cloning.curves) == ["held out", "pick, held out", "yaw, held out"]
 
 

@@ -199,43 +199,53 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
     "change",
     [
         {},  # images encoded once
-        {"tune_crops": True, "loader_workers": 2},
-        {"motion_share": 0.5, "accumulate": 2},
+        {"pretraining.finetune_crop_encoder": True, "loader.num_workers": 2},
+        {"augmentation.inverse_dynamics_prob": 0.5, "optimizer.grad_accum_steps": 2},
     ],
 )
 def test_a_mixed_run_that_was_killed_ends_as_if_nothing_had_happened(settings, tmp_path, change) -> None:
-    settings |= {"boxes": HOOK, **change}
-    whole = train(TrainingConfig(**{**settings, "out": tmp_path / "whole"}))
-    torn = TrainingConfig(**{**settings, "out": tmp_path / "torn"})
+    settings |= {"loader.boxes": HOOK, **change}
+    whole = train(TrainingConfig.of({**settings, "out": tmp_path / "whole"}))
+    torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
     train_until(torn, 8)
     assert_equal_runs(whole, train(torn))
     load_policy(str(whole))
 
 
 def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, data, tmp_path) -> None:
-    short = {**settings, "pretraining_steps": 0, "steps": 2, "tokens": tmp_path / "tokens"}
-    detected = train(TrainingConfig(**{**short, "boxes": HOOK, "detected_share": 1.0}))
+    short = {**settings, "pretraining.steps": 0, "schedule.steps": 2, "object_cache": tmp_path / "tokens"}
+    detected = train(TrainingConfig.of({**short, "loader.boxes": HOOK, "loader.detected_prob": 1.0}))
     (folder,) = (tmp_path / "tokens").iterdir()
     assert folder.name == f"objects-v3-{plugged_boxes(HOOK).name}"
-    plain = train(TrainingConfig(**{**short, "out": tmp_path / "plain"}))
+    plain = train(TrainingConfig.of({**short, "out": tmp_path / "plain"}))
     assert len(list((tmp_path / "tokens").iterdir())) == 2
-    none = train(TrainingConfig(**{**short, "out": tmp_path / "none", "boxes": HOOK, "detected_share": 0.0}))
-    mixed = train(TrainingConfig(**{**short, "out": tmp_path / "mixed", "boxes": HOOK}))
+    none = train(
+        TrainingConfig.of(
+            {**short, "out": tmp_path / "none", "loader.boxes": HOOK, "loader.detected_prob": 0.0}
+        )
+    )
+    mixed = train(TrainingConfig.of({**short, "out": tmp_path / "mixed", "loader.boxes": HOOK}))
     metrics = [(run / "metrics.jsonl").read_text() for run in (plain, none, mixed, detected)]
     assert metrics[0] == metrics[1]
     assert len(set(metrics)) == 3
     written = yaml.safe_load((mixed / "config.yaml").read_text())
-    assert written["training"]["detected_share"] == 0.5
+    assert written["training"]["loader"]["detected_prob"] == 0.5
     assert written["demonstrations"]["boxes"] == plugged_boxes(HOOK).name
 
 
 def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None:
     """The same weights get the same score whether or not some learnt from detected boxes."""
-    still = {**settings, "pretraining_steps": 0, "steps": 1, "learning_rate": 0.0, "weight_decay": 0.0}
+    still = {
+        **settings,
+        "pretraining.steps": 0,
+        "schedule.steps": 1,
+        "optimizer.learning_rate": 0.0,
+        "optimizer.weight_decay": 0.0,
+    }
     lines = {}
     for name, share in (("true", 0.0), ("mixed", 0.5), ("detected", 1.0)):
-        boxes = {"boxes": HOOK, "detected_share": share, "out": tmp_path / name}
-        run = train(TrainingConfig(**{**still, **boxes}))
+        boxes = {"loader.boxes": HOOK, "loader.detected_prob": share, "out": tmp_path / name}
+        run = train(TrainingConfig.of({**still, **boxes}))
         lines[name] = (run / "metrics.jsonl").read_text().splitlines()[1]
         assert "validation_loss" in lines[name]
     assert lines["true"] == lines["mixed"] != lines["detected"]
@@ -244,7 +254,9 @@ def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None
 def test_another_detector_is_another_run(settings, tmp_path) -> None:
     file = tmp_path / "extractors.py"
     file.write_text("from noisy_extractor import make\n")
-    config = TrainingConfig(**{**settings, "pretraining_steps": 0, "steps": 2, "boxes": f"{file}:make"})
+    config = TrainingConfig.of(
+        {**settings, "pretraining.steps": 0, "schedule.steps": 2, "loader.boxes": f"{file}:make"}
+    )
     train(config)
     train(config)
     file.write_text("from noisy_extractor import make  # changed\n")
@@ -255,15 +267,18 @@ def test_another_detector_is_another_run(settings, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"detected_share": 0.5}, "detected_share is 0.5, but no detector is given"),
-        ({"boxes": HOOK, "detected_share": 1.5}, "between 0 and 1"),
-        ({"boxes": HOOK, "preset": "gato-nano"}, "preset 'gato-nano' sees whole frames; leave boxes out"),
-        ({"boxes": "nobody"}, "boxes is 'nobody'; give detector"),
-        ({"boxes": "builtins:nobody"}, "has no function 'nobody'"),
+        ({"loader.detected_prob": 0.5}, "loader.detected_prob is 0.5, but no detector is given"),
+        ({"loader.boxes": HOOK, "loader.detected_prob": 1.5}, "between 0 and 1"),
+        (
+            {"loader.boxes": HOOK, "preset": "gato-nano"},
+            "preset 'gato-nano' takes whole frames; leave it out",
+        ),
+        ({"loader.boxes": "nobody"}, "boxes is 'nobody'; give detector"),
+        ({"loader.boxes": "builtins:nobody"}, "has no function 'nobody'"),
     ],
 )
 def test_boxes_that_cannot_be_leave_no_run_folder(settings, change, message) -> None:
-    fits = {"pretraining_steps": 0} if "preset" in change else {}
+    fits = {"pretraining.steps": 0} if "preset" in change else {}
     with pytest.raises(ConfigError, match=message):
-        train(TrainingConfig(**{**settings, **fits, **change}))
+        train(TrainingConfig.of({**settings, **fits, **change}))
     assert not settings["out"].exists()

@@ -15,29 +15,41 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.scene import Action  # noqa: E402
+from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
 from openvima.training.schedule import step_seed  # noqa: E402
-from openvima.training.stages import Cloning  # noqa: E402
 
 STEPS = 3
 
 
 def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
-    words = ["train", "--data", data, "--out", out, "--preset", preset, "--steps", STEPS, "--batch", 3]
-    return main([str(word) for word in (*words, "--checkpoint-every", 1, *options)])
+    words = [
+        "train",
+        "--data",
+        data,
+        "--out",
+        out,
+        "--preset",
+        preset,
+        "--schedule.steps",
+        STEPS,
+        "--loader.batch-size",
+        3,
+    ]
+    return main([str(word) for word in (*words, "--schedule.checkpoint-every", 1, *options)])
 
 
 @pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt", "midas"])
 def test_a_run_can_be_interrupted_and_gives_a_policy_that_acts(family, data, tmp_path, monkeypatch) -> None:
     preset, whole, torn = f"{family}-nano", tmp_path / "whole", tmp_path / "torn"
     assert run_train(data, whole, preset) == 0
-    backward = Cloning.backward
+    backward = BehaviourCloning.backward
 
-    def interrupted(self: Cloning, step: int) -> dict[str, float]:
+    def interrupted(self: BehaviourCloning, step: int) -> dict[str, float]:
         if step == 2:
             raise KeyboardInterrupt
         return backward(self, step)
 
-    monkeypatch.setattr(Cloning, "backward", interrupted)
+    monkeypatch.setattr(BehaviourCloning, "backward", interrupted)
     assert run_train(data, torn, preset) == 130
     monkeypatch.undo()
     assert run_train(data, torn, preset) == 0
@@ -58,7 +70,7 @@ def test_without_an_appearance_embedding_there_is_no_matching_and_the_images_are
     data, tmp_path
 ) -> None:
     assert run_train(data, tmp_path, "gpt-nano") == 0
-    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]["pretraining_steps"] == 0
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]["pretraining"]["steps"] == 0
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert {line["name"] for line in lines} == {"2-cloning"}
     metrics = {name for line in lines for name in line}

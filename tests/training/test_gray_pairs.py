@@ -14,7 +14,7 @@ from openvima.perception.objects import observe_prompt_image  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Prompt, Scene  # noqa: E402
 from openvima.tasks.novel_words import gray_image  # noqa: E402
-from openvima.training import TrainingConfig, loop, pretrain, train  # noqa: E402
+from openvima.training import TrainingConfig, policy, pretrain, train  # noqa: E402
 from openvima.training.pretrain import Pairs, Variety, alike_in_prompts, pairs_of_scene, stacked  # noqa: E402
 from openvima.training.scene_variants import with_random_looks  # noqa: E402
 
@@ -155,14 +155,14 @@ def test_which_are_gray_follows_from_the_seed():
 
 
 def test_a_run_draws_as_many_as_its_settings_say(settings, monkeypatch):
-    varieties, original = [], loop.render_pairs
+    varieties, original = [], policy.render_pairs
 
     def spy(*words, variety, **rest):
         varieties.append(variety)
         return original(*words, variety=variety, **rest)
 
-    monkeypatch.setattr(loop, "render_pairs", spy)
-    train(TrainingConfig(**{**settings, "steps": 1, "pretraining_grays": 0.4}))
+    monkeypatch.setattr(policy, "render_pairs", spy)
+    train(TrainingConfig.of({**settings, "schedule.steps": 1, "pretraining.grayscale_prob": 0.4}))
     assert [variety.grays for variety in varieties] == [0.4]
 
 

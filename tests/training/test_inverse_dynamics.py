@@ -147,36 +147,55 @@ def last_weights(run: Path) -> dict[str, "torch.Tensor"]:
 
 
 def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
-    words = ["--data", str(data), "--preset", "midas-nano", "--steps", "1", "--batch", "2"]
+    words = [
+        "--data",
+        str(data),
+        "--preset",
+        "midas-nano",
+        "--schedule.steps",
+        "1",
+        "--loader.batch-size",
+        "2",
+    ]
     before, after = str(tmp_path / "before"), str(tmp_path / "after")
-    assert main(["train", *words, "--motion-share", "1", "--out", before]) == 0
-    config = TrainingConfig(data=data, out=Path(after), preset="midas-nano", init=before)
+    assert main(["train", *words, "--augmentation.inverse-dynamics-prob", "1", "--out", before]) == 0
+    config = TrainingConfig(data=data, out=Path(after), preset="midas-nano", init_from=before)
     begun = build_learner(config).network.state_dict()
     weights = last_weights(Path(before))
     assert begun.keys() == weights.keys()
     assert all(torch.equal(begun[name], weights[name]) for name in weights)
-    assert main(["train", *words, "--init", before, "--learning-rate", "0", "--out", after]) == 0
+    assert (
+        main(["train", *words, "--init-from", before, "--optimizer.learning-rate", "0", "--out", after]) == 0
+    )
     assert all(torch.equal(tensor, weights[name]) for name, tensor in last_weights(Path(after)).items())
 
 
-@pytest.mark.parametrize("tune_crops", [False, True])
-def test_what_has_matched_looks_need_not_do_so_again(tune_crops, settings, tmp_path) -> None:
+@pytest.mark.parametrize("finetune", [False, True])
+def test_what_has_matched_looks_need_not_do_so_again(finetune, settings, tmp_path) -> None:
     """The crop encoder is taken over, and stays as it is unless it is to be tuned."""
-    first = train(TrainingConfig(**{**settings, "steps": 1}))
-    again = {**settings, "pretraining_steps": None, "warmup_steps": 0, "steps": 2, "out": tmp_path / "on"}
-    train(TrainingConfig(**again, init=str(first), tune_crops=tune_crops))
+    first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
+    again = {
+        **settings,
+        "pretraining.steps": None,
+        "schedule.warmup_steps": 0,
+        "schedule.steps": 2,
+        "out": tmp_path / "on",
+    }
+    train(
+        TrainingConfig.of({**again, "init_from": str(first), "pretraining.finetune_crop_encoder": finetune})
+    )
     names = sorted(path.name for path in (tmp_path / "on" / "checkpoints").glob("*-0*"))
     assert names == ["2-cloning-000002"]
     before, after = last_weights(first), last_weights(tmp_path / "on")
     kept = {name for name in before if torch.equal(before[name], after[name])}
     crops = {name for name in before if name.startswith("images.crop_encoder")}
     assert crops and "trunk.positions.weight" not in kept
-    assert crops <= kept if not tune_crops else not crops <= kept
+    assert crops <= kept if not finetune else not crops <= kept
 
 
 def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
-    first = train(TrainingConfig(**{**settings, "steps": 1}))
-    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano-bins", init=str(first))
+    first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
+    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano-bins", init_from=str(first))
     with pytest.raises(ConfigError, match=r"of other sizes: images\.crop\.width is 4 there and 32 here"):
         train(other)
     assert not other.out.exists()
@@ -185,15 +204,17 @@ def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("switch", "value"),
     [
-        ("motion_share", 0.5),
-        ("bystander_share", 0.5),
-        ("naming_share", 0.5),
+        ("augmentation.inverse_dynamics_prob", 0.5),
+        ("augmentation.drop_unused_objects_prob", 0.5),
+        ("augmentation.rename_objects_prob", 0.5),
         ("autoregressive", True),
         ("visual_residual", True),
     ],
 )
 def test_a_learner_of_ones_own_has_no_such_switch(switch, value, data, tmp_path) -> None:
-    config = TrainingConfig(data=data, out=tmp_path / "run", preset="some:learner", **{switch: value})
+    config = TrainingConfig.of(
+        {"data": data, "out": tmp_path / "run", "preset": "some:learner", switch: value}
+    )
     with pytest.raises(ConfigError, match=f"does not know {switch}; leave it out"):
         train(config)
 

@@ -24,20 +24,20 @@ from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])
 presets.PRESETS["tiny"] = lambda: PolicyConfig.from_dict(sizes)
-folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
-train(TrainingConfig(**folders, **settings), lambda done, total, note: print(note, flush=True))
+settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
+train(TrainingConfig.of(settings), lambda done, total, note: print(note, flush=True))
 """
 
 
 @pytest.fixture
 def config(settings) -> TrainingConfig:
-    return TrainingConfig(**{**settings, "checkpoint_every": 1})
+    return TrainingConfig.of({**settings, "schedule.checkpoint_every": 1})
 
 
 @pytest.fixture
 def whole(settings, tmp_path) -> Path:
     """A run that was never interrupted."""
-    return train(TrainingConfig(**{**settings, "checkpoint_every": 1, "out": tmp_path / "whole"}))
+    return train(TrainingConfig.of({**settings, "schedule.checkpoint_every": 1, "out": tmp_path / "whole"}))
 
 
 def assert_same(run: Path, whole: Path) -> None:
@@ -66,7 +66,7 @@ def interrupted(config: TrainingConfig, at: str) -> None:
         train(config, report)
 
 
-@pytest.mark.parametrize("stages", [("1-matching",), ("2-cloning",), ("1-matching", "2-cloning")])
+@pytest.mark.parametrize("stages", [("1-pretraining",), ("2-cloning",), ("1-pretraining", "2-cloning")])
 def test_a_run_stopped_by_the_keyboard_goes_on_as_if_it_had_not_been(config, whole, stages) -> None:
     for stage in stages:
         interrupted(config, stage)
@@ -75,9 +75,9 @@ def test_a_run_stopped_by_the_keyboard_goes_on_as_if_it_had_not_been(config, who
 
 def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(config, settings, whole) -> None:
     plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
-    plain["checkpoint_every"] = 1
+    plain["schedule.checkpoint_every"] = 1
     argument = json.dumps([presets.PRESETS["tiny"]().to_dict(), plain])
-    for stage in ("1-matching", "2-cloning"):
+    for stage in ("1-pretraining", "2-cloning"):
         process = subprocess.Popen([sys.executable, "-c", TRAIN, argument], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         seen = 0

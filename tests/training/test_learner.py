@@ -31,8 +31,20 @@ def example(monkeypatch) -> str:
 
 def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, tmp_path, capsys) -> None:
     out = tmp_path / "run"
-    words = ["train", "--data", data, "--out", out, "--preset", example, "--batch", 8, "--steps", 6]
-    words += ["--checkpoint-every", 3, "--validation-share", 0.2]
+    words = [
+        "train",
+        "--data",
+        data,
+        "--out",
+        out,
+        "--preset",
+        example,
+        "--loader.batch-size",
+        8,
+        "--schedule.steps",
+        6,
+    ]
+    words += ["--schedule.checkpoint-every", 3, "--loader.validation-fraction", 0.2]
     assert main([str(word) for word in words]) == 0
     whole = {path.name: path.read_bytes() for path in out.rglob("model.safetensors")}
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
@@ -77,13 +89,13 @@ def test_a_learner_that_does_not_tell_its_score_is_named_at_once(example, settin
 
     monkeypatch.setattr(custom_learner.Matcher, "score", "accuracy")
     with pytest.raises(ConfigError, match=r"score is 'accuracy', but .* pick_accuracy, place_accuracy; name"):
-        train(TrainingConfig(**{**settings, "preset": example, "pretraining_steps": 0}))
+        train(TrainingConfig.of({**settings, "preset": example, "pretraining.steps": 0}))
     assert not (settings["out"] / "metrics.jsonl").exists()
 
 
 def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
     with pytest.raises(ConfigError, match="does not know pretraining_steps"):
-        train(TrainingConfig(**{**settings, "preset": example}))
+        train(TrainingConfig.of({**settings, "preset": example}))
 
 
 def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
@@ -103,7 +115,7 @@ def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
         seen.append(checkpoint.name)
         return OnlineEval(("rotate",), episodes=2)(checkpoint)
 
-    config = TrainingConfig(**settings, rollout_every=4)
+    config = TrainingConfig.of({**settings, "rollout.every": 4})
     train(config, rollout=rollout)
     assert seen == ["2-cloning-000004"]
     lines = [json.loads(line) for line in (config.out / "metrics.jsonl").read_text().splitlines()]
@@ -113,14 +125,20 @@ def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
 
 def test_checkpoints_that_are_to_be_kept_are_kept(settings) -> None:
     """Also between those from which a run could go on."""
-    run = train(TrainingConfig(**{**settings, "keep_every": 2, "checkpoint_every": 5}))
+    run = train(TrainingConfig.of({**settings, "schedule.keep_every": 2, "schedule.checkpoint_every": 5}))
     kept = {folder.name for folder in (run / "checkpoints").glob("2-*")}
     assert kept >= {"2-cloning-000002", "2-cloning-000004", "2-cloning-000006"}
 
 
 def test_a_run_of_epochs_takes_as_many_steps_as_they_have(settings) -> None:
-    config = {**settings, "pretraining_steps": 0, "epochs": 1.5, "batch": 4, "validation_share": 0.0}
-    run = train(TrainingConfig(**config))
+    config = {
+        **settings,
+        "pretraining.steps": 0,
+        "schedule.epochs": 1.5,
+        "loader.batch_size": 4,
+        "loader.validation_fraction": 0.0,
+    }
+    run = train(TrainingConfig.of(config))
     assert [folder.name for folder in (run / "checkpoints").glob("2-*-000009")] == ["2-cloning-000009"]
 
 
@@ -140,27 +158,27 @@ def test_tensorboard_shows_the_metrics(settings) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     with pytest.raises(KeyboardInterrupt):  # what it told of step 4 comes again
-        train(TrainingConfig(**settings), _interrupts_at(4 + 4))
-    run = train(TrainingConfig(**settings))
+        train(TrainingConfig.of(settings), _interrupts_at(4 + 4))
+    run = train(TrainingConfig.of(settings))
     events = EventAccumulator(str(run / "tensorboard_log"))
     events.Reload()
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    for name, before in (("1-matching", 0), ("2-cloning", 4)):
+    for name, before in (("1-pretraining", 0), ("2-cloning", 4)):
         told = [
             (before + line["step"], line["loss"]) for line in lines if line["name"] == name and "loss" in line
         ]
         shown = [(event.step, event.value) for event in events.Scalars(f"{name}/loss")]
         assert shown == [(step, pytest.approx(loss)) for step, loss in told]
     assert not (
-        train(TrainingConfig(**{**settings, "out": run.with_name("b"), "tensorboard": False}))
+        train(TrainingConfig.of({**settings, "out": run.with_name("b"), "runtime.tensorboard": False}))
         / "tensorboard_log"
     ).exists()
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_last_checkpoint(settings, monkeypatch) -> None:
-    from openvima.training.stages import Cloning
+    from openvima.training.behaviour_cloning import BehaviourCloning
 
-    backward = Cloning.backward
+    backward = BehaviourCloning.backward
 
     def exploding(self, step: int) -> dict[str, float]:
         metrics = backward(self, step)
@@ -168,7 +186,9 @@ def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_last_checkpoint(se
             self.parameters[0].grad.fill_(float("nan"))
         return metrics
 
-    monkeypatch.setattr(Cloning, "backward", exploding)
-    with pytest.raises(ConfigError, match=r"the gradient is nan at step 3 of 2-cloning.*lower learning_rate"):
-        train(TrainingConfig(**settings))
+    monkeypatch.setattr(BehaviourCloning, "backward", exploding)
+    with pytest.raises(
+        ConfigError, match=r"the gradient is nan at step 3 of 2-cloning.*lower optimizer.learning_rate"
+    ):
+        train(TrainingConfig.of(settings))
     assert (settings["out"] / "checkpoints" / "2-cloning-000002").is_dir()

@@ -23,8 +23,8 @@ def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:
 
 @pytest.mark.parametrize("killed_at", [1, 3, 4, 7])
 def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_path, killed_at):
-    whole = TrainingConfig(**{**settings, "out": tmp_path / "whole"})
-    torn = TrainingConfig(**{**settings, "out": tmp_path / "torn"})
+    whole = TrainingConfig.of({**settings, "out": tmp_path / "whole"})
+    torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
     train(whole)
     train_until(torn, killed_at)
     train(torn)
@@ -37,7 +37,7 @@ def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_
 
 
 def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
-    config = TrainingConfig(**settings)
+    config = TrainingConfig.of(settings)
     train_until(config, 7)
     with (config.out / "metrics.jsonl").open("a") as lines:
         lines.write('{"stage": 1, "step": 3, "name": "2-cloning", "loss": 1.0}\n{"stage": 1, "st')
@@ -51,7 +51,7 @@ def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
 
 
 def test_a_finished_run_is_left_as_it_is(settings):
-    config = TrainingConfig(**settings)
+    config = TrainingConfig.of(settings)
     train(config)
     before = {file: file.stat().st_mtime_ns for file in config.out.rglob("*.safetensors")}
     train(config)
@@ -59,7 +59,7 @@ def test_a_finished_run_is_left_as_it_is(settings):
 
 
 def test_another_seed_gives_other_weights(settings, tmp_path):
-    runs = [TrainingConfig(**{**settings, "seed": seed, "out": tmp_path / str(seed)}) for seed in (0, 1)]
+    runs = [TrainingConfig.of({**settings, "seed": seed, "out": tmp_path / str(seed)}) for seed in (0, 1)]
     first, second = (final_weights(train(run)) for run in runs)
     assert not torch.equal(first["query"], second["query"])
 
@@ -69,17 +69,18 @@ def test_global_random_state_and_threads_are_left_alone(settings):
     expected = torch.rand(2)
     torch.manual_seed(3)
     threads = torch.get_num_threads()
-    train(TrainingConfig(**settings))
+    train(TrainingConfig.of(settings))
     assert torch.equal(torch.rand(2), expected)
     assert torch.get_num_threads() == threads
 
 
 def test_other_settings_on_a_run_are_named_and_force_begins_anew(settings):
-    train(TrainingConfig(**settings))
-    changed = {**settings, "steps": 2, "learning_rate": 5e-4}
-    with pytest.raises(ConfigError, match=r"training\.steps is 6 there and 2 here; training\.learning_rate"):
-        train(TrainingConfig(**changed))
-    run = train(TrainingConfig(**changed, force=True))
+    train(TrainingConfig.of(settings))
+    changed = {**settings, "schedule.steps": 2, "optimizer.learning_rate": 5e-4}
+    differing = r"training\.optimizer\.learning_rate is .*; training\.schedule\.steps is 6 there and 2 here"
+    with pytest.raises(ConfigError, match=differing):
+        train(TrainingConfig.of(changed))
+    run = train(TrainingConfig.of({**changed, "force": True}))
     assert [folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()] == [
         "2-cloning-000002"
     ]
@@ -89,31 +90,31 @@ def test_a_folder_with_other_files_is_never_cleared(settings):
     settings["out"].mkdir()
     (settings["out"] / "thesis.tex").write_text("years of work")
     with pytest.raises(ConfigError, match="not empty"):
-        train(TrainingConfig(**settings))
+        train(TrainingConfig.of(settings))
     with pytest.raises(ConfigError, match="other files"):
-        train(TrainingConfig(**settings, force=True))
+        train(TrainingConfig.of({**settings, "force": True}))
     assert (settings["out"] / "thesis.tex").exists()
 
 
 def test_without_demonstrations_the_error_says_how_to_make_some(settings, tmp_path):
     with pytest.raises(DatasetError, match="openvima generate"):
-        train(TrainingConfig(**{**settings, "data": tmp_path / "nothing"}))
+        train(TrainingConfig.of({**settings, "data": tmp_path / "nothing"}))
     assert not settings["out"].exists()
 
 
 def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
-    run = train(TrainingConfig(**settings))
+    run = train(TrainingConfig.of(settings))
     kept = {folder.name for folder in (run / "checkpoints").iterdir() if folder.is_dir()}
     assert kept == {"2-cloning-000006", (run / "checkpoints" / "best.txt").read_text()}
     load_policy(str(run))
 
 
 def test_metrics_name_stage_and_step_and_hold_no_times(settings):
-    run = train(TrainingConfig(**settings))
+    run = train(TrainingConfig.of(settings))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [(line["name"], line["step"]) for line in lines if "loss" in line] == [
-        ("1-matching", 2),
-        ("1-matching", 4),
+        ("1-pretraining", 2),
+        ("1-pretraining", 4),
         ("2-cloning", 2),
         ("2-cloning", 4),
         ("2-cloning", 6),
@@ -122,15 +123,15 @@ def test_metrics_name_stage_and_step_and_hold_no_times(settings):
 
 
 def test_a_run_that_was_killed_before_it_could_name_its_best_checkpoint_names_it_later(settings):
-    best = train(TrainingConfig(**settings)) / "checkpoints" / "best.txt"
+    best = train(TrainingConfig.of(settings)) / "checkpoints" / "best.txt"
     name = best.read_text()
     best.unlink()
-    train(TrainingConfig(**settings))
+    train(TrainingConfig.of(settings))
     assert best.read_text() == name
 
 
 def test_a_damaged_checkpoint_is_named(settings):
-    config = TrainingConfig(**settings)
+    config = TrainingConfig.of(settings)
     train_until(config, 3)
     (weights,) = config.out.rglob("model.safetensors")
     weights.write_bytes(weights.read_bytes()[:100])
@@ -139,7 +140,7 @@ def test_a_damaged_checkpoint_is_named(settings):
 
 
 def test_what_an_interrupted_save_left_behind_is_removed(settings):
-    config = TrainingConfig(**settings)
+    config = TrainingConfig.of(settings)
     leftover = config.out / "checkpoints" / "2-cloning-000002.partial"
     train_until(config, 3)
     leftover.mkdir()
@@ -150,17 +151,21 @@ def test_what_an_interrupted_save_left_behind_is_removed(settings):
 
 def test_the_progress_report_ends_at_the_total(settings):
     seen = []
-    train(TrainingConfig(**settings), lambda done, total, note: seen.append((done, total, note)))
+    train(TrainingConfig.of(settings), lambda done, total, note: seen.append((done, total, note)))
     assert seen[-1][:2] == (10, 10)
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
     assert "drawing scenes" in seen[0][2]
 
 
 @pytest.mark.parametrize(
-    "change", [{"preset": "nano-bins", "pretraining_steps": 0, "steps": 1}, {"tune_crops": True}]
+    "change",
+    [
+        {"preset": "nano-bins", "pretraining.steps": 0, "schedule.steps": 1},
+        {"pretraining.finetune_crop_encoder": True},
+    ],
 )
 def test_bins_and_tuned_crops_train_too(settings, change):
-    run = train(TrainingConfig(**{**settings, **change}))
+    run = train(TrainingConfig.of({**settings, **change}))
     load_policy(str(run))
 
 
@@ -174,30 +179,30 @@ def test_an_empty_run_folder_has_nothing_to_go_on_from(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "steps is 0; it must be at least 1"),
-        ({"spurious_probability": 1.5}, "between 0 and 1"),
+        ({"schedule.steps": 0}, "steps is 0; it must be at least 1"),
+        ({"augmentation.false_positive_prob": 1.5}, "between 0 and 1"),
         ({"preset": "gato-nanno"}, "no preset 'gato-nanno'. Did you mean 'gato-nano'"),
     ],
 )
 def test_settings_out_of_range_are_named(settings, change, message):
     with pytest.raises(ConfigError, match=message):
-        TrainingConfig(**{**settings, **change})
+        TrainingConfig.of({**settings, **change})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"preset": "vima-2m"}, "'vima-2m' reads prompts with T5.* take nano"),
-        ({"preset": "gato-nano", "pretraining_steps": 5}, "'gato-nano' has no appearance embedding"),
+        ({"preset": "vima-2m"}, "'vima-2m' encodes prompts with T5.* take nano"),
+        ({"preset": "gato-nano", "pretraining.steps": 5}, "'gato-nano' has no appearance embedding"),
     ],
 )
 def test_a_preset_that_cannot_be_trained_so_leaves_no_run_folder(settings, change, message):
     with pytest.raises(ConfigError, match=message):
-        train(TrainingConfig(**{**settings, **change}))
+        train(TrainingConfig.of({**settings, **change}))
     assert not settings["out"].exists()
 
 
 def test_an_unknown_asset_pack_leaves_no_run_folder(settings):
     with pytest.raises(AssetError, match="nosuch"):
-        train(TrainingConfig(**settings, assets="nosuch"))
+        train(TrainingConfig.of({**settings, "assets": "nosuch"}))
     assert not settings["out"].exists()

@@ -17,11 +17,12 @@ from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
+from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
 from openvima.training.collate import Collator  # noqa: E402
+from openvima.training.config import AugmentationConfig, LoaderConfig  # noqa: E402
 from openvima.training.dataset import Batch  # noqa: E402
 from openvima.training.learner import PolicyLearner  # noqa: E402
 from openvima.training.parallel import Parallel  # noqa: E402
-from openvima.training.stages import Cloning  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import examples_of, source_of  # noqa: E402
 
@@ -146,9 +147,12 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
     model = build_network(sizes, seed=0)
     learner = PolicyLearner(model, reader)
     config = TrainingConfig(
-        data=tmp_path, out=tmp_path, batch=32, pretraining_steps=0, spurious_probability=0.0
+        data=tmp_path,
+        out=tmp_path,
+        loader=LoaderConfig(batch_size=32),
+        augmentation=AugmentationConfig(false_positive_prob=0.0),
     )
-    stage = Cloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
+    stage = BehaviourCloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
     optimizer = torch.optim.AdamW(stage.parameters, lr=2e-3)
     for step in range(150):
         optimizer.zero_grad()
@@ -175,9 +179,12 @@ def test_the_copying_network_learns_places_by_heart_that_prompt_and_past_show(ta
     source, model = source_of(runs, reader), build_network(sizes, seed=0)
     learner = PolicyLearner(model, reader)
     config = TrainingConfig(
-        data=tmp_path, out=tmp_path, batch=6, pretraining_steps=0, spurious_probability=0.0
+        data=tmp_path,
+        out=tmp_path,
+        loader=LoaderConfig(batch_size=6),
+        augmentation=AugmentationConfig(false_positive_prob=0.0),
     )
-    stage = Cloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
+    stage = BehaviourCloning(learner, learner, config, source, source, Parallel(0, 1, torch.device("cpu")))
     optimizer = torch.optim.AdamW(stage.parameters, lr=2e-3)
     for step in range(120):
         optimizer.zero_grad()

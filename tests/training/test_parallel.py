@@ -26,9 +26,9 @@ from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])
 presets.PRESETS["tiny-bins"] = lambda: PolicyConfig.from_dict(sizes)
-folders = {name: Path(settings.pop(name)) for name in ("data", "out")}
 kill_at = settings.pop("kill_at", None)
-train(TrainingConfig(**folders, **settings), lambda done, total, note: done == kill_at and os._exit(9))
+settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
+train(TrainingConfig.of(settings), lambda done, total, note: done == kill_at and os._exit(9))
 """
 
 
@@ -44,8 +44,14 @@ def bins(settings, monkeypatch) -> dict:
         return replace(sizes, trunk=trunk, images=images, prompt=replace(sizes.prompt, text=text))
 
     monkeypatch.setitem(presets.PRESETS, "tiny-bins", tiny)
-    changes = {"preset": "tiny-bins", "pretraining_steps": 0, "steps": 6, "batch": 8, "checkpoint_every": 1}
-    return {**settings, **changes, "spurious_probability": 0.3}
+    changes = {
+        "preset": "tiny-bins",
+        "pretraining.steps": 0,
+        "schedule.steps": 6,
+        "loader.batch_size": 8,
+        "schedule.checkpoint_every": 1,
+    }
+    return {**settings, **changes, "augmentation.false_positive_prob": 0.3}
 
 
 def run_in_processes(count: int, settings: dict) -> Path:
@@ -101,36 +107,36 @@ def assert_alike(ours: Path, theirs: Path) -> None:
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
 def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
-    bins |= {"boxes": HOOK}
-    one = train(TrainingConfig(**{**bins, "out": tmp_path / "one"}))
-    parts = {"accumulate": 8}  # more than demonstrations of a process
-    two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two", "sharding": sharding})
+    bins |= {"loader.boxes": HOOK}
+    one = train(TrainingConfig.of({**bins, "out": tmp_path / "one"}))
+    parts = {"optimizer.grad_accum_steps": 8}  # more than demonstrations of a process
+    two = run_in_processes(2, {**bins, **parts, "out": tmp_path / "two", "runtime.sharding": sharding})
     assert_alike(one, two)
     load_policy(str(two))
 
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
 def test_a_run_of_two_processes_goes_on_with_one(bins, tmp_path, sharding) -> None:
-    whole = train(TrainingConfig(**{**bins, "out": tmp_path / "whole"}))
-    torn = {**bins, "out": tmp_path / "torn", "sharding": sharding}
+    whole = train(TrainingConfig.of({**bins, "out": tmp_path / "whole"}))
+    torn = {**bins, "out": tmp_path / "torn", "runtime.sharding": sharding}
     run_in_processes(2, {**torn, "kill_at": 4})
     assert sorted(path.name for path in (tmp_path / "torn/checkpoints").glob("2-*"))[-1].endswith("000003")
-    assert_alike(whole, train(TrainingConfig(**torn)))
+    assert_alike(whole, train(TrainingConfig.of(torn)))
 
 
 def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, tmp_path) -> None:
-    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
-    ahead = train(TrainingConfig(**{**bins, "out": tmp_path / "ahead", "loader_workers": 2}))
+    plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
+    ahead = train(TrainingConfig.of({**bins, "out": tmp_path / "ahead", "loader.num_workers": 2}))
     assert (plain / "metrics.jsonl").read_bytes() == (ahead / "metrics.jsonl").read_bytes()
-    parts = train(TrainingConfig(**{**bins, "out": tmp_path / "parts", "accumulate": 4}))
+    parts = train(TrainingConfig.of({**bins, "out": tmp_path / "parts", "optimizer.grad_accum_steps": 4}))
     assert_alike(plain, parts)
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # of the tracer itself
 def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
     """Traced as for the compiler, but run as they are: generating code takes a minute."""
-    bins |= {"steps": 2, "checkpoint_every": 2}
-    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
+    bins |= {"schedule.steps": 2, "schedule.checkpoint_every": 2}
+    plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
     traced, compiled = [], torch.nn.Module.compile
 
     def trace(module: torch.nn.Module, **options) -> None:
@@ -139,15 +145,17 @@ def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
 
     monkeypatch.setattr(torch.nn.Module, "compile", trace)
     torch.compiler.reset()
-    assert_alike(plain, train(TrainingConfig(**{**bins, "out": tmp_path / "traced", "compile": True})))
+    assert_alike(
+        plain, train(TrainingConfig.of({**bins, "out": tmp_path / "traced", "runtime.compile": True}))
+    )
     torch.compiler.reset()
     assert {"CrossBlock", "SelfBlock", "TextBlock"} <= set(traced)
     assert not {"Linear", "Sequential"} & set(traced)
 
 
 def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:
-    plain = train(TrainingConfig(**{**bins, "out": tmp_path / "plain"}))
-    half = train(TrainingConfig(**{**bins, "out": tmp_path / "half", "precision": "bfloat16"}))
+    plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
+    half = train(TrainingConfig.of({**bins, "out": tmp_path / "half", "runtime.precision": "bfloat16"}))
     for a, b in zip(losses(plain), losses(half), strict=True):
         if "loss" in a:
             assert a["loss"] != b["loss"]

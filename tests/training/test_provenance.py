@@ -13,7 +13,7 @@ from openvima.training.provenance import git_state, provenance
 
 
 def test_every_start_of_a_run_is_noted(settings, data):
-    config = TrainingConfig(**{**settings, "checkpoint_every": 3})
+    config = TrainingConfig.of({**settings, "schedule.checkpoint_every": 3})
     train(config)
     train(config)
     lines = [json.loads(line) for line in (config.out / "sessions_log.jsonl").read_text().splitlines()]

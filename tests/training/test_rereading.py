@@ -1,7 +1,6 @@
 """Demonstrations told in other words, and motions without what is beside the point."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -162,12 +161,15 @@ def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"preset": "gpt-nano", "naming_share": 0.5}, "sees whole frames"),
-        ({"preset": "gpt-nano", "bystander_share": 0.5}, "sees whole frames"),
-        ({"preset": "nano", "bystander_share": 0.5, "boxes": "detector"}, "no ids that tell bystanders"),
+        ({"preset": "gpt-nano", "augmentation.rename_objects_prob": 0.5}, "takes whole frames"),
+        ({"preset": "gpt-nano", "augmentation.drop_unused_objects_prob": 0.5}, "takes whole frames"),
+        (
+            {"preset": "nano", "augmentation.drop_unused_objects_prob": 0.5, "loader.boxes": "detector"},
+            "no ids, so unused ones are unknown",
+        ),
     ],
 )
 def test_what_needs_objects_and_their_ids_says_so(settings, message, tmp_path):
-    config = replace(TrainingConfig(data=tmp_path, out=tmp_path / "run"), **settings)
+    config = TrainingConfig.of({"data": tmp_path, "out": tmp_path / "run", **settings})
     with pytest.raises(ConfigError, match=message):
         train(config)

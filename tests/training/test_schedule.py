@@ -4,12 +4,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.training.config import ScheduleConfig  # noqa: E402
 from openvima.training.schedule import learning_rate_at, step_generator, step_seed  # noqa: E402
 
 
 def shares(steps: int, warmup_steps: int) -> list[float]:
     return [
-        learning_rate_at(step, highest=1.0, steps=steps, warmup_steps=warmup_steps) for step in range(steps)
+        learning_rate_at(step, ScheduleConfig(warmup_steps=warmup_steps), peak=1.0, num_steps=steps)
+        for step in range(steps)
     ]
 
 
@@ -25,19 +27,20 @@ def test_the_rate_rises_to_its_peak_and_then_only_falls(steps: int, warmup_steps
 
 
 def test_the_rise_is_a_line_and_the_fall_half_a_cosine() -> None:
-    values = shares(100, 9)
+    values, schedule = shares(100, 9), ScheduleConfig(warmup_steps=9)
     assert values[:9] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
-    assert learning_rate_at(55, highest=1, steps=101, warmup_steps=9) == pytest.approx(0.5)
-    assert learning_rate_at(100, highest=1, steps=100, warmup_steps=9) == pytest.approx(0)
-    assert learning_rate_at(1000, highest=1, steps=100, warmup_steps=9) == pytest.approx(0)
+    assert learning_rate_at(55, schedule, peak=1, num_steps=101) == pytest.approx(0.5)
+    assert learning_rate_at(100, schedule, peak=1, num_steps=100) == pytest.approx(0)
+    assert learning_rate_at(1000, schedule, peak=1, num_steps=100) == pytest.approx(0)
 
 
 def test_the_fall_may_end_early_and_above_zero() -> None:
-    settings = {"highest": 1e-4, "steps": 47_000, "warmup_steps": 7000, "decay_steps": 17_000, "final": 1e-7}
+    schedule = ScheduleConfig(warmup_steps=7000, decay_steps=17_000, final_learning_rate=1e-7)
+    settings = {"schedule": schedule, "peak": 1e-4, "num_steps": 47_000}
     assert learning_rate_at(7000, **settings) == pytest.approx(1e-4)
     assert learning_rate_at(15_500, **settings) == pytest.approx((1e-4 + 1e-7) / 2)
     assert learning_rate_at(24_000, **settings) == learning_rate_at(46_999, **settings) == 1e-7
-    short = {**settings, "steps": 9000}  # then the warm-up is a third, and the fall ends with the run
+    short = {**settings, "num_steps": 9000}  # then the warm-up is a third, and the fall ends with the run
     assert learning_rate_at(3000, **short) == pytest.approx(1e-4)
     assert learning_rate_at(9000, **short) == pytest.approx(1e-7)
 

@@ -71,8 +71,8 @@ def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
     for module in (sequence_lengths, trunk):
         monkeypatch.setattr(module, "MAX_PLACES", 30)
-    config = TrainingConfig(
-        **{**settings, "preset": "midas-nano", "pretraining_steps": 0, "checkpoint_every": 1}
+    config = TrainingConfig.of(
+        {**settings, "preset": "midas-nano", "pretraining.steps": 0, "schedule.checkpoint_every": 1}
     )
     with pytest.raises(DatasetError, match=r"of sweep_without_exceeding is too long .* takes 30\. .*--tasks"):
         train(config)

@@ -130,10 +130,10 @@ def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"preset": "gpt-nano", "stranger_share": 0.5}, "sees whole frames"),
-        ({"stranger_share": 1.5}, "stranger_share"),
+        ({"preset": "gpt-nano", "augmentation.distractor_prob": 0.5}, "takes whole frames"),
+        ({"augmentation.distractor_prob": 1.5}, "augmentation.distractor_prob"),
     ],
 )
 def test_wrong_shares_say_so(settings, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
-        train(TrainingConfig(data=tmp_path, out=tmp_path / "run", **settings))
+        train(TrainingConfig.of({"data": tmp_path, "out": tmp_path / "run", **settings}))

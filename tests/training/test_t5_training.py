@@ -50,7 +50,7 @@ def t5(tmp_path: Path) -> Path:
 @pytest.fixture
 def t5_settings(settings, t5, monkeypatch) -> dict:
     monkeypatch.setitem(presets.PRESETS, "tiny-t5", small_t5_vima)
-    changes = {"preset": "tiny-t5", "t5": str(t5), "pretraining_steps": 0, "steps": 4}
+    changes = {"preset": "tiny-t5", "t5": str(t5), "pretraining.steps": 0, "schedule.steps": 4}
     return {**settings, **changes}
 
 
@@ -61,7 +61,7 @@ def checkpoints(run: Path) -> list[Path]:
 def test_training_begins_with_the_weights_of_t5_and_leaves_the_frozen_ones(t5_settings, t5) -> None:
     from transformers import T5EncoderModel
 
-    prompt = load_checkpoint(checkpoints(train(TrainingConfig(**t5_settings)))[-1]).prompt
+    prompt = load_checkpoint(checkpoints(train(TrainingConfig.of(t5_settings)))[-1]).prompt
     reference = T5EncoderModel.from_pretrained(t5)
     first, second = reference.encoder.block
     assert torch.equal(prompt.words.weight, reference.shared.weight)
@@ -72,7 +72,7 @@ def test_training_begins_with_the_weights_of_t5_and_leaves_the_frozen_ones(t5_se
 
 
 def test_every_checkpoint_holds_the_tokenizer_so_that_t5_may_go(t5_settings, t5) -> None:
-    run = train(TrainingConfig(**t5_settings))
+    run = train(TrainingConfig.of(t5_settings))
     text = "Put the block into the bowl."
     expected = T5Tokenizer(t5).encode(text)
     t5.rename(t5.with_name("elsewhere"))
@@ -96,8 +96,8 @@ def kill_at_4(done: int, total: int, note: str) -> None:
 
 
 def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settings, t5, tmp_path) -> None:
-    whole = train(TrainingConfig(**{**t5_settings, "out": tmp_path / "whole"}))
-    torn = TrainingConfig(**{**t5_settings, "out": tmp_path / "torn"})
+    whole = train(TrainingConfig.of({**t5_settings, "out": tmp_path / "whole"}))
+    torn = TrainingConfig.of({**t5_settings, "out": tmp_path / "torn"})
     with pytest.raises(Killed):
         train(torn, kill_at_4)
     moved = t5.rename(t5.with_name("elsewhere"))
@@ -108,13 +108,13 @@ def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settin
 
 def test_a_preset_with_t5_needs_to_know_where_it_is(t5_settings) -> None:
     with pytest.raises(ConfigError, match="'tiny-t5' reads prompts with T5; set t5"):
-        train(TrainingConfig(**{**t5_settings, "t5": None}))
+        train(TrainingConfig.of({**t5_settings, "t5": None}))
     assert not t5_settings["out"].exists()
 
 
 def test_a_preset_without_t5_refuses_one(settings, t5) -> None:
     with pytest.raises(ConfigError, match="leave t5 out"):
-        train(TrainingConfig(**settings, t5=str(t5)))
+        train(TrainingConfig.of({**settings, "t5": str(t5)}))
 
 
 def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> None:
@@ -123,25 +123,25 @@ def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> 
     wider = replace(sizes, prompt=replace(sizes.prompt, text=text))
     monkeypatch.setitem(presets.PRESETS, "tiny-t5", lambda: wider)
     with pytest.raises(CheckpointError, match=r"wi\.weight is \(16, 32\) instead of \(24, 32\)"):
-        train(TrainingConfig(**t5_settings))
+        train(TrainingConfig.of(t5_settings))
     assert not t5_settings["out"].exists()
 
 
 def test_weights_to_begin_with_bring_their_tokenizer(t5_settings, t5, tmp_path) -> None:
-    first = train(TrainingConfig(**t5_settings))
+    first = train(TrainingConfig.of(t5_settings))
     t5.rename(t5.with_name("elsewhere"))
-    again = {**t5_settings, "t5": None, "init": str(first), "out": tmp_path / "again"}
-    learner = build_learner(TrainingConfig(**again))
+    again = {**t5_settings, "t5": None, "init_from": str(first), "out": tmp_path / "again"}
+    learner = build_learner(TrainingConfig.of(again))
     weights = load_checkpoint(checkpoints(first)[-1]).state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in learner.network.state_dict().items())
-    assert checkpoints(train(TrainingConfig(**again)))
+    assert checkpoints(train(TrainingConfig.of(again)))
 
 
 def test_weights_without_a_tokenizer_need_to_know_where_it_is(t5_settings, t5, tmp_path) -> None:
     network = build_network(small_t5_vima(), seed=3)
     save_checkpoint(network, tmp_path / "bare")
-    begun = {**t5_settings, "init": str(tmp_path / "bare")}
+    begun = {**t5_settings, "init_from": str(tmp_path / "bare")}
     with pytest.raises(ConfigError, match="no tokenizer of T5 is stored; set t5, too"):
-        train(TrainingConfig(**{**begun, "t5": None}))
-    learner = build_learner(TrainingConfig(**begun))
+        train(TrainingConfig.of({**begun, "t5": None}))
+    learner = build_learner(TrainingConfig.of(begun))
     assert torch.equal(learner.network.prompt.words.weight, network.prompt.words.weight)  # not those of t5

@@ -21,6 +21,7 @@ from openvima.training.scene_variants import laid_again, with_twins  # noqa: E40
 from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
+LOSSES = ("loss/contrastive", "loss/second_view")
 HARD = Variety(random_looks=0.5, twins=0.6, again=True)
 
 
@@ -191,7 +192,13 @@ def test_looks_and_turns_are_learnt_together():
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert set(metrics) == {"match_accuracy", "again_accuracy", "turn_accuracy"}
+    assert set(metrics) == {
+        "contrastive_accuracy",
+        "second_view_accuracy",
+        "rotation_accuracy",
+        *LOSSES,
+        "loss/rotation",
+    }
     assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
     assert turning.turn_accuracy(encoder, pairs) > 0.25  # by chance a tenth
 
@@ -199,7 +206,7 @@ def test_looks_and_turns_are_learnt_together():
 def test_without_turn_bins_only_looks_are_learnt(pairs):
     generator = step_generator(0, "test", 0)
     _, metrics = turning.joint_loss(_encoder(turn_bins=0), pairs, temperature=0.1, generator=generator)
-    assert set(metrics) == {"match_accuracy", "again_accuracy"}
+    assert set(metrics) == {"contrastive_accuracy", "second_view_accuracy", *LOSSES}
 
 
 def test_a_turn_counts_as_right_within_fifteen_degrees():
@@ -233,9 +240,17 @@ def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
         return replace(tiny, images=replace(tiny.images, turn_bins=24))
 
     monkeypatch.setitem(presets.PRESETS, "turning-tiny", turning_tiny)
-    harder = {"pretraining_random_looks": 0.5, "pretraining_twins": 0.5, "pretraining_box_shift": 1.0}
-    changes = {"preset": "turning-tiny", "steps": 2, **harder}
-    run = train(TrainingConfig(**{**settings, **changes}))
+    harder = {
+        "pretraining.appearance_randomization_prob": 0.5,
+        "pretraining.hard_negative_prob": 0.5,
+        "pretraining.box_jitter_px": 1.0,
+    }
+    changes = {"preset": "turning-tiny", "schedule.steps": 2, **harder}
+    run = train(TrainingConfig.of({**settings, **changes}))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    matching = {name for line in lines if line["name"] == "1-matching" for name in line}
-    assert {"turn_accuracy", "validation_turn_accuracy", "validation_again_accuracy"} <= matching
+    matching = {name for line in lines if line["name"] == "1-pretraining" for name in line}
+    assert {
+        "rotation_accuracy",
+        "validation_rotation_accuracy",
+        "validation_second_view_accuracy",
+    } <= matching

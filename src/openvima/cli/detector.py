@@ -28,7 +28,7 @@ FRAMES_PER_EPISODE = 2  # one moment in both views
 def train(config: Training) -> int:
     """Train a detector on the segmentation of demonstrations, or go on with a run that was interrupted.
 
-    Example: openvima detector train --data demos --out detector --threads 2
+    Example: openvima detector train --data demos --out detector --runtime.threads 2
 
     Returns:
         Exit status.

@@ -1,4 +1,4 @@
-"""Behaviour cloning: data to tensors, the loop, run folders."""
+"""Training of policies and detectors: nested settings, one loop with stages, run folders."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ def train(
     report: Callable[[int, int, str], None] | None = None,
     rollout: Callable[[Path], dict[str, float]] | None = None,
 ) -> Path:
-    """Train a policy on demonstrations, or go on with a run; see `openvima.training.loop.train`.
+    """Train a policy on demonstrations, or resume a run; see `openvima.training.policy.train`.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -19,9 +19,9 @@ def train(
     from openvima.policies.base import require_torch
 
     require_torch("training")
-    from openvima.training import loop
+    from openvima.training import policy
 
-    return loop.train(config, report, rollout)
+    return policy.train(config, report, rollout)
 
 
 __all__ = ["TrainingConfig", "train"]

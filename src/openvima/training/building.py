@@ -1,4 +1,4 @@
-"""What a run trains: the network of a preset, with parts switched on or off, or a learner of one's own."""
+"""What a run trains: the network of a preset, with parts switched on or off, or a learner of your own."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,24 +15,15 @@ from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.presets import preset
 from openvima.policies.t5 import load_t5, tokenizer_for
-from openvima.training.config import DETECTED_SHARE, MATCHING_STEPS, TrainingConfig
+from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.retelling import Retelling
-from openvima.training.run_folder import flattened
 from openvima.training.schedule import step_seed
+from openvima.training.validation import flattened
 
 # Settings that only networks of this package have.
-_OF_PRESETS = (
-    "pretraining_steps",
-    "t5",
-    "motion_share",
-    "bystander_share",
-    "naming_share",
-    "reordering_share",
-    "stranger_share",
-    "autoregressive",
-    "visual_residual",
-)
+_OF_PRESETS = ("t5", "autoregressive", "visual_residual")
+_FOR_OBJECTS = ("drop_unused_objects_prob", "rename_objects_prob", "distractor_prob")
 
 
 def resolved(config: TrainingConfig) -> TrainingConfig:
@@ -41,47 +32,60 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     Raises:
         ConfigError: They do not.
     """
-    if config.detected_share and config.boxes is None:
+    loader, augmentation = config.loader, config.augmentation
+    if loader.detected_prob and loader.boxes is None:
         raise ConfigError(
-            f"detected_share is {config.detected_share:g}, but no detector is given; name one with boxes, "
-            "such as 'detector'."
+            f"loader.detected_prob is {loader.detected_prob:g}, but no detector is given; name one with "
+            "loader.boxes, such as 'detector'."
         )
-    if config.boxes is not None and config.bystander_share:
+    if loader.boxes is not None and augmentation.drop_unused_objects_prob:
         raise ConfigError(
-            f"bystander_share is {config.bystander_share:g} and boxes {config.boxes!r}; found objects "
-            "have no ids that tell bystanders. Leave out either."
+            f"augmentation.drop_unused_objects_prob is {augmentation.drop_unused_objects_prob:g} and "
+            f"loader.boxes {loader.boxes!r}; detected objects have no ids, so unused ones are unknown. Leave "
+            "out either."
         )
-    if config.boxes is not None and config.detected_share is None:
-        config = replace(config, detected_share=DETECTED_SHARE)
+    if loader.boxes is not None and loader.detected_prob is None:
+        config = replace(config, loader=replace(loader, detected_prob=DETECTED_PROB))
     if ":" in config.preset:
-        unknown = [name for name in _OF_PRESETS if getattr(config, name)]
-        if unknown:
-            raise ConfigError(f"a learner of your own does not know {' or '.join(unknown)}; leave it out.")
-        return replace(config, pretraining_steps=0)
+        return _for_own_learner(config)
     sizes = _sizes(config)
-    reads_with_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
-    if reads_with_t5 and config.t5 is None and config.init is None:
+    needs_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
+    if needs_t5 and config.t5 is None and config.init_from is None:
         raise ConfigError(
-            f"preset {config.preset!r} reads prompts with T5; set t5 to the folder that holds it, or to "
+            f"preset {config.preset!r} encodes prompts with T5; set t5 to the folder that holds it, or to "
             "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
         )
-    if config.t5 is not None and not reads_with_t5:
+    if config.t5 is not None and not needs_t5:
         raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
-    for name in ("bystander_share", "naming_share", "stranger_share"):
-        if getattr(config, name) and not isinstance(images, ObjectEncoderConfig):
+    for name in _FOR_OBJECTS:
+        if getattr(augmentation, name) and not isinstance(images, ObjectEncoderConfig):
             raise ConfigError(
-                f"{name} is {getattr(config, name):g}, but preset {config.preset!r} sees whole frames; it "
-                "needs one that sees objects."
+                f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
+                "whole frames; it needs one that takes objects."
             )
     has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
-    if config.pretraining_steps and not has_appearance:
+    if config.pretraining.steps and not has_appearance:
         raise ConfigError(
-            f"pretraining_steps is {config.pretraining_steps}, but preset {config.preset!r} has no "
-            "appearance embedding to match prompt and scene with; leave it out, or set it to 0."
+            f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} has no "
+            "appearance embedding to pretrain; leave it out, or set it to 0."
         )
-    if config.pretraining_steps is None:
-        return replace(config, pretraining_steps=MATCHING_STEPS if has_appearance and not config.init else 0)
+    if config.pretraining.steps is None:
+        steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
+        return replace(config, pretraining=replace(config.pretraining, steps=steps))
     return config
+
+
+def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
+    augmentation = {f"augmentation.{n}": v for n, v in flattened(config.identity()["augmentation"]).items()}
+    augmentation.pop("augmentation.false_positive_prob")  # which does nothing unless its collator has it
+    given = {
+        "pretraining.steps": config.pretraining.steps,
+        **{name: getattr(config, name) for name in _OF_PRESETS},
+        **augmentation,
+    }
+    if unknown := [name for name, value in given.items() if value]:
+        raise ConfigError(f"a learner of your own does not know {' or '.join(unknown)}; leave it out.")
+    return replace(config, pretraining=replace(config.pretraining, steps=0))
 
 
 def _sizes(config: TrainingConfig) -> PolicyConfig:
@@ -95,50 +99,51 @@ def _sizes(config: TrainingConfig) -> PolicyConfig:
 
 
 def build_learner(config: TrainingConfig) -> Learner:
-    """Build what a run trains, with fresh weights or with those it begins with.
+    """Build what a run trains, with fresh weights or those of `init_from`.
 
     Args:
         config: All settings, as `resolved` returned them.
 
     Raises:
-        CheckpointError: T5 or the weights to begin with are not where the settings say.
-        ConfigError: The weights to begin with are those of a network of other sizes, or lack a tokenizer.
-        MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
+        CheckpointError: T5 or the initial weights are not where the settings say.
+        ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer.
+        MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
     if ":" in config.preset:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(step_seed(config.seed, "weights", 0))
             learner = make_learner(config.preset)
-        if config.init:
-            learner.read(find_checkpoint(config.init))
+        if config.init_from:
+            learner.read(find_checkpoint(config.init_from))
         return learner
     sizes, stored = _sizes(config), None
     network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
-    if config.init:
-        stored = _begin_with(network, config.init)
+    if config.init_from:
+        stored = _load_weights_of(network, config.init_from)
     elif config.t5:
         load_t5(network, config.t5)
     where = config.t5 or stored
     if sizes.prompt.tokenizer == "t5" and where is None:
         raise ConfigError(
-            f"init is {config.init}, with which no tokenizer of T5 is stored; set t5, too, to the folder "
-            "that holds it, or to 't5-base'. Its weights are then not read."
+            f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
+            "folder that holds it, or to 't5-base'. Its weights are then not read."
         )
     reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, where))
+    augmentation = config.augmentation
     return PolicyLearner(
         network,
         reader,
-        spurious_probability=config.spurious_probability,
+        spurious_probability=augmentation.false_positive_prob,
         retelling=Retelling(
-            motion_share=config.motion_share,
-            bystander_share=config.bystander_share,
-            naming_share=config.naming_share,
-            reordering_share=config.reordering_share,
+            motion_share=augmentation.inverse_dynamics_prob,
+            bystander_share=augmentation.drop_unused_objects_prob,
+            naming_share=augmentation.rename_objects_prob,
+            reordering_share=augmentation.shuffle_sentences_prob,
         ),
     )
 
 
-def _begin_with(network: PolicyNetwork, source: str) -> Path | None:
+def _load_weights_of(network: PolicyNetwork, source: str) -> Path | None:
     """Copy the weights of another network, and return the folder of its tokenizer, if it has one."""
     other, tokenizer = load_network(source)
     ours, theirs = flattened(network.config.to_dict()), flattened(other.config.to_dict())
@@ -149,8 +154,8 @@ def _begin_with(network: PolicyNetwork, source: str) -> Path | None:
     ]
     if differing:
         raise ConfigError(
-            f"init is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that it "
-            "was trained with, and the same autoregressive and visual_residual."
+            f"init_from is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that "
+            "it was trained with, and the same autoregressive and visual_residual."
         )
     network.load_state_dict(other.state_dict())
     return tokenizer

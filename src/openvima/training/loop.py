@@ -1,35 +1,25 @@
-"""The training loop: stages one after the other, checkpoints, and going on where a run stopped."""
+"""The training loop: stages in turn, metrics, checkpoints, and exact resuming.
+
+Contrastive pretraining, behaviour cloning and the training of detectors are stages of this one loop. A stage
+says what a step minimises; the loop does the rest.
+"""
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import asdict, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import nn
 
-from openvima.catalog.packs import load_assets
-from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.reader import Dataset
-from openvima.detector.hooks import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
-from openvima.policies.devices import torch_threads
-from openvima.training.building import build_learner, resolved
-from openvima.training.config import TrainingConfig
-from openvima.training.inverse_dynamics import MOTION_TEXT
-from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.config import RunConfig, ScheduleConfig
+from openvima.training.learner import Learner
 from openvima.training.optimizer_state import load_named_state, named_state
-from openvima.training.parallel import (
-    Parallel,
-    compile_layers,
-    joined,
-    set_whole_state,
-    whole_state,
-)
-from openvima.training.pretrain import Variety, render_pairs
+from openvima.training.parallel import Parallel, set_whole_state, whole_state
 from openvima.training.provenance import index_hash, provenance
 from openvima.training.run_folder import (
     METRICS_FILE,
@@ -39,134 +29,136 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.sequence_lengths import check_lengths
-from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
-from openvima.training.stages import Cloning, Matching, Metrics, Stage, freeze_crops, has_turns, keeps_crops
 from openvima.training.tensorboard import Board
 
+Metrics = dict[str, float]
+# Called with steps done, steps in all, and a note.
 Report = Callable[[int, int, str], None]
-# A trial in the simulator: checkpoint folder to metrics. It is handed in, since training needs no simulation.
+# From a checkpoint folder to metrics. It is handed in, since training needs no simulation.
 Rollout = Callable[[Path], Metrics]
 
 LOG_EVERY = 20  # steps
-# Where files are, and how the work is done, does not make it another run.
-_NOT_SETTINGS = (
-    "data",
-    "out",
-    "tokens",
-    "t5",
-    "device",
-    "compile",
-    "sharding",
-    "loader_workers",
-    "threads",
-    "tensorboard",
-    "force",
-    "checkpoint_every",
-    "keep_every",
-    "rollout_every",
-    "rollout_episodes",
-)
 
 
-def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout | None = None) -> Path:
-    """Train a policy on demonstrations, or go on with a run that was interrupted.
+class Stage(Protocol):
+    """One loss to be minimised for a number of steps.
 
-    With the same settings and number of threads an interrupted run on a processor ends with the very weights
-    of one that was not. Started by `torchrun`, all its processes train together.
+    Attributes:
+        name: In file names and metrics; names sort in the order of the stages.
+        learning_rate: Peak learning rate.
+        parameters: What is trained.
+    """
+
+    name: str
+    learning_rate: float
+    parameters: list[nn.Parameter]
+
+    def backward(self, step: int) -> Metrics:
+        """Add the gradients of one step; return "loss", its parts as "loss/NAME", and other metrics."""
+        ...
+
+    def validate(self) -> Metrics:
+        """Return metrics on held-out data: "score", the larger the better, and perhaps "score_error"."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStage:
+    """A stage that is made when its turn comes.
+
+    Args:
+        num_steps: Its length.
+        make: Makes it.
+    """
+
+    num_steps: int
+    make: Callable[[], Stage]
+
+
+def num_steps(schedule: ScheduleConfig, num_examples: Callable[[], int], batch_size: int) -> int:
+    """Return the steps of a run, from its epochs if they are set."""
+    if schedule.epochs is None:
+        return schedule.steps
+    count = num_examples()
+    return max(1, round(schedule.epochs * count / min(batch_size, count)))
+
+
+class Trainer:
+    """One run in progress.
 
     Args:
         config: All settings.
-        report: Called with steps done, steps in all, and a note.
-        rollout: Called with a checkpoint every `config.rollout_every` steps; returns what to log.
-
-    Returns:
-        The run folder; `load_policy` takes it.
+        dataset: The demonstrations.
+        learner: What is trained; a resumed run loads its weights here.
+        parallel: The processes of the run.
+        report: Called with the progress.
+        rollout: Called with checkpoints of the last stage.
+        rollout_every: Steps between these.
+        demonstrations: What else identifies the data.
 
     Raises:
-        ConfigError: The folder holds a run with other settings, preset and settings contradict each other, or
-            there is no such detector.
-        DatasetError: There are no demonstrations, or one is too long for the network.
-        CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
-            or of other sizes.
-        PromptError: A prompt has a word that the policy's vocabulary lacks.
-        MissingExtraError: The preset reads prompts with T5, and a package for that is not installed.
+        CheckpointError: The last checkpoint is damaged.
+        ConfigError: The folder holds a run with other settings.
     """
-    config = resolved(config)
-    load_assets(config.assets)  # what is wrong is found before there is a run folder
-    dataset = Dataset(config.data)
-    boxes = plugged_boxes(config.boxes) if config.boxes is not None else None
-    with torch_threads(config.threads), joined(config.device, config.sharding) as parallel:
-        learner = build_learner(config)
-        if boxes and learner.input_kind == "frames":
-            raise ConfigError(
-                f"boxes is {config.boxes!r}, but preset {config.preset!r} sees whole frames; leave boxes "
-                "out, or take a preset that sees objects."
-            )
-        run = RunFolder(
-            config.out,
-            _settings(config, dataset, learner, boxes),
-            force=config.force,
-            keep_every=config.keep_every,
-            is_first=parallel.is_first,
-        )
-        parallel.wait()
-        trainer = _Trainer(config, dataset, boxes, learner, run, parallel, report or _ignore, rollout)
-        try:
-            trainer.train()
-        finally:
-            trainer.board.close()
-    return run.path
-
-
-class _Trainer:
-    """One run in progress."""
 
     def __init__(
         self,
-        config: TrainingConfig,
+        config: RunConfig,
         dataset: Dataset,
-        boxes: Boxes | None,
         learner: Learner,
-        run: RunFolder,
         parallel: Parallel,
-        report: Report,
-        rollout: Rollout | None,
+        *,
+        report: Report | None = None,
+        rollout: Rollout | None = None,
+        rollout_every: int | None = None,
+        demonstrations: dict[str, Any] | None = None,  # Any: YAML
     ) -> None:
-        self.config, self.dataset, self.learner, self.run = config, dataset, learner, run
-        self.boxes, self.parallel, self.report, self.rollout = boxes, parallel, report, rollout
-        self.started = time.monotonic()
-        self._last = (0, self.started)  # step and time of the last line of metrics
-        self.progress = run.resume(learner)
+        self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
+        self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
+        data = {"episodes": len(dataset), "index": index_hash(config.data), **(demonstrations or {})}
+        self.run = RunFolder(
+            config.out,
+            {"training": config.identity(), "demonstrations": data, "network": learner.description()},
+            force=config.force,
+            keep_every=config.schedule.keep_every,
+            is_first=parallel.is_first,
+        )
+        parallel.wait()
+        self._started = time.monotonic()
+        self._last = (0, self._started)  # step and time of the last line of metrics
+        self.progress = self.run.resume(learner)
         learner.to(parallel.device)
-        self.module: nn.Module = learner
-        self.stages: list[tuple[int, Callable[[], Stage]]] = []
-        self.num_steps = 0  # until both are known, for what is reported on the way
-        steps = config.steps if config.epochs is None else self._steps_of_epochs(config.epochs)
-        self.stages.append((steps, self._cloning))
-        if config.pretraining_steps:
-            self.stages.insert(0, (config.pretraining_steps, self._matching))
-        self.num_steps = sum(steps for steps, _ in self.stages)
-        self.board = Board(run.path, self._done() + 1, wanted=config.tensorboard and parallel.is_first)
-        if parallel.is_first:
-            run.go_back_to(self.progress)
-            origin = {"processes": parallel.num_ranks, **provenance(dataset)}
-            run.append(SESSIONS_FILE, {**self._here(), **origin})
+        self._stages: Sequence[PlannedStage] = ()
 
-    def train(self) -> None:
-        """Run what is left of the stages."""
-        for number, (num_steps, make) in enumerate(self.stages):
-            if number < self.progress.stage or (number, num_steps) == (
-                self.progress.stage,
-                self.progress.step,
-            ):
-                continue
-            if number > self.progress.stage:
-                self.progress = replace(self.progress, stage=number, step=0)
-            self._run_stage(make(), num_steps)
+    def train(self, stages: Sequence[PlannedStage]) -> Path:
+        """Run what is left of the stages, and return the run folder.
+
+        Raises:
+            ConfigError: The loss diverged.
+        """
+        self._stages, first = stages, self.parallel.is_first
+        self._board = Board(self.run.path, self._done() + 1, wanted=self.config.runtime.tensorboard and first)
+        if first:
+            self.run.go_back_to(self.progress)
+            origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
+            self.run.append(SESSIONS_FILE, {**self._here(), **origin})
+        try:
+            for number in range(self.progress.stage, len(stages)):
+                if number > self.progress.stage:
+                    self.progress = replace(self.progress, stage=number, step=0)
+                if self.progress.step < stages[number].num_steps:
+                    self._run_stage(stages[number].make(), stages[number].num_steps)
+        finally:
+            self._board.close()
+        return self.run.path
+
+    def report(self, note: str) -> None:
+        """Report the progress with a note."""
+        if self._on_report and self.parallel.is_first:
+            self._on_report(self._done(), sum(stage.num_steps for stage in self._stages), note)
 
     def _run_stage(self, stage: Stage, num_steps: int) -> None:
-        optimizer = _optimizer(self.learner, stage, self.config)
+        optimizer = _optimizer(self.learner, stage, self.config.optimizer.weight_decay)
         if self.progress.step:
             self._load_optimizer(optimizer)
         window: list[Metrics] = []
@@ -182,81 +174,77 @@ class _Trainer:
                 self._save(stage, optimizer)
 
     def _saves_at(self, step: int) -> bool:
-        """Whether a checkpoint is due, be it to go on from, to keep, or to play."""
-        config = self.config
+        """Whether a checkpoint is due, be it to resume from, to keep, or to roll out."""
+        schedule = self.config.schedule
         return any(
             every and step % every == 0
-            for every in (config.checkpoint_every, config.keep_every, config.rollout_every)
+            for every in (schedule.checkpoint_every, schedule.keep_every, self._rollout_every)
         )
 
     def _step(self, stage: Stage, optimizer: torch.optim.Optimizer, step: int, num_steps: int) -> Metrics:
         config = self.config
-        rate = learning_rate_at(
-            step,
-            highest=stage.learning_rate,
-            steps=num_steps,
-            warmup_steps=config.warmup_steps,
-            decay_steps=config.decay_steps,
-            final=config.final_learning_rate,
-        )
+        rate = learning_rate_at(step, config.schedule, peak=stage.learning_rate, num_steps=num_steps)
         for group in optimizer.param_groups:
             group["lr"] = rate
         optimizer.zero_grad(set_to_none=True)
-        self.module.train()
+        self.learner.train()
         device, rank = self.parallel.device, self.parallel.rank
         purpose = f"dropout of {stage.name}" + (f" in process {rank}" if rank else "")
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
             torch.manual_seed(step_seed(config.seed, purpose, step))  # from it dropout draws
             metrics = stage.backward(step)
-        norm = float(nn.utils.clip_grad_norm_(stage.parameters, config.clip_norm))  # of all processes
+        norm = nn.utils.clip_grad_norm_(stage.parameters, config.optimizer.max_grad_norm)  # of all processes
         if not math.isfinite(norm):
             raise ConfigError(
-                f"the gradient is {norm} at step {step} of {stage.name}, with learning_rate {rate:g} and "
-                f"precision {config.precision}; lower learning_rate, or take float32. The last checkpoint "
-                "is from before."
+                f"the gradient is {norm:g} at step {step} of {stage.name}, with learning rate {rate:g} and "
+                f"precision {config.runtime.precision}; lower optimizer.learning_rate, or take float32. The "
+                "last checkpoint is from before."
             )
         optimizer.step()
-        return {**metrics, "gradient_norm": norm}
+        return {**metrics, "gradient_norm": float(norm), "learning_rate": rate}
 
     def _log(self, stage: Stage, metrics: Metrics) -> None:
-        self._note(stage, metrics)
+        self._write(stage, metrics)
         if self.parallel.is_first:
-            seconds = round(time.monotonic() - self.started, 2)
+            seconds = round(time.monotonic() - self._started, 2)
             self.run.append(TIMINGS_FILE, {**self._here(), "seconds_since_start": seconds})
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
-        note = "  ".join(f"{name} {value:.3f}" for name, value in list(metrics.items())[:3])
-        self._report(f"{stage.name}: {note}  {rate:.1f} steps/s")
+        shown = [(name, value) for name, value in metrics.items() if "/" not in name][:3]
+        note = "  ".join(f"{name} {value:.3f}" for name, value in shown)
+        self.report(f"{stage.name}: {note}  {rate:.1f} steps/s")
 
     def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
-        """Validate, note whether it is the best, and write a checkpoint.
+        """Validate, update the best checkpoint, and write one.
 
-        With few held-out demonstrations scores are noisy, and later checkpoints have learnt at smaller rates:
-        a later one counts as the best unless it is worse by more than the score's standard error.
+        With few held-out demonstrations scores are noisy, and later checkpoints were trained at smaller
+        rates: a later one counts as the best unless it is worse by more than the score's standard error.
         """
-        self.module.eval()
+        self.learner.eval()
         metrics = stage.validate()
-        self._note(stage, {f"validation_{name}": value for name, value in metrics.items()})
+        self._write(stage, {f"validation_{name}": value for name, value in metrics.items()})
         name = f"{stage.name}-{self.progress.step:06d}"
-        is_last_stage = self.progress.stage == len(self.stages) - 1
+        is_last_stage = self.progress.stage == len(self._stages) - 1
         score, error = metrics.get("score", 0.0), metrics.get("score_error", 0.0)
         best = self.progress.best_score
         if is_last_stage and (best is None or score >= best - error):
-            self.progress = replace(self.progress, best_score=max(score, best or 0.0), best_checkpoint=name)
+            best = score if best is None else max(score, best)
+            self.progress = replace(self.progress, best_score=best, best_checkpoint=name)
         state = self._state(optimizer)
         if self.parallel.is_first:
             self.run.save(name, self.learner, state, self.progress)
-            every = self.config.rollout_every
-            if self.rollout and every and is_last_stage and self.progress.step % every == 0:
-                scores = self.rollout(self.run.checkpoints / name)
-                self._note(stage, {f"rollout_{key}": value for key, value in scores.items()})
+            every = self._rollout_every
+            if self._rollout and every and is_last_stage and self.progress.step % every == 0:
+                scores = self._rollout(self.run.checkpoints / name)
+                self._write(stage, {f"rollout_{key}": value for key, value in scores.items()})
         self.parallel.wait()
 
-    def _note(self, stage: Stage, metrics: Metrics) -> None:
+    def _write(self, stage: Stage, metrics: Metrics) -> None:
+        """Append metrics to `metrics.jsonl` and TensorBoard."""
         if metrics and self.parallel.is_first:
             self.run.append(METRICS_FILE, {**self._here(), "name": stage.name, **metrics})
-            self.board.add(stage.name, metrics, self._done())
+            self._board.add(stage.name, metrics, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
         if self.parallel.is_sharded:
@@ -264,126 +252,31 @@ class _Trainer:
         return TrainedState(self.learner.state_dict(), named_state(self.learner, optimizer))
 
     def _load_optimizer(self, optimizer: torch.optim.Optimizer) -> None:
-        state = self.run.optimizer_state()
-        if self.parallel.is_sharded:
-            set_whole_state(self.learner, optimizer, state)
-        else:
-            load_named_state(self.learner, optimizer, state)
-
-    @cached_property
-    def _tokens(self) -> list[ObjectCache]:
-        """The token caches: of true boxes, of those of a detector, or first the one and then the other.
-
-        The first process makes them if need be.
-        """
-        share, folder = self.config.detected_share or 0.0, self.config.tokens
-        caches = []
-        if not self.parallel.is_first:
-            self.parallel.wait()
-        if share < 1:
-            kind = self.learner.input_kind
-            caches.append(open_object_cache(self.dataset, kind, folder=folder, report=self._say))
-        if share > 0:
-            assert self.boxes is not None  # `resolved` has seen to it
-            caches.append(detected_object_cache(self.dataset, self.boxes, folder=folder, report=self._say))
-        if self.parallel.is_first:
-            self.parallel.wait()
-        return caches
-
-    def _steps_of_epochs(self, epochs: float) -> int:
-        """Steps of so many passes over what is left to learn from when some is kept for validation."""
-        training, _ = self._examples
-        return max(1, round(epochs * len(training) / min(self.config.batch, len(training))))
-
-    @cached_property
-    def _examples(self) -> tuple[ExampleSource, ExampleSource]:
-        """What to learn from, and what is held out."""
-        config = self.config
-        return split_examples(
-            self._tokens[0],
-            validation_share=config.validation_share,
-            validation_episodes=config.validation_episodes,
-        )
-
-    def _matching(self) -> Stage:
-        assert isinstance(self.learner, PolicyLearner)  # `resolved` has seen to it
-        tasks = sorted(set(self.dataset.index.column("task").to_pylist()))
-        network, config = self.learner.network, self.config
-        pairs = render_pairs(
-            tasks,
-            num_scenes=config.pretraining_scenes,
-            seed=config.seed,
-            assets=config.assets,
-            variety=Variety(
-                config.pretraining_random_looks,
-                config.pretraining_twins,
-                again=has_turns(network) or config.pretraining_twins > 0,
-                grays=config.pretraining_grays,
-            ),
-            report=self._say,
-        )
-        return Matching(network, config, pairs.to(self.parallel.device))
-
-    def _cloning(self) -> Stage:
-        self._report(f"reading {len(self.dataset)} demonstrations")
-        tokens, config = self._tokens, self.config
-        if isinstance(self.learner, PolicyLearner):
-            check_words(tokens[0], self.learner.reader)
-            if config.motion_share:
-                self.learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
-            for cache in tokens:
-                check_lengths(
-                    cache, self.learner.network, self.learner.reader, motion_share=config.motion_share
-                )
-            if keeps_crops(self.learner.network, config):
-                freeze_crops(self.learner, tokens)
-        if config.compile:
-            compile_layers(self.learner)
-        self.module = self.parallel.wrap(self.learner)
-        training, validation = self._examples
-        detected = with_boxes_of(tokens[1], training) if len(tokens) > 1 else None
-        return Cloning(self.learner, self.module, config, training, validation, self.parallel, detected)
-
-    def _say(self, done: int, total: int, note: str) -> None:
-        self._report(f"{note or 'cutting out objects'}, {done} of {total}")
-
-    def _report(self, note: str) -> None:
-        if self.parallel.is_first:
-            self.report(self._done(), self.num_steps, note)
+        load = set_whole_state if self.parallel.is_sharded else load_named_state
+        load(self.learner, optimizer, self.run.optimizer_state())
 
     def _here(self) -> dict[str, int]:
         return {"stage": self.progress.stage, "step": self.progress.step}
 
     def _done(self) -> int:
         """Steps that are done, counted through all stages."""
-        return sum(steps for steps, _ in self.stages[: self.progress.stage]) + self.progress.step
+        done = [stage.num_steps for stage in self._stages[: self.progress.stage]]
+        return sum(done) + self.progress.step
 
 
-def _optimizer(learner: Learner, stage: Stage, config: TrainingConfig) -> torch.optim.Optimizer:
-    """AdamW; vectors (biases, norms) and tables do not decay."""
+def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.optim.Optimizer:
+    """AdamW; vectors (biases, norms) and embedding tables do not decay."""
     tables = {id(m.weight) for m in learner.modules() if isinstance(m, nn.Embedding)}
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]
     groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=config.weight_decay, fused=True)
+    return torch.optim.AdamW(groups, lr=stage.learning_rate, weight_decay=weight_decay, fused=True)
 
 
-def _settings(
-    config: TrainingConfig, dataset: Dataset, learner: Learner, boxes: Boxes | None
-) -> dict[str, Any]:  # Any: YAML
-    """Everything that decides the weights: settings, network sizes, and which demonstrations there are."""
-    values = {name: value for name, value in asdict(config).items() if name not in _NOT_SETTINGS}
-    demonstrations = {
-        "episodes": len(dataset),
-        "index": index_hash(config.data),
-        **({"boxes": boxes.name} if boxes else {}),
-    }
-    return {"training": values, "demonstrations": demonstrations, "policy": learner.description()}
-
-
-def _mean(window: list[Metrics]) -> Metrics:
-    return {name: sum(metrics[name] for metrics in window) / len(window) for name in window[0]}
-
-
-def _ignore(done: int, total: int, note: str) -> None:
-    """Report to nobody."""
+def _mean(window: Sequence[Metrics]) -> Metrics:
+    """Average each metric over the steps that have it."""
+    values: dict[str, list[float]] = {}
+    for metrics in window:
+        for name, value in metrics.items():
+            values.setdefault(name, []).append(value)
+    return {name: sum(found) / len(found) for name, found in values.items()}

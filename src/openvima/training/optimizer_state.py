@@ -1,4 +1,4 @@
-"""What an optimizer remembers, by the names of parameters, as checkpoints hold it."""
+"""The state of an optimizer by the names of parameters, as checkpoints contain it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from torch import nn
 def named_state(
     module: nn.Module, optimizer: torch.optim.Optimizer
 ) -> dict[str, Any]:  # Any: as torch has it
-    """Return what an optimizer remembers of each parameter of a module, by its name."""
+    """Return the state of each parameter of a module, by its name."""
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     return {names[id(parameter)]: values for parameter, values in optimizer.state.items()}
 
@@ -18,8 +18,21 @@ def named_state(
 def load_named_state(
     module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Any]
 ) -> None:  # Any: as above
-    """Undo `named_state`; the optimizer may have its parameters in another order."""
+    """Undo `named_state`; the optimizer may have its parameters in another order.
+
+    Moments get the memory format of their parameters: the fused optimizer walks through both in memory order.
+    """
     names = {id(parameter): name for name, parameter in module.named_parameters()}
-    ordered = [names[id(p)] for group in optimizer.param_groups for p in group["params"]]
-    values = {number: dict(state[name]) for number, name in enumerate(ordered) if name in state}
+    ordered = [p for group in optimizer.param_groups for p in group["params"]]
+    values = {
+        number: {key: _like(parameter, value) for key, value in state[names[id(parameter)]].items()}
+        for number, parameter in enumerate(ordered)
+        if names[id(parameter)] in state
+    }
     optimizer.load_state_dict({**optimizer.state_dict(), "state": values})
+
+
+def _like(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    if value.shape != parameter.shape:
+        return value  # the number of steps
+    return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

@@ -78,6 +78,11 @@ class Parallel:
             with module.no_sync():  # type: ignore[operator]
                 yield
 
+    def autocast(self, precision: str) -> torch.autocast:
+        """Return a context in which matrix products have that precision, "float32" or "bfloat16"."""
+        is_half = precision == "bfloat16"
+        return torch.autocast(self.device.type, torch.bfloat16 if is_half else None, enabled=is_half)
+
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Average named numbers over all processes; one that lacks a name counts as 0."""
         if self.num_ranks == 1:
@@ -110,10 +115,12 @@ def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
     try:
         chosen = torch.device(device)
     except RuntimeError:
-        raise ConfigError(f"device is {device!r}; it must be auto, cpu, cuda or cuda:NUMBER.") from None
+        raise ConfigError(
+            f"runtime.device is {device!r}; it must be auto, cpu, cuda or cuda:NUMBER."
+        ) from None
     if chosen.type == "cuda":
         if not torch.cuda.is_available():
-            raise ConfigError("device is 'cuda', but no GPU can be used here; take cpu, or auto.")
+            raise ConfigError("runtime.device is 'cuda', but no GPU can be used here; take cpu, or auto.")
         local = int(os.environ.get("LOCAL_RANK", 0)) if chosen.index is None else chosen.index
         chosen = torch.device("cuda", local)
         torch.cuda.set_device(chosen)

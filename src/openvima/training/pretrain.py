@@ -190,7 +190,7 @@ def matching_loss(
     prompt = embed_looks(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
     scene = embed_looks(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
     loss, accuracy = contrast(prompt, scene, alike_in_prompts(pairs), temperature=temperature)
-    return loss, {"match_accuracy": accuracy}
+    return loss, {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
 
 
 def alike_in_prompts(pairs: Pairs) -> torch.Tensor:

@@ -1,32 +1,33 @@
-"""Named settings: as the paper trains, for one workstation, and for a processor alone."""
+"""Named settings: as the paper trains, for one workstation, and for a CPU; and settings from files."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import yaml
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.training.config import TrainingConfig
+from openvima.training.validation import converted, flattened, setting_types
 
 # VIMA, Jiang et al. 2023, with what later re-implementations report where the paper is silent: AdamW without
 # decay, the rate falls to its end within the first half of the run.
 _PAPER: Mapping[str, Any] = {
     "preset": "vima-200m",
-    "epochs": 10,
-    "batch": 128,
-    "learning_rate": 1e-4,
-    "final_learning_rate": 1e-7,
-    "warmup_steps": 7000,
-    "decay_steps": 17000,
-    "weight_decay": 0.0,
-    "validation_share": 1 / 13,
-    "checkpoint_every": 1000,
-    "precision": "bfloat16",
-    "loader_workers": 4,
+    "schedule.epochs": 10,
+    "loader.batch_size": 128,
+    "optimizer.learning_rate": 1e-4,
+    "schedule.final_learning_rate": 1e-7,
+    "schedule.warmup_steps": 7000,
+    "schedule.decay_steps": 17000,
+    "optimizer.weight_decay": 0.0,
+    "loader.validation_fraction": 1 / 13,
+    "schedule.checkpoint_every": 1000,
+    "runtime.precision": "bfloat16",
+    "loader.num_workers": 4,
 }
-# MIDAS, Li et al. 2023: rates and batches are not published, so they are VIMA's.
+# MIDAS, Li et al. 2023: learning rates and batch sizes are not published, so they are VIMA's.
 _MIDAS: Mapping[str, Any] = {**_PAPER, "preset": "midas-92m"}
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
@@ -35,54 +36,54 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         # 10,300 iterations is the longest pretraining of the paper; shorter ones helped less.
         "midas-pretrain": {
             **_MIDAS,
-            "epochs": None,
-            "steps": 10300,
-            "warmup_steps": 1000,
-            "decay_steps": None,
-            "motion_share": 1.0,
+            "schedule.epochs": None,
+            "schedule.steps": 10300,
+            "schedule.warmup_steps": 1000,
+            "schedule.decay_steps": None,
+            "augmentation.inverse_dynamics_prob": 1.0,
         },
         "midas-finetune": _MIDAS,
-        # The paper mixes motions into the tasks for use in context and does not say how many.
-        "midas-in-context": {**_MIDAS, "motion_share": 0.5},
-        # One GPU of 24 GB and a tenth of the data; the rate falls until the end, which wastes nothing.
+        # The paper mixes in-context demonstrations into the tasks and does not state how many.
+        "midas-in-context": {**_MIDAS, "augmentation.inverse_dynamics_prob": 0.5},
+        # One GPU of 24 GB and a tenth of the data; the rate decays until the end.
         "workstation": {
             "preset": "vima-20m",
-            "epochs": 10,
-            "batch": 128,
-            "accumulate": 4,
-            "learning_rate": 1e-4,
-            "final_learning_rate": 1e-7,
-            "warmup_steps": 1000,
-            "weight_decay": 0.0,
-            "bucket": 20,
-            "checkpoint_every": 500,
-            "precision": "bfloat16",
-            "loader_workers": 2,
+            "schedule.epochs": 10,
+            "loader.batch_size": 128,
+            "optimizer.grad_accum_steps": 4,
+            "optimizer.learning_rate": 1e-4,
+            "schedule.final_learning_rate": 1e-7,
+            "schedule.warmup_steps": 1000,
+            "optimizer.weight_decay": 0.0,
+            "loader.bucket_batches": 20,
+            "schedule.checkpoint_every": 500,
+            "runtime.precision": "bfloat16",
+            "loader.num_workers": 2,
         },
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
-        # For a policy like the one that comes with the package; docs/training.md tells how that was made.
+        # For a policy like the bundled openvima-small; docs/training.md has its history.
         "small": {
             "preset": "small",
-            "pretraining_steps": 4000,
-            "pretraining_scenes": 8000,
-            "pretraining_random_looks": 0.4,
-            "pretraining_twins": 0.4,
-            "pretraining_box_shift": 1.0,
-            "pretraining_grays": 0.3,
-            "pretraining_gaps": 0.35,
-            "steps": 3100,
-            "batch": 128,
-            "learning_rate": 4e-4,
-            "warmup_steps": 100,
-            "motion_share": 0.2,
-            "bystander_share": 0.35,
-            "naming_share": 0.3,
-            "reordering_share": 0.3,
-            "stranger_share": 0.6,
-            "validation_share": 0.02,
-            "validation_episodes": 500,
-            "checkpoint_every": 250,
+            "pretraining.steps": 4000,
+            "pretraining.num_scenes": 8000,
+            "pretraining.appearance_randomization_prob": 0.4,
+            "pretraining.hard_negative_prob": 0.4,
+            "pretraining.box_jitter_px": 1.0,
+            "pretraining.grayscale_prob": 0.3,
+            "pretraining.occlusion_prob": 0.35,
+            "schedule.steps": 3100,
+            "loader.batch_size": 128,
+            "optimizer.learning_rate": 4e-4,
+            "schedule.warmup_steps": 100,
+            "augmentation.inverse_dynamics_prob": 0.2,
+            "augmentation.drop_unused_objects_prob": 0.35,
+            "augmentation.rename_objects_prob": 0.3,
+            "augmentation.shuffle_sentences_prob": 0.3,
+            "augmentation.distractor_prob": 0.6,
+            "loader.validation_fraction": 0.02,
+            "loader.validation_episodes": 500,
+            "schedule.checkpoint_every": 250,
         },
     }
 )
@@ -92,7 +93,7 @@ def default_recipe(preset: str | None) -> str:
     """Return the recipe for a preset.
 
     Returns:
-        "small" for "small", "nano" for all nano networks and those of your own, else "paper".
+        "small" for "small", "nano" for all nano networks and learners of your own, else "paper".
     """
     if preset == "small":
         return preset
@@ -100,7 +101,7 @@ def default_recipe(preset: str | None) -> str:
 
 
 def recipe_settings(name: str) -> dict[str, Any]:
-    """Return the settings of a recipe that differ from the defaults.
+    """Return the settings of a recipe that differ from the defaults, by dotted name.
 
     Raises:
         ConfigError: There is no such recipe.
@@ -111,7 +112,7 @@ def recipe_settings(name: str) -> dict[str, Any]:
 
 
 def read_settings(file: Path) -> dict[str, Any]:
-    """Read settings from a YAML file: names of `TrainingConfig` and their values.
+    """Read settings from a YAML file, by dotted name: nested fields of `TrainingConfig` and their values.
 
     The `config.yaml` of a run folder is such a file, too: its part "training" counts.
 
@@ -126,33 +127,18 @@ def read_settings(file: Path) -> dict[str, Any]:
         values = values["training"]
     if not isinstance(values, dict):
         raise ConfigError(f"{file} must hold settings, one `name: value` a line.")
-    known = get_type_hints(TrainingConfig)
-    problems = [
-        unknown_name(f"setting in {file} called", name, known) for name in values if name not in known
-    ]
-    if problems:
+    values, known = flattened(values), setting_types(TrainingConfig)
+    if problems := [unknown_name(f"setting in {file} called", n, known) for n in values if n not in known]:
         raise ConfigError(" ".join(problems))
-    return {
-        name: _converted(value, get_args(known[name]) or (known[name],)) for name, value in values.items()
-    }
+    return {name: converted(value, known[name]) for name, value in values.items()}
 
 
 def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
     """Put other settings over some.
 
-    Steps among them replace the epochs of a recipe; and weights to begin with bring a crop encoder along, so
-    that pretraining is left to the preset, which then has none, unless they set it as well.
+    Steps among them replace the epochs of a recipe; and `init_from` brings a trained crop encoder, so that
+    pretraining is left to the preset, which then has none, unless they set it as well.
     """
-    length = {"epochs": None} if "steps" in others else {}
-    matching = {"pretraining_steps": None} if others.get("init") else {}
-    return {**settings, **length, **matching, **others}
-
-
-def _converted(value: Any, kinds: tuple[Any, ...]) -> Any:  # Any: what YAML holds, and types
-    """Make paths and numbers of texts; YAML takes 1e-4, without a point, for a text."""
-    if not isinstance(value, str) or not {Path, float} & set(kinds):
-        return value
-    try:
-        return Path(value) if Path in kinds else float(value)
-    except ValueError:  # the settings will say what it must be
-        return value
+    length = {"schedule.epochs": None} if "schedule.steps" in others else {}
+    pretraining = {"pretraining.steps": None} if others.get("init_from") else {}
+    return {**settings, **length, **pretraining, **others}

@@ -27,6 +27,7 @@ from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
 from openvima.training.learner import Learner, read_tensors
 from openvima.training.tensorboard import BOARD_FOLDER
+from openvima.training.validation import flattened
 
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
@@ -236,13 +237,3 @@ def _read_progress(checkpoint: Path) -> Progress:
         return Progress(**json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
-
-
-def flattened(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
-    """Return nested settings as one mapping; names are joined by dots."""
-    if not isinstance(values, dict):
-        return {prefix: values}
-    result: dict[str, Any] = {}
-    for name, value in values.items():
-        result |= flattened(value, f"{prefix}.{name}" if prefix else str(name))
-    return result

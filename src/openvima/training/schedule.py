@@ -5,35 +5,26 @@ import math
 
 import torch
 
+from openvima.training.config import ScheduleConfig
 
-def learning_rate_at(
-    step: int,
-    *,
-    highest: float,
-    steps: int,
-    warmup_steps: int,
-    decay_steps: int | None = None,
-    final: float = 0.0,
-) -> float:
-    """Learning rate of one step.
 
-    It rises linearly over the warm-up, falls along half a cosine, and then stays where it is.
+def learning_rate_at(step: int, schedule: ScheduleConfig, *, peak: float, num_steps: int) -> float:
+    """Return the learning rate of a step: linear warm-up, cosine decay, then constant.
 
     Args:
         step: Steps done, from 0.
-        highest: Learning rate after the warm-up.
-        steps: Steps of the whole run.
-        warmup_steps: Steps of the rise; at most a third of the run counts.
-        decay_steps: Steps of the fall; None, or more than are left, is to the end of the run.
-        final: Where the fall ends; at most `highest`.
+        schedule: Its warm-up counts up to a third of the run, its decay up to the end of the run, its final
+            rate up to the peak.
+        peak: Learning rate after the warm-up.
+        num_steps: Steps of the whole run.
     """
-    warmup_steps = min(warmup_steps, steps // 3)
+    warmup_steps = min(schedule.warmup_steps, num_steps // 3)
     if step < warmup_steps:
-        return highest * (step + 1) / (warmup_steps + 1)
-    left = max(1, steps - warmup_steps)
-    progress = min(1.0, (step - warmup_steps) / min(left, decay_steps or left))
-    final = min(final, highest)
-    return final + (highest - final) * 0.5 * (1 + math.cos(math.pi * progress))
+        return peak * (step + 1) / (warmup_steps + 1)
+    left = max(1, num_steps - warmup_steps)
+    progress = min(1.0, (step - warmup_steps) / min(left, schedule.decay_steps or left))
+    final = min(schedule.final_learning_rate, peak)
+    return final + (peak - final) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
 def step_seed(seed: int, purpose: str, step: int) -> int:

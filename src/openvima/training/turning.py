@@ -39,10 +39,16 @@ def joint_loss(
     alone_loss, alone = contrast(prompt, scene, alike_in_prompts(pairs), temperature=temperature)
     again_loss, matched = contrast(moved[rows], scene[rows], same_look, temperature=temperature)
     loss = (alone_loss + again_loss) / 2
-    metrics = {"match_accuracy": alone, "again_accuracy": matched}
+    metrics = {
+        "loss/contrastive": alone_loss.detach(),
+        "loss/second_view": again_loss.detach(),
+        "contrastive_accuracy": alone,
+        "second_view_accuracy": matched,
+    }
     if encoder.config.turn_bins:
-        loss = loss + turn_loss(encoder, features, masks, again.turns)
-        metrics["turn_accuracy"] = _right_turns(encoder, features, masks, again.turns).float().mean()
+        rotation_loss = turn_loss(encoder, features, masks, again.turns)
+        loss, metrics["loss/rotation"] = loss + rotation_loss, rotation_loss.detach()
+        metrics["rotation_accuracy"] = _right_turns(encoder, features, masks, again.turns).float().mean()
     return loss, metrics
 
 

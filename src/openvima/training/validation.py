@@ -1,13 +1,28 @@
-"""Checks of settings, which may come from a file and so be anything."""
+"""Checks of settings, which may come from a file and so be anything, and settings by dotted names."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
-from typing import Any, get_args, get_type_hints
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from openvima.errors import unknown_name
+from openvima.errors import ConfigError, unknown_name
 
-Bounds = Mapping[str, tuple[float, float | None]]
 
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Smallest and largest allowed value of a number; None means no upper bound."""
+
+    low: float
+    high: float | None = None
+
+
+Count = Annotated[int, Range(1)]
+Steps = Annotated[int, Range(0)]
+Probability = Annotated[float, Range(0, 1)]
+
+Settings = TypeVar("Settings")
 # What values of a type may be, and how that is called.
 _TYPES = {
     int: (Integral, "a whole number"),
@@ -17,31 +32,106 @@ _TYPES = {
 }
 
 
-def problems_of(settings: object, bounds: Bounds) -> Iterator[str]:
-    """Say of each setting that cannot be as it is why.
+def problems_of(settings: object, prefix: str = "") -> Iterator[str]:
+    """Say of each setting that is not allowed why, nested ones included.
 
     Args:
         settings: A dataclass; the types of its fields decide what they may hold.
-        bounds: Smallest and largest allowed value of numbers by name; None means no bound on that side.
+        prefix: What comes before the names of its fields.
     """
-    for name, hint in get_type_hints(type(settings)).items():
-        if problem := _problem(name, getattr(settings, name), get_args(hint) or (hint,), bounds):
+    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+        value = getattr(settings, name)
+        if is_dataclass(value):
+            yield from problems_of(value, f"{prefix}{name}.")
+        elif problem := _problem(prefix + name, value, hint):
             yield problem
 
 
-def _problem(name: str, value: Any, kinds: tuple[Any, ...], bounds: Bounds) -> str | None:
-    # Any: the value may be anything; the kinds are words from which to choose, or types.
-    if isinstance(kinds[0], str):
-        return None if value in kinds else unknown_name(name, value, kinds)
-    if kinds[0] not in _TYPES or (value is None and type(None) in kinds):
+def flattened(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
+    """Return nested settings as one mapping; names are joined by dots."""
+    if not isinstance(values, Mapping):
+        return {prefix: values}
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        result |= flattened(value, f"{prefix}.{name}" if prefix else str(name))
+    return result
+
+
+def setting_types(kind: type, prefix: str = "") -> dict[str, Any]:  # Any: types
+    """Return the type of every setting of a dataclass by its dotted name."""
+    types: dict[str, Any] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        types |= setting_types(hint, f"{prefix}{name}.") if _is_section(hint) else {prefix + name: hint}
+    return types
+
+
+def from_settings(kind: type[Settings], settings: Mapping[str, Any]) -> Settings:
+    """Make a dataclass of dataclasses from settings by dotted name; those left out keep their defaults.
+
+    Raises:
+        ConfigError: A name is no setting.
+    """
+    known = setting_types(kind)
+    if problems := [unknown_name("setting", name, known) for name in settings if name not in known]:
+        raise ConfigError(" ".join(problems))
+    return _nested(kind, settings, "")
+
+
+def _nested(kind: type[Settings], settings: Mapping[str, Any], prefix: str) -> Settings:
+    values = {}
+    defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]  # a dataclass
+    for name, hint in get_type_hints(kind).items():
+        if _is_section(hint):
+            default = {f"{prefix}{name}.{key}": v for key, v in _values(defaults[name]).items()}
+            values[name] = _nested(hint, {**default, **settings}, f"{prefix}{name}.")
+        elif prefix + name in settings:
+            values[name] = settings[prefix + name]
+    return kind(**values)
+
+
+def _is_section(hint: Any) -> TypeGuard[type]:  # Any: a type
+    return is_dataclass(hint)
+
+
+def _values(section: Any) -> dict[str, Any]:  # Any: a dataclass
+    return {field.name: getattr(section, field.name) for field in fields(section)}
+
+
+def converted(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
+    """Make paths and numbers of texts; YAML takes 1e-4, without a point, for a text."""
+    kinds = {_plain(option)[0] for option in _options(hint)}
+    if not isinstance(value, str) or not {Path, float} & kinds:
+        return value
+    try:
+        return Path(value) if Path in kinds else float(value)
+    except ValueError:  # the settings will say what it must be
+        return value
+
+
+def _options(hint: Any) -> tuple[Any, ...]:  # Any: types
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def _plain(hint: Any) -> tuple[Any, Range | None]:  # Any: types
+    """Return a type without its annotation, and the range of its values."""
+    return get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, None)
+
+
+def _problem(name: str, value: Any, hint: Any) -> str | None:  # Any: a value may be anything; types
+    options = _options(hint)
+    plain, limits = _plain(options[0])
+    if get_origin(plain) is Literal:
+        return None if value in get_args(plain) else unknown_name(name, value, get_args(plain))
+    if plain not in _TYPES or (value is None and NoneType in options):
         return None
-    kind, called = _TYPES[kinds[0]]
+    kind, called = _TYPES[plain]
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         return f"{name} is {value!r}; it must be {called}."
-    return _out_of_range(name, value, *bounds[name]) if name in bounds else None
+    return _out_of_range(name, value, limits) if limits else None
 
 
-def _out_of_range(name: str, value: Any, low: float, high: float | None) -> str | None:  # Any: a number
+def _out_of_range(name: str, value: Any, limits: Range) -> str | None:  # Any: a number
+    low, high = limits.low, limits.high
     if low <= value and (high is None or value <= high):
         return None
     allowed = f"at least {low:g}" if high is None else f"between {low:g} and {high:g}"

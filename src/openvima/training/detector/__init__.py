@@ -9,7 +9,7 @@ from openvima.training.detector.config import DetectorTrainingConfig
 def train_detector(
     config: DetectorTrainingConfig, report: Callable[[int, int, str], None] | None = None
 ) -> Path:
-    """Train a detector, or go on with a run; see `openvima.training.detector.loop.train_detector`.
+    """Train a detector, or resume a run; see `openvima.training.detector.stage.train_detector`.
 
     Raises:
         MissingExtraError: torch is not installed.
@@ -17,9 +17,9 @@ def train_detector(
     from openvima.policies.base import require_torch
 
     require_torch("training a detector")
-    from openvima.training.detector import loop
+    from openvima.training.detector import stage
 
-    return loop.train_detector(config, report)
+    return stage.train_detector(config, report)
 
 
 __all__ = ["DetectorTrainingConfig", "train_detector"]

@@ -22,7 +22,7 @@ class FrameBatch:
     Args:
         images: Shape (B, 3, H, W), uint8.
         objects: Those of each image.
-        generator: Draws the anchors and proposals that the losses look at.
+        generator: Samples the anchors and proposals of the losses.
     """
 
     images: torch.Tensor
@@ -42,7 +42,7 @@ class FrameBatch:
         return FrameBatch(images, objects, generator)
 
     def to(self, device: torch.device) -> "FrameBatch":
-        """Return the batch on another device; what is drawn is drawn on the processor."""
+        """Return the batch on another device; random numbers come from the CPU."""
         return FrameBatch(
             self.images.to(device), [objects.to(device) for objects in self.objects], self.generator
         )
@@ -53,7 +53,7 @@ class DetectorLearner(Learner):
 
     Args:
         network: The network; it is trained in place.
-        sampled: Proposals of a frame that the heads learn from.
+        sampled: Proposals of a frame that the heads are trained on.
     """
 
     def __init__(self, network: MaskRCNN, *, sampled: int) -> None:
@@ -62,11 +62,12 @@ class DetectorLearner(Learner):
         self._sampled = sampled
 
     def forward(self, batch: FrameBatch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the sum of the losses, and each of them."""
+        """Return the sum of the losses, and each of them as "loss/NAME"."""
         losses = self.network.losses(
             batch.images, batch.objects, sampled=self._sampled, generator=batch.generator
         )
-        return torch.stack(list(losses.values())).sum(), losses
+        parts = {f"loss/{name}": value.detach() for name, value in losses.items()}
+        return torch.stack(list(losses.values())).sum(), parts
 
     def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
         """Write a checkpoint that `load_detector` takes."""

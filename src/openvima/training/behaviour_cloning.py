@@ -1,0 +1,187 @@
+"""Behaviour cloning as a stage of training."""
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from openvima.data.object_cache.cache import ObjectCache
+from openvima.data.torch_dataset import BatchStream, batches_of
+from openvima.errors import ConfigError
+from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.training.config import TrainingConfig
+from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.loop import Metrics
+from openvima.training.parallel import Parallel
+from openvima.training.pretraining.stage import crop_parameters
+from openvima.training.source import ExampleSource, Parts, by_length, order_of
+
+CHUNK = 64  # demonstrations whose images are encoded together
+MAX_FEATURES = 2_000_000  # images that are encoded once and kept, rather than in every step
+
+
+class BehaviourCloning:
+    """Minimises the loss of a learner over whole demonstrations, read from the object cache.
+
+    Args:
+        learner: What is trained.
+        module: What to call for its loss: the learner, perhaps wrapped for several processes.
+        config: All settings.
+        training: Demonstrations to train on.
+        validation: Held-out demonstrations, which choose the best checkpoint.
+        parallel: The processes of the run.
+        detected: Those to train on, with the boxes of a detector, if they are to be mixed in.
+    """
+
+    name = "2-cloning"
+
+    def __init__(
+        self,
+        learner: Learner,
+        module: nn.Module,
+        config: TrainingConfig,
+        training: ExampleSource,
+        validation: ExampleSource,
+        parallel: Parallel,
+        detected: ExampleSource | None = None,
+    ) -> None:
+        self.learning_rate = config.optimizer.learning_rate
+        self.parameters = [p for p in learner.parameters() if p.requires_grad]
+        self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
+        self._training, self._validation, self._detected = training, validation, detected
+        self._validated = module if parallel.is_sharded else learner
+        self._order = order_of(
+            training,
+            batch=config.loader.batch_size,
+            seed=config.seed,
+            bucket=config.loader.bucket_batches,
+            rank=parallel.rank,
+            num_ranks=parallel.num_ranks,
+        )
+        self._batches: Iterator[list[tuple[Any, int]]] = iter(())
+        self._next_step = -1
+
+    def backward(self, step: int) -> Metrics:
+        """Take the step's demonstrations, in parts of similar length, and add their gradients."""
+        if step != self._next_step:
+            self._batches = self._from(step)
+        self._next_step = step + 1
+        parts = next(self._batches)
+        total = self._training.num_steps(self._order.rows_of_all(step))
+        sums: Metrics = {}
+        for number, (batch, num_steps) in enumerate(parts):
+            # Processes average their gradients: each counts by its fraction of the steps of all.
+            weight = num_steps * self._parallel.num_ranks / total
+            with self._parallel.shares(self._module, last=number == len(parts) - 1):
+                loss, metrics = self._call(batch, self._module)
+                (loss * weight).backward()
+            _add(sums, {"loss": loss, **metrics}, weight)
+        return sums
+
+    @torch.no_grad()
+    def validate(self) -> Metrics:
+        """Return loss and metrics on held-out demonstrations; the learner names the one that is the score."""
+        source, collate = self._validation, self._learner.collator()
+        if not len(source):
+            return {}
+        total = source.num_steps(np.arange(len(source)))
+        ranks, parts = self._parallel.num_ranks, self._config.optimizer.grad_accum_steps
+        size = max(1, self._order.batch // ranks // parts)
+        sums: Metrics = {}
+        # Sorted by length, to reduce padding; processes take parts in turn.
+        rows = np.lexsort(source.lengths.T[::-1])
+        for number, start in enumerate(range(0, len(rows), size)):
+            examples = [source[int(row)] for row in rows[start : start + size]]
+            mine = number % ranks == self._parallel.rank
+            if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes at once
+                continue
+            for group in by_length(examples):
+                loss, metrics = self._call(collate(group, None), self._validated)
+                weight = sum(e.episode.num_steps for e in group) / total
+                _add(sums, {"loss": loss, **metrics}, weight * mine * ranks)
+        sums = self._parallel.mean(sums)
+        score = sums[self._learner.score]
+        return {**sums, "score": score, "score_error": math.sqrt(max(0.0, score * (1 - score)) / total)}
+
+    def _from(self, step: int) -> Iterator[list[tuple[Any, int]]]:
+        config, parts = self._config, self._config.optimizer.grad_accum_steps
+        ours = self._order.batch // self._parallel.num_ranks
+        stream = BatchStream(
+            self._training,
+            self._order,
+            first=step,
+            transform=Parts(
+                self._learner.collator(),
+                config.seed,
+                largest=-(-ours // parts),
+                # Sharded weights are gathered at every pass, so all processes must make equally many.
+                count=min(parts, ours) if self._parallel.is_sharded else None,
+                detected=self._detected,
+                detected_share=config.loader.detected_prob or 0.0,
+                strangers=self._training if config.augmentation.distractor_prob else None,
+                stranger_share=config.augmentation.distractor_prob,
+            ),
+        )
+        return iter(batches_of(stream, num_workers=min(config.loader.num_workers, _num_cpus())))
+
+    def _call(
+        self, batch: Any, module: nn.Module
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: a learner's own
+        device = self._parallel.device
+        with self._parallel.autocast(self._config.runtime.precision):
+            loss, metrics = module(batch if device.type == "cpu" else batch.to(device))
+        if self._learner.score not in metrics:  # said at the first step, not at the first checkpoint
+            raise ConfigError(
+                f"the learner's score is {self._learner.score!r}, but its forward returns "
+                f"{', '.join(sorted(metrics)) or 'no metrics'}; name one of them as its score."
+            )
+        return loss, metrics
+
+
+def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
+    """Whether the crop encoder stays frozen: it was pretrained, here or where the weights come from."""
+    images, pretraining = network.images, config.pretraining
+    has_appearance = isinstance(images, ObjectEncoder) and images.config.appearance_width > 0
+    is_pretrained = bool(pretraining.steps or config.init_from)
+    return has_appearance and is_pretrained and not pretraining.finetune_crop_encoder
+
+
+def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
+    """Freeze the crop encoder; unless there are too many images, encode each once for the whole run.
+
+    Args:
+        learner: Whose encoder.
+        caches: All that is trained on; their images are numbered one cache after the other.
+    """
+    for parameter in crop_parameters(learner.network):
+        parameter.requires_grad_(False)
+    count = sum(int(cache.image_counts().sum()) for cache in caches)
+    if count > MAX_FEATURES:
+        return
+    device = next(learner.parameters()).device
+    height, width = learner.reader.image_size
+    parts = [np.zeros((1, 3, height, width), np.uint8)]  # number 0 is black
+    features = []
+    with torch.no_grad():
+        for cache in caches:
+            for start in range(0, len(cache), CHUNK):
+                parts += [episode.images for episode in cache[start : start + CHUNK]]
+                images = torch.from_numpy(np.concatenate(parts)).to(device)
+                features.append(learner.network.encode_images(images))
+                parts = []
+    learner.features = torch.cat(features)
+
+
+def _num_cpus() -> int:
+    """How many this process may use; more workers than these would compete."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _add(sums: Metrics, values: dict[str, torch.Tensor], weight: float) -> None:
+    for name, value in values.items():
+        sums[name] = sums.get(name, 0.0) + value.item() * weight

@@ -1,0 +1,146 @@
+"""Training a detector: frames of demonstrations, and its stage of the training loop."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from openvima.data.batching import BatchOrder
+from openvima.data.reader import Dataset
+from openvima.detector.augment import augmented
+from openvima.detector.checkpoint import load_network
+from openvima.detector.config import detector_config
+from openvima.detector.detectron2 import load_detectron2
+from openvima.detector.frames import Frame, FrameSource, held_out_frames
+from openvima.detector.network import MaskRCNN
+from openvima.errors import ConfigError, DatasetError
+from openvima.policies.devices import torch_threads
+from openvima.training.detector.config import DetectorTrainingConfig
+from openvima.training.detector.learner import DetectorLearner, FrameBatch
+from openvima.training.detector.split import split_episodes
+from openvima.training.loop import Metrics, PlannedStage, Report, Trainer, num_steps
+from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.schedule import step_generator, step_seed
+
+VALIDATION_BATCH = 8  # frames
+
+
+def train_detector(config: DetectorTrainingConfig, report: Report | None = None) -> Path:
+    """Train a detector on the segmentation of demonstrations, or resume an interrupted run.
+
+    Args:
+        config: All settings.
+        report: Called with steps done, steps in all, and a note.
+
+    Returns:
+        The run folder; `load_detector` takes it.
+
+    Raises:
+        ConfigError: The folder holds a run with other settings, the loss diverged, or there are several
+            processes.
+        DatasetError: There are not enough demonstrations.
+        CheckpointError: The last checkpoint, or the initial one, is damaged.
+    """
+    dataset, loader = Dataset(config.data), config.loader
+    training, held_out = split_episodes(dataset, loader.validation_fraction)
+    if 2 * len(training) < loader.batch_size or not len(held_out):
+        raise DatasetError(
+            f"{config.data} holds {len(training)} demonstrations to train on and {len(held_out)} for "
+            f"validation; a batch of {loader.batch_size} frames needs {loader.batch_size // 2} and 1. "
+            "Generate more, lower loader.batch_size, or raise loader.validation_fraction."
+        )
+    runtime = config.runtime
+    with torch_threads(runtime.threads), joined(runtime.device, runtime.sharding) as parallel:
+        if parallel.num_ranks > 1:
+            raise ConfigError("a detector trains in one process; start it without torchrun.")
+        learner = DetectorLearner(_network(config), sampled=config.proposals_per_frame)
+        trainer = Trainer(config, dataset, learner, parallel, report=report)
+        learner.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+        if runtime.compile:
+            compile_layers(learner)
+
+        def make() -> DetectorStage:
+            source = FrameSource(dataset, training, prompt_share=loader.prompt_prob)
+            kept = FrameSource(dataset, held_out, prompt_share=loader.prompt_prob)
+            frames = list(held_out_frames(kept, loader.validation_frames, seed=config.seed))
+            return DetectorStage(learner, config, source, frames, parallel)
+
+        steps = num_steps(config.schedule, lambda: len(training), loader.batch_size // 2)
+        return trainer.train([PlannedStage(steps, make)])
+
+
+class DetectorStage:
+    """Minimises the losses of Mask R-CNN over frames with known objects.
+
+    Args:
+        learner: What is trained.
+        config: All settings.
+        source: Frames to train on.
+        held_out: Frames that choose the best checkpoint, by their loss.
+        parallel: The process of the run.
+    """
+
+    name = "detector"
+
+    def __init__(
+        self,
+        learner: DetectorLearner,
+        config: DetectorTrainingConfig,
+        source: FrameSource,
+        held_out: Sequence[Frame],
+        parallel: Parallel,
+    ) -> None:
+        self.learning_rate = config.optimizer.learning_rate
+        self.parameters = list(learner.parameters())
+        self._learner, self._config, self._parallel = learner, config, parallel
+        self._source, self._held_out = source, held_out
+        self._order = BatchOrder(len(source), batch=config.loader.batch_size // 2, seed=config.seed)
+
+    def backward(self, step: int) -> Metrics:
+        """Draw the step's frames and add their gradients, in parts."""
+        frames, sums = self._frames(step), Metrics()
+        generator = step_generator(self._config.seed, "boxes of the losses", step)
+        size = -(-len(frames) // self._config.optimizer.grad_accum_steps)
+        for start in range(0, len(frames), size):
+            part = frames[start : start + size]
+            self._add(sums, part, generator, len(part) / len(frames)).backward()
+        return sums
+
+    @torch.no_grad()
+    def validate(self) -> Metrics:
+        """Return the losses on held-out frames; the score is the negative loss."""
+        frames, sums = self._held_out, Metrics()
+        for start in range(0, len(frames), VALIDATION_BATCH):
+            part = frames[start : start + VALIDATION_BATCH]
+            generator = step_generator(self._config.seed, "boxes of the validation", start)
+            self._add(sums, part, generator, len(part) / len(frames))
+        return {**sums, "score": -sums["loss"]}
+
+    def _add(
+        self, sums: Metrics, frames: Sequence[Frame], generator: torch.Generator, weight: float
+    ) -> torch.Tensor:
+        """Add the weighted losses of some frames to sums, and return the weighted loss."""
+        with self._parallel.autocast(self._config.runtime.precision):
+            loss, losses = self._learner(FrameBatch.of(frames, generator).to(self._parallel.device))
+        for name, value in {"loss": loss, **losses}.items():
+            sums[name] = sums.get(name, 0.0) + value.item() * weight
+        return loss * weight
+
+    def _frames(self, step: int) -> list[Frame]:
+        frames = []
+        for row in self._order.rows(step).tolist():
+            rng = np.random.default_rng([self._config.seed, step, row])
+            drawn = self._source.draw(row, rng)
+            frames += [augmented(f, rng) for f in drawn] if self._config.loader.augment else drawn
+        return frames
+
+
+def _network(config: DetectorTrainingConfig) -> MaskRCNN:
+    """The network to begin with; `init_from` is read in full, which also checks it."""
+    if config.init_from is not None:
+        is_file = config.init_from.is_file()
+        return load_detectron2(config.init_from) if is_file else load_network(config.init_from)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(step_seed(config.seed, "weights", 0))
+        return MaskRCNN(detector_config(config.preset))

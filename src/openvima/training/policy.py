@@ -1,0 +1,165 @@
+"""Training a policy: contrastive pretraining, then behaviour cloning."""
+
+from functools import cached_property
+from pathlib import Path
+
+from openvima.catalog.packs import load_assets
+from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
+from openvima.data.reader import Dataset
+from openvima.detector.hooks import detected_object_cache, plugged_boxes
+from openvima.errors import ConfigError
+from openvima.policies.devices import torch_threads
+from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
+from openvima.training.building import build_learner, resolved
+from openvima.training.config import TrainingConfig
+from openvima.training.inverse_dynamics import MOTION_TEXT
+from openvima.training.learner import Learner, PolicyLearner
+from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer, num_steps
+from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.pretrain import Variety, render_pairs
+from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
+from openvima.training.sequence_lengths import check_lengths
+from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
+
+
+def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout | None = None) -> Path:
+    """Train a policy on demonstrations, or resume an interrupted run.
+
+    With the same settings and number of threads an interrupted run on a CPU ends with the very weights of an
+    uninterrupted one. Started by `torchrun`, all its processes train together.
+
+    Args:
+        config: All settings.
+        report: Called with steps done, steps in all, and a note.
+        rollout: Called with a checkpoint every `config.rollout.every` steps; returns what to log.
+
+    Returns:
+        The run folder; `load_policy` takes it.
+
+    Raises:
+        ConfigError: The folder holds a run with other settings, preset and settings contradict each other,
+            there is no such detector, or the loss diverged.
+        DatasetError: There are no demonstrations, or one is too long for the network.
+        CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
+            or of other sizes.
+        PromptError: A prompt has a word that the policy's vocabulary lacks.
+        MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
+    """
+    config = resolved(config)
+    load_assets(config.assets)  # mistakes are found before there is a run folder
+    dataset = Dataset(config.data)
+    boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
+    runtime = config.runtime
+    with torch_threads(runtime.threads), joined(runtime.device, runtime.sharding) as parallel:
+        learner = build_learner(config)
+        if boxes and learner.input_kind == "frames":
+            raise ConfigError(
+                f"loader.boxes is {config.loader.boxes!r}, but preset {config.preset!r} takes whole frames; "
+                "leave it out, or take a preset that takes objects."
+            )
+        trainer = Trainer(
+            config,
+            dataset,
+            learner,
+            parallel,
+            report=report,
+            rollout=rollout,
+            rollout_every=config.rollout.every,
+            demonstrations={"boxes": boxes.name} if boxes else None,
+        )
+        return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
+
+
+class _Stages:
+    """Makes the stages of a run from its settings."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        dataset: Dataset,
+        boxes: Boxes | None,
+        learner: Learner,
+        parallel: Parallel,
+        trainer: Trainer,
+    ) -> None:
+        self.config, self.dataset, self.boxes = config, dataset, boxes
+        self.learner, self.parallel, self.trainer = learner, parallel, trainer
+
+    def planned(self) -> list[PlannedStage]:
+        """Return the stages in order."""
+        config = self.config
+        steps = num_steps(config.schedule, lambda: len(self._examples[0]), config.loader.batch_size)
+        cloning = PlannedStage(steps, self._behaviour_cloning)
+        if not config.pretraining.steps:
+            return [cloning]
+        return [PlannedStage(config.pretraining.steps, self._pretraining), cloning]
+
+    def _pretraining(self) -> Stage:
+        assert isinstance(self.learner, PolicyLearner)  # `resolved` has checked it
+        network, config = self.learner.network, self.config.pretraining
+        pairs = render_pairs(
+            sorted(set(self.dataset.index.column("task").to_pylist())),
+            num_scenes=config.num_scenes,
+            seed=self.config.seed,
+            assets=self.config.assets,
+            variety=Variety(
+                config.appearance_randomization_prob,
+                config.hard_negative_prob,
+                again=compares_rotations(network) or config.hard_negative_prob > 0,
+                grays=config.grayscale_prob,
+            ),
+            report=self._say,
+        )
+        return ContrastivePretraining(network, config, self.config.seed, pairs.to(self.parallel.device))
+
+    def _behaviour_cloning(self) -> Stage:
+        self.trainer.report(f"reading {len(self.dataset)} demonstrations")
+        caches, config, learner = self._caches, self.config, self.learner
+        if isinstance(learner, PolicyLearner):
+            prob = config.augmentation.inverse_dynamics_prob
+            check_words(caches[0], learner.reader)
+            if prob:
+                learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
+            for cache in caches:
+                check_lengths(cache, learner.network, learner.reader, motion_share=prob)
+            if freezes_crops(learner.network, config):
+                freeze_crops(learner, caches)
+        if config.runtime.compile:
+            compile_layers(learner)
+        module = self.parallel.wrap(learner)
+        training, validation = self._examples
+        detected = with_boxes_of(caches[1], training) if len(caches) > 1 else None
+        return BehaviourCloning(learner, module, config, training, validation, self.parallel, detected)
+
+    @cached_property
+    def _examples(self) -> tuple[ExampleSource, ExampleSource]:
+        """Demonstrations to train on, and held-out ones."""
+        loader = self.config.loader
+        return split_examples(
+            self._caches[0],
+            validation_share=loader.validation_fraction,
+            validation_episodes=loader.validation_episodes,
+        )
+
+    @cached_property
+    def _caches(self) -> list[ObjectCache]:
+        """The object caches: of true boxes, of those of a detector, or first the one and then the other.
+
+        The first process makes them if need be.
+        """
+        prob, folder = self.config.loader.detected_prob or 0.0, self.config.object_cache
+        caches = []
+        if not self.parallel.is_first:
+            self.parallel.wait()
+        if prob < 1:
+            kind = self.learner.input_kind
+            caches.append(open_object_cache(self.dataset, kind, folder=folder, report=self._say))
+        if prob > 0:
+            assert self.boxes is not None  # `resolved` has checked it
+            caches.append(detected_object_cache(self.dataset, self.boxes, folder=folder, report=self._say))
+        if self.parallel.is_first:
+            self.parallel.wait()
+        return caches
+
+    def _say(self, done: int, total: int, note: str) -> None:
+        self.trainer.report(f"{note or 'extracting objects'}, {done} of {total}")

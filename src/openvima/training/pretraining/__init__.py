@@ -1,0 +1,1 @@
+"""Contrastive pretraining of the crop encoder: rendered pairs, the losses, the stage."""
