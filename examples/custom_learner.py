@@ -1,7 +1,7 @@
 """A network of your own, trained by `openvima train` and scored like any other.
 
     openvima generate --tasks visual_manipulation --episodes 200 --out demos
-    PYTHONPATH=examples openvima train --data demos --preset custom_learner:make --schedule.steps 300 --out run
+    PYTHONPATH=examples openvima train --data demos --preset custom_learner:make --out run
     PYTHONPATH=examples python examples/custom_learner.py run
 
 The training loop gives it recipes, exact resuming, validation, several processes and half precision. Two

@@ -47,8 +47,10 @@ def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
         f"probability {looks:g} an object there has a random shape, and with {looks:g} a random texture"
         in page
     )
-    assert f"probability {recipe['pretraining_grays']:g} the prompt image of an object is gray" in page
-    assert f"with {recipe['pretraining_gaps']:g} gaps are painted over it" in page
+    assert (
+        f"probability {recipe['pretraining.grayscale_prob']:g} the prompt image of an object is gray" in page
+    )
+    assert f"with {recipe['pretraining.occlusion_prob']:g} gaps are painted over it" in page
 
 
 def test_the_figure_shows_every_crop_and_view(monkeypatch: pytest.MonkeyPatch) -> None:
