@@ -130,7 +130,7 @@ def options() -> dict[tuple[str, ...], frozenset[str]]:
                 main([*path, "--help"])
             plain = re.sub(r"\x1b\[[0-9;]*m", "", output.getvalue())
             found[path] = frozenset(
-                re.findall(r"(?:^|│) *(?:-\w, )?(--[a-z][a-z0-9.-]*)", plain, re.MULTILINE)
+                re.findall(r"(?:^|│ |  )(?:-\w, )?(--[a-z][a-z0-9.-]*)", plain, re.MULTILINE)
             )
             found[path] |= frozenset(re.findall(r", (--no-[a-z0-9.-]+)", plain))
     return found

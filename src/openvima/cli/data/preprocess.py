@@ -29,8 +29,8 @@ def tokens(
         folder: Folder of demonstrations.
         kind: objects for all presets that see objects, frames for gato, flamingo and gpt.
         boxes: Detector that finds the objects instead, for `openvima train --loader.boxes`: "detector" for
-            the one that comes with the package, detector=FOLDER for one that `openvima detector train` made, or
-            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectExtractor.
+            the bundled one, detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION
+            or FILE.py:FUNCTION, which makes an ObjectExtractor.
         out: Folder to keep it in; by default "tokens" in the folder of demonstrations.
         workers: Number of processes.
 
