@@ -1,6 +1,6 @@
 """Make docs/images/openvima_small.webp: a policy at work on several tasks, side by side, prompts above.
 
-    python benchmarks/small_animation.py [--policy openvima-small] [--show TASK:LEVEL,...] [--out FILE]
+    python experiments/openvima_small/animation.py [--policy NAME] [--show TASK:LEVEL,...] [--out FILE]
 
 Of each task the first episode is shown that the policy solves, counting from `--seed` (domain "user", neither
 training nor evaluation); TASK:LEVEL:SEED shows that very one, solved or not. All that are shown are printed.

@@ -1,4 +1,4 @@
-"""The animation of `benchmarks/small_animation.py`: what is shown, side by side, without end."""
+"""The animation of `experiments/openvima_small/animation.py`: what is shown, side by side, without end."""
 
 import io
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from animation import SHOWN, Scenes, Wanted, compose, encoded, play_shown, tracks_of
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
-from small_animation import SHOWN, Scenes, Wanted, compose, encoded, play_shown, tracks_of
 
 WIDTH = 200
 
@@ -79,7 +79,7 @@ class Idle:
 
 
 def test_a_policy_that_solves_nothing_is_named_and_a_seed_shows_a_failure(monkeypatch) -> None:
-    monkeypatch.setattr("small_animation.MAX_TRIES", 1)
+    monkeypatch.setattr("animation.MAX_TRIES", 1)
     with pytest.raises(ConfigError, match="solves none of seeds 3 to 3"):
         play_shown(Idle(), Wanted("rotate", "L1"), first_seed=3, width=WIDTH)
     assert not play_shown(Idle(), Wanted("rotate", "L1", 3), first_seed=0, width=WIDTH).outcome.success

@@ -1,4 +1,4 @@
-"""Figures about the policy of the package; `benchmarks/small_results.py` makes them from evaluations."""
+"""Figures about openvima-small; `results.py` makes them from evaluations."""
 
 import textwrap
 from collections.abc import Sequence
@@ -9,9 +9,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from findings import LEVELS, PUBLISHED_DEMONSTRATIONS, Findings, Training
 from openvima.evaluation.results import LevelMean
 from openvima.report.published import PublishedModel, leading_models, published_models
-from small_findings import LEVELS, PUBLISHED_DEMONSTRATIONS, Findings, Training
 
 INK, FAINT, GRID, PAPER = "#1f2933", "#77818c", "#dfe3e9", "#ffffff"
 OURS, VIMA, PUBLISHED = "#0072b2", "#d98200", "#a9b2bc"

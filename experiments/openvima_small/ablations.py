@@ -1,6 +1,6 @@
 r"""What the parts of the preset `small` are worth, and what more demonstrations are.
 
-    python benchmarks/small_ablations.py --data train400 --crops crops --out ablations \
+    python experiments/openvima_small/ablations.py --data train400 --crops crops --out ablations \
         --only full,no-comparison
 
 Every variant is trained with the same number of steps, then plays the same evaluation episodes. Most begin

@@ -1,9 +1,9 @@
-"""Turn evaluations of the policy of the package into its record, its tables and its figures.
+"""Turn evaluations of openvima-small into its record, its tables and its figures.
 
-    python benchmarks/small_results.py EVALUATION --trainings ablations/*.json [--out OUT]
+    PYTHONPATH=benchmarks python experiments/openvima_small/results.py EVALUATION --trainings FILES
 
 EVALUATION is made by `openvima evaluate --policy openvima-small --ablations all --out EVALUATION`. Each file
-of `--trainings` holds what `benchmarks/small_ablations.py` writes, or a list of such records: name, what,
+of `--trainings` holds what `ablations.py` writes, or a list of such records: name, what,
 demonstrations, steps, minutes, and evaluation, the path of a results.json. Those of as many demonstrations
 and steps as the one named `--baseline` are compared with it, and those of other numbers of demonstrations
 make the scaling curve with it. Names that begin with "vima" are VIMA's architecture.
@@ -20,6 +20,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from figures import save_all
+from findings import (
+    DEMONSTRATIONS,
+    LEVELS,
+    POLICY,
+    PUBLISHED_DEMONSTRATIONS,
+    Findings,
+    Training,
+    find,
+    read_trainings,
+)
 from openvima.atomic_io import atomic_write_file
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.comparison import Comparison
@@ -30,17 +41,6 @@ from openvima.policies.parameter_counts import policy_size
 from openvima.report.paper import Estimate, Line, Table, markdown, paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
 from sim import circumstances
-from small_figures import save_all
-from small_findings import (
-    DEMONSTRATIONS,
-    LEVELS,
-    POLICY,
-    PUBLISHED_DEMONSTRATIONS,
-    Findings,
-    Training,
-    find,
-    read_trainings,
-)
 
 OUT = Path("results/2026-11-22_small")
 IMAGES = Path("docs/images")
@@ -52,7 +52,7 @@ BESIDE = (
 )  # in the short table: best, best known, like size
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"
-_ANIMATION = "openvima_small.webp"  # that `benchmarks/small_animation.py` makes
+_ANIMATION = "openvima_small.webp"  # that `experiments/openvima_small/animation.py` makes
 _FIGURES = {
     "animation": "openvima-small at work on six tasks, each with its prompt",
     "levels": "Success of openvima-small at the four levels beside published models",
@@ -281,7 +281,8 @@ def write(findings: Findings, out: Path, images: Path, pages: Sequence[Path], wh
     page = out.with_suffix(".md")
     if not page.exists():
         places = {name: f"{MARK.format(name=name)}\n{END.format(name=name)}" for name in made}
-        command = f"python benchmarks/small_results.py EVALUATION --trainings FILES --out {out}"
+        script = "experiments/openvima_small/results.py"
+        command = f"python {script} EVALUATION --trainings FILES --out {out}"
         atomic_write_file(page, _PAGE.format(**places, command=command, **where))
     for path in (*pages, page):
         figures = {

@@ -1,4 +1,4 @@
-"""What `benchmarks/small_results.py` makes of evaluations: right numbers, whole figures, pages left alone."""
+"""`experiments/openvima_small/results.py`: right numbers, whole figures, pages left alone."""
 
 import json
 from dataclasses import replace
@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
+from findings import Findings, find, read_trainings
 from openvima.errors import ConfigError, DatasetError, UnknownPolicyError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import PairCounts, mean_difference, mean_of_rates
-from small_findings import Findings, find, read_trainings
-from small_results import fill, record, tables, write
+from results import fill, record, tables, write
 
 EPISODES = 10
 TASKS = {"L1": ("rotate", "twist"), "L2": ("rotate",), "L3": ("twist",), "L4": ("same_texture",)}
