@@ -11,6 +11,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "openvima"
 
 # Lowest first; a package imports only from those before it (and from its own files).
 ORDER = (
+    "html",
     "catalog",
     "scene",
     "render",
@@ -29,6 +30,7 @@ ORDER = (
     "cli",
 )
 FORBIDDEN = {
+    "html": {"mujoco", "torch"},
     "catalog": {"mujoco", "torch"},
     "scene": {"mujoco", "torch"},
     "render": {"mujoco", "torch"},

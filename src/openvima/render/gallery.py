@@ -1,9 +1,7 @@
-"""A web page that shows every object and texture of an asset pack: pictures, measures, and who uses it."""
+"""Asset gallery: a page with renderings, dimensions and users of every object and texture of a pack."""
 
-import html
 import io
-from collections.abc import Callable, Sequence
-from importlib import resources
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +23,13 @@ from openvima.catalog import (
     texture_spec,
 )
 from openvima.errors import AssetError
+from openvima.html import render_page, require_extra
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Rasteriser
 from openvima.render.thumbnails import Detail, draw_thumbnail
 
 Report = Callable[[int, int, str], None]
+Card = dict[str, object]  # values of the template's macro `card`
 
 PICTURES = "pictures"
 _SWATCH_PX = 240
@@ -61,77 +61,81 @@ _ROLES_OUTSIDE_POOLS = {"line": "the line that sweeps must not touch or cross"}
 
 
 def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) -> tuple[Path, tuple[str, ...]]:
-    """Write index.html and its pictures; the page needs nothing else and nothing from the network.
+    """Write index.html and its images; the page loads nothing from the network.
 
     Args:
-        out: Folder; what an earlier call wrote there is overwritten.
-        assets: The pack to show.
-        report: Is told how many of how many entries are drawn, and the last one's name.
+        out: Folder; an earlier gallery there is overwritten.
+        assets: The asset pack.
+        report: Called with entries rendered, entries in all, and the last one's name.
 
     Returns:
-        The page, and a sentence for each object and texture that the pack cannot show.
+        The page, and a sentence for each object and texture that the pack lacks.
     """
+    require_extra()
     artist = _Artist(out, Rasteriser(assets))
-    textures = [*TEXTURES.values(), texture_spec(NEUTRAL_TEXTURE)]
-    total = len(OBJECTS) + len(textures)
-    objects, swatches = [], []
+    specs = [*TEXTURES.values(), texture_spec(NEUTRAL_TEXTURE)]
+    total = len(OBJECTS) + len(specs)
+    objects = []
     for index, spec in enumerate(OBJECTS.values()):
         objects.append(_object_card(artist, spec, index))
         if report:
             report(len(objects), total, spec.name)
-    for spec in textures:
-        swatches.append(_texture_card(artist, spec))
+    textures: dict[str, list[Card]] = {title: [] for title in _CATEGORIES.values()}
+    for index, spec in enumerate(specs, len(objects) + 1):
+        textures[_CATEGORIES[spec.category]].append(_texture_card(artist, spec))
         if report:
-            report(len(objects) + len(swatches), total, spec.name)
-    page = atomic_write_file(
-        out / "index.html", _page(assets.name, objects, _by_category(textures, swatches))
+            report(index, total, spec.name)
+    page = render_page(
+        "assets",
+        pack=assets.name,
+        levels=LEVELS,
+        objects=objects,
+        textures=textures,
+        num_textures=len(TEXTURES),
     )
-    return page, tuple(dict.fromkeys(artist.problems))
+    return atomic_write_file(out / "index.html", page), tuple(dict.fromkeys(artist.problems))
 
 
 class _Artist:
-    """Draws pictures into the page's folder and returns their <img> elements."""
+    """Renders images into the page's folder."""
 
     def __init__(self, out: Path, rasteriser: Rasteriser) -> None:
         self.out = out
         self.rasteriser = rasteriser
         self.problems: list[str] = []
 
-    def portrait(self, object_name: str, texture_name: str, view: View, *, detail: Detail = 1) -> str:
+    def portrait(self, object_name: str, texture_name: str, view: View, *, detail: Detail = 1) -> Card:
         return self._picture(
             _slug(f"{object_name} in {texture_name} {view}"),
             f"{texture_name} {object_name}" + (", from above" if view == "top" else ""),
             lambda: draw_thumbnail(self.rasteriser, object_name, texture_name, view, detail=detail),
         )
 
-    def swatch(self, texture_name: str) -> str:
+    def swatch(self, texture_name: str) -> Card:
         return self._picture(
             _slug(f"texture {texture_name}"),
             f"texture {texture_name}",
             lambda: _shrunk(self.rasteriser.assets.texture(texture_name)),
         )
 
-    def _picture(self, name: str, title: str, draw: Callable[[], np.ndarray]) -> str:
+    def _picture(self, name: str, title: str, draw: Callable[[], np.ndarray]) -> Card:
         try:
             pixels = draw()
         except AssetError as error:
             self.problems.append(str(error))
-            return f'<span class="missing">{html.escape(title)} is missing</span>'
+            return {"title": title, "file": None}
         stream = io.BytesIO()
         Image.fromarray(pixels).save(stream, "PNG")
         atomic_write_file(self.out / PICTURES / f"{name}.png", stream.getvalue())
         height, width = pixels.shape[:2]
-        return (
-            f'<img src="{PICTURES}/{name}.png" width="{width}" height="{height}" '
-            f'alt="{html.escape(title)}" title="{html.escape(title)}" loading="lazy">'
-        )
+        return {"title": title, "file": f"{PICTURES}/{name}.png", "width": width, "height": height}
 
 
-def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> str:
+def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> Card:
     hero = _HEROES[index % len(_HEROES)]
-    views = "".join(artist.portrait(spec.name, hero, view, detail=2) for view in VIEWS)
+    views = [artist.portrait(spec.name, hero, view, detail=2) for view in VIEWS]
     palette = _PALETTES[index % len(_PALETTES)]
-    strip = "".join(artist.portrait(spec.name, name, "front") for name in palette)
+    strip = [artist.portrait(spec.name, name, "front") for name in palette]
     facts = {
         "size": _extent(artist, spec),
         "mass": f"{1000 * spec.mass_kg:g} g",
@@ -143,15 +147,19 @@ def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> str:
         "base": _levels_where(lambda pool: spec.name in pool.base_objects),
     }
     note = _ROLES_OUTSIDE_POOLS.get(spec.name, "") or ("" if any(rows.values()) else "used by no task")
-    return (
-        f'<article class="card" id="{_slug(spec.name)}"><h3>{spec.name}</h3>'
-        f'<p class="kind">{_KINDS[spec.kind]}</p>'
-        f'<div class="views">{views}</div><div class="strip">{strip}</div>'
-        f"{_facts(facts)}{_level_table(rows, note)}</article>"
-    )
+    return {
+        "id": _slug(spec.name),
+        "name": spec.name,
+        "kind": _KINDS[spec.kind],
+        "views": views,
+        "strip": strip,
+        "facts": facts,
+        "roles": rows,
+        "note": note,
+    }
 
 
-def _texture_card(artist: _Artist, spec: TextureSpec) -> str:
+def _texture_card(artist: _Artist, spec: TextureSpec) -> Card:
     facts = {}
     try:
         image = artist.rasteriser.assets.texture(spec.name)
@@ -172,12 +180,16 @@ def _texture_card(artist: _Artist, spec: TextureSpec) -> str:
         note = "prompt images that show a shape only"
     else:
         note = "" if any(rows.values()) else "used by no task"
-    return (
-        f'<article class="card" id="{_slug("texture " + spec.name)}"><h3>{spec.name}</h3>'
-        f'<div class="views">{artist.swatch(spec.name)}'
-        f"{artist.portrait(_SAMPLE_OBJECT, spec.name, 'front')}</div>"
-        f"{_facts(facts)}{_level_table(rows, note)}</article>"
-    )
+    return {
+        "id": _slug(f"texture {spec.name}"),
+        "name": spec.name,
+        "kind": "",
+        "views": [artist.swatch(spec.name), artist.portrait(_SAMPLE_OBJECT, spec.name, "front")],
+        "strip": [],
+        "facts": facts,
+        "roles": rows,
+        "note": note,
+    }
 
 
 def _extent(artist: _Artist, spec: ObjectSpec) -> str:
@@ -197,7 +209,7 @@ def _symmetry(symmetry_rad: float | None) -> str:
     if symmetry_rad is None:
         return "not stated"
     if symmetry_rad == 0:
-        return "looks the same at any angle"
+        return "same at any angle"
     degrees = round(np.rad2deg(symmetry_rad))
     return "no symmetry" if degrees == 360 else f"counts as the same every {degrees}°"
 
@@ -210,54 +222,6 @@ def _levels_where(is_used: Callable[..., bool]) -> dict[str, tuple[str, ...]]:
     """Levels with the tasks of which the pool passes, for those levels that have any."""
     found = {level: tuple(t for t in tasks_at(level) if is_used(pool(t, level))) for level in LEVELS}
     return {level: tasks for level, tasks in found.items() if tasks}
-
-
-def _facts(facts: dict[str, str]) -> str:
-    return "<dl>" + "".join(f"<dt>{k}</dt><dd>{html.escape(v)}</dd>" for k, v in facts.items()) + "</dl>"
-
-
-def _level_table(rows: dict[str, dict[str, tuple[str, ...]]], note: str) -> str:
-    """Which levels use an entry, a line a role; the tasks show when the pointer rests on a level."""
-    lines = []
-    for role, levels in rows.items():
-        if levels:
-            chips = "".join(
-                f'<span class="{"on" if level in levels else "off"}" '
-                f'title="{html.escape(", ".join(levels.get(level, ())) or "no task")}">{level}</span>'
-                for level in LEVELS
-            )
-            lines.append(f'<div class="levels"><b>{role}</b>{chips}</div>')
-    return "".join(lines) + (f'<p class="note">{note}</p>' if note else "")
-
-
-def _by_category(textures: Sequence[TextureSpec], cards: Sequence[str]) -> str:
-    sections = []
-    for category, title in _CATEGORIES.items():
-        members = [card for spec, card in zip(textures, cards, strict=True) if spec.category == category]
-        sections.append(f"<h3>{title} ({len(members)})</h3>" + _grid(members, "small"))
-    return "".join(sections)
-
-
-def _grid(cards: Sequence[str], size: str) -> str:
-    return f'<div class="grid {size}">{"".join(cards)}</div>'
-
-
-def _page(pack: str, objects: Sequence[str], textures: str) -> str:
-    style = resources.files("openvima.render").joinpath("gallery.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Objects and textures · {pack} pack · openvima</title>\n"
-        f'<link rel="icon" href="data:,">\n<style>\n{style}</style>\n</head>\n<body>\n'
-        f'<header><div><p class="eyebrow">openvima · {pack} pack</p>'
-        f"<h1>{len(objects)} objects, {len(TEXTURES)} textures</h1>"
-        "<p>Drawn by the simulator's own renderer, enlarged and with smoothed edges. Each object is seen by "
-        "the front camera and from above. Highlighted levels use it; point at one for its tasks.</p>"
-        '<nav><a href="#objects">Objects</a><a href="#textures">Textures</a></nav></div></header>\n<main>\n'
-        f'<section id="objects"><h2>Objects</h2>{_grid(objects, "large")}</section>\n'
-        f'<section id="textures"><h2>Textures</h2>{textures}</section>\n'
-        "</main>\n</body>\n</html>\n"
-    )
 
 
 def _shrunk(image: np.ndarray) -> np.ndarray:

@@ -32,10 +32,9 @@ def ablation_section(results: Results) -> str:
     means = results.means()
     return section(
         "ablations",
-        "What the score is made of",
-        "The same policy on the same episodes with something taken from it. What it still solves does not "
-        "need that. Below each score stand its interval and the change in points; ≈ marks what is inside the "
-        "noise.",
+        "Input ablations",
+        "The same policy on the same episodes with one input removed or replaced. Below each score: its "
+        "95 % interval and the change in points; ≈ marks changes inside the noise.",
         "".join(_policy(results, means, policy) for policy in policies)
         + f'<div class="card"><dl class="levels">{meanings}</dl></div>',
     )

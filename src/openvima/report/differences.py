@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from openvima.evaluation.comparison import Comparison, Difference
-from openvima.report.markup import breakable, folded, section
+from openvima.html import breakable
+from openvima.report.markup import folded, section
 from openvima.report.text import counted, percent, points, points_span, probability, prose
 
 _METHOD = (
@@ -21,8 +22,8 @@ def comparison_section(comparisons: Sequence[Comparison]) -> str:
         return ""
     return section(
         "comparison",
-        "Which is better?",
-        "Differences between policies on the same episodes. What is inside the noise may well be chance.",
+        "Comparison",
+        "Differences between policies on the same episodes.",
         "".join(_comparison(comparison) for comparison in comparisons)
         + f'<p class="note">{prose(_METHOD)}</p>',
     )

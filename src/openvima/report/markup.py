@@ -10,11 +10,6 @@ def section(name: str, title: str, lead: str, body: str) -> str:
     return f'<section id="{name}"><h2>{prose(title)}</h2><p>{prose(lead)}</p>{body}</section>'
 
 
-def breakable(name: str) -> str:
-    """Let long names break after their underscores."""
-    return name.replace("_", "_\u200b")
-
-
 def policy_head(policy: str, colour: str) -> str:
     """Head of a policy's column; the colour is a CSS variable."""
     return f'<th scope="col" style="--series:var({colour})">{DOT}{prose(policy)}</th>'

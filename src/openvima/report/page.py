@@ -1,8 +1,7 @@
-"""The report as one HTML file that needs nothing else: no network, no scripts, no other files."""
+"""The report: one self-contained HTML file without scripts."""
 
 import shlex
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,14 @@ from openvima.atomic_io import atomic_write_file
 from openvima.evaluation.comparison import Comparison, compare_pairs, default_pairs
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
+from openvima.html import render_page
 from openvima.report import sections
 from openvima.report.ablations import ablation_section
 from openvima.report.curves import read_run_charts
 from openvima.report.differences import comparison_section
 from openvima.report.published_comparison import published_section
 from openvima.report.tables import failure_table, rate_table
-from openvima.report.text import headline, prose
+from openvima.report.text import findings, headline
 from openvima.video.clips import Clip
 
 _OPTIONS = {  # settings that a command names where they are not these
@@ -76,11 +76,20 @@ def write_report(
         sections.level_meanings(results),
         sections.reproduction(results, command or default_command(results)),
     )
-    return atomic_write_file(out, _page(results, "\n".join(part for part in body if part), notes))
+    page = render_page(
+        "report",
+        headline=headline(results),
+        summary=findings(results),
+        measured=sections.measured(results),
+        notes=notes,
+        sections=[part for part in body if part],
+        version=results.versions.get("openvima", ""),
+    )
+    return atomic_write_file(out, page)
 
 
 def default_command(results: Results) -> str:
-    """Put the command together from the settings; of run folders and servers only the names are known."""
+    """Compose the command from the settings; of run folders and servers only the names are known."""
     config = results.config
     policies = [_policy_word(name, results.policies.get(name, {})) for name in results.policy_names()]
     words = [
@@ -100,23 +109,8 @@ def default_command(results: Results) -> str:
 
 
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
-    """Name a policy for `--policy`; where weights lie is not in the results, so that is left to fill in."""
+    """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
     named = what.get("preset") or what.get("packaged")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"
-
-
-def _page(results: Results, body: str, notes: Sequence[str]) -> str:
-    style = resources.files("openvima.report").joinpath("style.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta name="description" content="{sections.summary_line(results)}">\n'
-        f"<title>{prose(headline(results))} · openvima</title>\n"
-        '<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n{sections.heading(results, notes)}\n"
-        f"<main>\n{body}\n</main>\n"
-        f"<footer><div>openvima {prose(results.versions.get('openvima', ''))} · prompts, images and films "
-        "on this page come from the evaluated episodes themselves.</div></footer>\n</body>\n</html>\n"
-    )

@@ -24,7 +24,7 @@ def published_section(results: Results) -> str:
     others = [model for model in published_models() if model not in leading]
     return section(
         "published",
-        "Beside published numbers",
+        "Published results",
         "Means over the tasks of each level (%). " + _coverage(results, levels),
         f'<div class="card scroll"><table class="rates">{_head(levels)}<tbody>{_own_rows(results, levels)}'
         f'</tbody><tbody class="elsewhere">{_rows(leading, levels)}</tbody></table></div>'

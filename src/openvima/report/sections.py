@@ -1,9 +1,9 @@
 """Sections of the report, each a function from results to HTML."""
 
-import base64
 from collections.abc import Sequence
 
 from openvima.evaluation.results import LevelMean, Results
+from openvima.html import data_uri
 from openvima.report.curves import Chart
 from openvima.report.figures import curve_chart, level_chart
 from openvima.report.markup import DOT, section
@@ -11,8 +11,6 @@ from openvima.report.text import (
     LEVEL_MEANINGS,
     LEVEL_NAMES,
     counted,
-    findings,
-    headline,
     listed,
     percent,
     prose,
@@ -23,24 +21,15 @@ from openvima.report.text import (
 from openvima.video.clips import Clip
 
 
-def heading(results: Results, notes: Sequence[str] = ()) -> str:
-    """The page's head: the finding, what was measured, and what to beware of."""
-    levels, tasks = results.levels(), results.tasks()
+def measured(results: Results) -> str:
+    """Counts of policies, tasks, levels and episodes as a sentence."""
     episodes = sorted({row.episodes for row in results.rows})
     each = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
-    measured = (
+    return (
         f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
-        f"{counted(len(tasks), 'task')}, {counted(len(levels), 'level')}, {each} each; "
+        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, {each} each; "
         f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
         "never uses."
-    )
-    return (
-        '<header><div><div class="eyebrow">openvima evaluation report</div>'
-        f"<h1>{prose(headline(results))}</h1>"
-        "<p>A robot arm is told what to do by a prompt that mixes words with images. It looks at the table "
-        "from two cameras, acts, and an episode counts as solved when the goal is reached within the step "
-        "limit.</p>"
-        f"<p>{prose(measured)}</p>{''.join(f'<p><b>{prose(note)}</b></p>' for note in notes)}</div></header>"
     )
 
 
@@ -58,9 +47,9 @@ def policy_cards(results: Results) -> str:
         )
     return section(
         "overview",
-        "At a glance",
-        "Share of solved episodes, averaged over the tasks of each level. The higher the level, the less of "
-        "what it shows was seen in training.",
+        "Overview",
+        "Success rates, averaged over the tasks of each level. Higher levels are further from the training "
+        "distribution.",
         f'<div class="grid">{"".join(cards)}</div>',
     )
 
@@ -79,22 +68,21 @@ def level_charts(results: Results) -> str:
     )
     return section(
         "chart",
-        "How sure the numbers are",
-        "Each dot is a success rate, each bar its 95 % interval. Bars that do not overlap mean that the "
-        "difference is hardly chance; where they do overlap, comparing episode by episode may still tell.",
+        "Confidence intervals",
+        "Success rates with 95 % intervals. Overlapping intervals do not rule out a difference: the paired "
+        "comparison below has more power.",
         f'<ul class="legend">{legend}</ul><div class="grid wide">{panels}</div>',
     )
 
 
 def clip_cards(clips: Sequence[Clip]) -> str:
-    """Films of single episodes, each with its prompt."""
+    """Videos of single episodes, each with its prompt."""
     if not clips:
         return ""
     return section(
-        "films",
-        "Watch it work",
-        "Episodes of the evaluation, filmed from the front camera in real time. Below each film stands the "
-        "prompt as the policy received it.",
+        "videos",
+        "Videos",
+        "Episodes of the evaluation in real time, from the front camera, each with its prompt.",
         f'<div class="grid wide">{"".join(_clip_card(clip) for clip in clips)}</div>',
     )
 
@@ -115,7 +103,7 @@ def training_charts(charts: Sequence[Chart]) -> str:
     return section(
         "training",
         "Training",
-        "How the policy learned from the demonstrations.",
+        "Metrics of the training run over its steps.",
         f'<div class="grid wide">{figures}</div>',
     )
 
@@ -129,8 +117,8 @@ def level_meanings(results: Results) -> str:
     )
     return section(
         "levels",
-        "What the levels mean",
-        "Each level takes away one more thing that the policy could have learned by heart.",
+        "Levels",
+        "Each level removes one more thing to which a policy could have overfitted.",
         f'<div class="card"><dl class="levels">{entries}</dl></div>',
     )
 
@@ -147,19 +135,14 @@ def reproduction(results: Results, command: str) -> str:
     )
     return section(
         "repeat",
-        "Repeat this",
-        "The same command gives the same numbers, with any number of workers.",
+        "Reproduction",
+        "The same command gives the same results with any number of workers.",
         f'<div class="card"><pre><code>{prose(command)}</code></pre>'
-        '<p class="note">The outcome of every single episode is in the results.json of the evaluation. '
-        "Objects are cut out along the simulator’s own outlines, as in most published scores; a detector "
-        "finds them only where the ablation “detected boxes” says so.</p>"
+        '<p class="note">results.json contains the outcome of every episode. Objects are cropped '
+        "by the segmentation of the simulator, as in most published results, except in the ablation "
+        "“detected boxes”.</p>"
         f'<ul class="versions">{versions}{weights}</ul></div>',
     )
-
-
-def summary_line(results: Results) -> str:
-    """The findings as plain text, for search engines and link previews."""
-    return prose(findings(results))
 
 
 def _meter(mean: LevelMean) -> str:
@@ -183,8 +166,8 @@ def _clip_card(clip: Clip) -> str:
     label = f"{clip.policy} on {clip.task}, level {clip.level}, seed {clip.seed}"
     return (
         f'<article class="card clip"><video controls autoplay muted loop playsinline '
-        f'aria-label="{prose(label)}" poster="{_data_uri(clip.poster, "image/png")}" '
-        f'src="{_data_uri(clip.video, "video/mp4")}"></video><div class="text"><p class="prompt">{prompt}</p>'
+        f'aria-label="{prose(label)}" poster="{data_uri(clip.poster)}" '
+        f'src="{data_uri(clip.video, "video/mp4")}"></video><div class="text"><p class="prompt">{prompt}</p>'
         f'<div class="meta">{outcome}<span>{prose(clip.policy)}</span><span>{prose(clip.task)}</span>'
         f"<span>{prose(clip.level)}</span><span>seed {clip.seed}</span></div></div></article>"
     )
@@ -193,7 +176,7 @@ def _clip_card(clip: Clip) -> str:
 def _prompt_part(part: str | bytes) -> str:
     if isinstance(part, str):
         return prose(part)
-    return f'<img src="{_data_uri(part, "image/png")}" alt="[image]">'
+    return f'<img src="{data_uri(part)}" alt="[image]">'
 
 
 def _tasks_of(results: Results, level: str) -> str:
@@ -201,7 +184,3 @@ def _tasks_of(results: Results, level: str) -> str:
     if not tasks:
         return ' <span class="note">Not part of this evaluation.</span>'
     return f' <span class="note">Here: {prose(listed(tasks))}.</span>'
-
-
-def _data_uri(content: bytes, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
-from openvima.report.markup import breakable, policy_head, section
+from openvima.html import breakable
+from openvima.report.markup import policy_head, section
 from openvima.report.published import BESIDE, published_tasks
 from openvima.report.text import (
     LEVEL_NAMES,
@@ -53,10 +54,10 @@ def failure_table(results: Results) -> str:
         lines += _failure_lines(policy, colours[policy], rows)
     return section(
         "failures",
-        "What went wrong",
-        "Causes of unsolved episodes, over all levels.",
+        "Failures",
+        "Causes of failed episodes, over all levels.",
         '<div class="card scroll"><table><thead><tr><th scope="col">policy</th><th scope="col">cause</th>'
-        '<th scope="col" class="num">episodes</th><th scope="col" class="num">share of all</th>'
+        '<th scope="col" class="num">episodes</th><th scope="col" class="num">fraction</th>'
         f'<th scope="col">tasks</th></tr></thead><tbody>{"".join(lines)}</tbody></table></div>',
     )
 

@@ -1,6 +1,5 @@
-"""Pictures of all tasks: what each is told and how a solved episode looks."""
+"""Task gallery: the prompt and a solved episode of every task."""
 
-import html
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -14,7 +13,8 @@ from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.evaluation.recording import save_episode_image
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
-from openvima.tasks import TaskSpec, list_tasks, task_spec
+from openvima.html import render_page, require_extra
+from openvima.tasks import list_tasks, task_spec
 from openvima.video.prompt_strip import INK, draw_prompt_strip, font
 from openvima.video.recorder import SceneRenderer
 
@@ -22,16 +22,6 @@ SHEET_NAME = "contact_sheet.png"
 PAGE_NAME = "index.html"
 _COLUMNS, _GAP, _TITLE_HEIGHT = 3, 16, 30  # the last two in pixels
 _TRIES = 20  # seeds, until the oracle solves an episode
-
-_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>openvima: tasks</title>
-<style>
-:root {{ color-scheme: light dark; }}
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
-img {{ width: 100%; height: auto; border-radius: 8px; background: #fff; }}
-section {{ margin-block: 2.5rem; }} h2 {{ margin-bottom: 0; }} p {{ margin-top: .2rem; }}
-</style><h1>{count} tasks</h1>{sections}</html>
-"""
 
 
 def save_task_gallery(
@@ -42,7 +32,7 @@ def save_task_gallery(
     seed: int = 0,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
-    """Write a page with a solved episode of each task, its pictures, and all of them on one sheet.
+    """Write a page with a solved episode of each task, its images, and all of them on one sheet.
 
     Args:
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
@@ -54,6 +44,7 @@ def save_task_gallery(
     Returns:
         The page.
     """
+    require_extra()
     folder.mkdir(parents=True, exist_ok=True)
     specs = [task_spec(name) for name in tasks or list_tasks()]
     panels = []
@@ -65,8 +56,7 @@ def save_task_gallery(
         if report is not None:
             report(number + 1, len(specs), spec.name)
     atomic_write_file(folder / SHEET_NAME, _small_png(_sheet(panels)))
-    sections = "\n".join(_section(spec) for spec in specs)
-    return atomic_write_file(folder / PAGE_NAME, _PAGE.format(count=len(specs), sections=sections))
+    return atomic_write_file(folder / PAGE_NAME, render_page("tasks", tasks=specs))
 
 
 def _first_solved(env: TabletopEnv, seed: int) -> int:
@@ -74,7 +64,7 @@ def _first_solved(env: TabletopEnv, seed: int) -> int:
         (outcome,) = play([env], [candidate], OracleRolloutPolicy())
         if outcome.success:
             return candidate
-    return seed  # shown as it is: not solved
+    return seed
 
 
 def _panel(env: TabletopEnv, title: str, seed: int) -> Image.Image:
@@ -104,17 +94,8 @@ def _sheet(panels: Sequence[Image.Image]) -> Image.Image:
     return sheet
 
 
-def _small_png(picture: Image.Image) -> bytes:
-    """A picture in 256 colours, a third of the size."""
+def _small_png(image: Image.Image) -> bytes:
+    """Encode an image in 256 colours, a third of the size."""
     stream = BytesIO()
-    picture.quantize(256, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    image.quantize(256, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
     return stream.getvalue()
-
-
-def _section(spec: TaskSpec) -> str:
-    facts = f"{spec.family.replace('_', ' ')} · {spec.end_effector} · {', '.join(spec.levels)}"
-    template = html.escape(spec.template)
-    return (
-        f'<section id="{spec.name}"><h2>{spec.name}</h2><p>{facts}<br><code>{template}</code><br>'
-        f'{html.escape(spec.summary)}</p><img src="{spec.name}.png" alt="{spec.name}: {template}"></section>'
-    )

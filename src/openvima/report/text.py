@@ -13,25 +13,25 @@ LEVEL_NAMES = {
 }
 LEVEL_MEANINGS = {
     "train": "Objects, textures and tasks of the training set, on fresh seeds.",
-    "L1": "Everything was seen in training, but never laid out like this.",
-    "L2": "Known objects and known textures, in pairs that training kept apart.",
-    "L3": "Shapes that never occurred in training, and textures from the whole catalogue.",
-    "L4": "Prompts of a kind that training did not contain, with new objects and textures.",
+    "L1": "Objects, textures and tasks of the training set, in new placements.",
+    "L2": "Training objects and textures in new combinations.",
+    "L3": "New shapes, and textures from the whole catalogue.",
+    "L4": "New kinds of prompts, with new objects and textures.",
 }
 _ROLES = {
-    "oracle": "Scripted solver that sees the true scene. The most that a policy can reach.",
-    "random": "Actions drawn at random. The least that a policy must beat.",
-    "untrained": "The same network before any training.",
-    "run": "Trained policy: sees only the prompt and two camera images.",
-    "remote": "Policy behind a server: sees only the prompt and two camera images.",
+    "oracle": "Scripted solver with access to the scene: the upper bound.",
+    "random": "Random actions: the lower bound.",
+    "untrained": "A network with random weights.",
+    "run": "Trained policy: observes the prompt and two camera images.",
+    "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _ABLATION_DESCRIPTIONS = {
-    "no_prompt": "The prompt is a full stop in every episode. What is still solved, the table gives away.",
-    "other_prompt_images": "The prompt has its own words, with images of another episode of the task.",
-    "scrambled_words": "The prompt has its own images; each word is some word of the vocabulary.",
-    "shuffled_objects": "Objects have other numbers, which only under compat say how the table was laid.",
-    "detected_boxes": "Objects are found by a detector in the pixels, not given by the simulator.",
-    "in_context": "The prompt is no task but a motion: what the oracle did in this very episode.",
+    "no_prompt": "The prompt is a full stop in every episode; only the table is left.",
+    "other_prompt_images": "The prompt keeps its words; its images come from another episode of the task.",
+    "scrambled_words": "The prompt keeps its images; each word is replaced by a random word.",
+    "shuffled_objects": "Object ids are permuted; only with compat do they reveal the order of spawning.",
+    "detected_boxes": "Boxes come from a detector instead of the simulator.",
+    "in_context": "The prompt is a demonstration of the oracle in the same episode.",
 }
 
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")

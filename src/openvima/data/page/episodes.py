@@ -1,8 +1,5 @@
-"""One episode on the page: its prompt in words and pictures, its steps with the actions drawn in."""
+"""One episode on the data page: its prompt, and its observations with the actions drawn in."""
 
-import base64
-import html
-import io
 import math
 
 import numpy as np
@@ -10,51 +7,52 @@ from PIL import Image
 
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
+from openvima.html import data_uri, render_page
 from openvima.render import channels_last
 from openvima.render.camera import CAMERAS, View, project
 from openvima.scene import BACKGROUND_ID, Action, PromptImage
+from openvima.video.clips import png
 
 _GAP = 2  # pixels between the two views
 _MARGIN = 3  # pixels around an object in the prompt
 _RING = 4.5  # radius in pixels
 _HEAD = 7.0  # length of the arrow's head in pixels
 _LEAST_TURN_DEG = 1
-_CLOSING = ".,;:"  # marks that stick to what stands before them
+_CLOSING = ".,;:"  # no space before these
 
 
 def episode_card(demo: Demonstration) -> str:
-    """Write an episode as HTML.
+    """Render an episode as HTML.
 
     Args:
         demo: The episode, with its images.
     """
-    prompt = " ".join(
-        html.escape(part) if isinstance(part, str) else _prompt_picture(part)
-        for part in demo.prompt.sequence()
-    )
-    for mark in _CLOSING:
-        prompt = prompt.replace(f" {mark}", mark)
-    frames = "".join(_frame(demo, step) for step in range(demo.num_steps + 1))
     facts = (
         f"level {demo.level}",
         f"seed {demo.seed} of domain {demo.domain}",
         demo.end_effector,
-        *([f"{demo.num_redraws} redraws"] if demo.num_redraws else []),
+        *([f"{demo.num_redraws} resamples"] if demo.num_redraws else []),
         "solved" if demo.outcome.success else demo.outcome.reason or "not solved",
     )
-    meta = "".join(f"<span>{html.escape(fact)}</span>" for fact in facts)
-    return (
-        f'<article class="card episode"><p class="prompt">{prompt}</p><div class="frames">{frames}</div>'
-        f'<p class="meta">{meta}<span>content <code>{demo.content_hash()}</code></span></p></article>'
+    return render_page(
+        "episode",
+        prompt=[_prompt_part(part, index) for index, part in enumerate(demo.prompt.sequence())],
+        frames=[_frame(demo, step) for step in range(demo.num_steps + 1)],
+        width=IMAGE_SHAPE[1],
+        height=2 * IMAGE_SHAPE[0] + _GAP,
+        facts=facts,
+        content_hash=demo.content_hash(),
     )
 
 
-def _prompt_picture(image: PromptImage) -> str:
-    pixels = channels_last(image.rgb["front"])
-    if image.kind == "object":
-        pixels = _cut_to_object(pixels, image.segm["front"])
-    kind = "scene" if image.kind == "scene" else "object"
-    return f'<img class="{kind}" src="{_png_uri(pixels)}" alt="[{html.escape(image.name)}]">'
+def _prompt_part(part: str | PromptImage, index: int) -> dict[str, str]:
+    if isinstance(part, str):
+        return {"space": " " if index and part[0] not in _CLOSING else "", "uri": "", "text": part}
+    pixels = channels_last(part.rgb["front"])
+    if part.kind == "object":
+        pixels = _cut_to_object(pixels, part.segm["front"])
+    uri = data_uri(png(Image.fromarray(np.ascontiguousarray(pixels))))
+    return {"space": " " if index else "", "uri": uri, "kind": part.kind, "name": part.name}
 
 
 def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
@@ -66,20 +64,15 @@ def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
     return pixels[top : rows[-1] + 1 + _MARGIN, left : columns[-1] + 1 + _MARGIN]
 
 
-def _frame(demo: Demonstration, step: int) -> str:
-    """What both cameras saw before a step, or at the end, with what is done next."""
+def _frame(demo: Demonstration, step: int) -> dict[str, str]:
+    """Observation of both cameras before a step, or at the end, with the action that follows."""
     height, width = IMAGE_SHAPE
-    picture = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
-    for place, view in enumerate(VIEWS):
-        top = place * (height + _GAP)
-        picture[top : top + height] = channels_last(demo.rgb[view][step])
+    image = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
+    for index, view in enumerate(VIEWS):
+        top = index * (height + _GAP)
+        image[top : top + height] = channels_last(demo.rgb[view][step])
     arrows = "" if step == demo.num_steps else "".join(_arrow(demo.actions[step], view) for view in VIEWS)
-    caption = html.escape(_caption(demo, step))
-    return (
-        f'<figure><svg viewBox="0 0 {width} {2 * height + _GAP}" role="img" aria-label="{caption}">'
-        f'<image href="{_png_uri(picture)}" width="{width}" height="{2 * height + _GAP}"/>{arrows}</svg>'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    return {"caption": _caption(demo, step), "uri": data_uri(png(Image.fromarray(image))), "arrows": arrows}
 
 
 def _arrow(action: Action, view: View) -> str:
@@ -126,9 +119,3 @@ def _turn_deg(action: Action) -> int:
     """By how much an action turns what it carries, in whole degrees; to the left seen from above."""
     yaws = [2 * math.atan2(q[2], q[3]) for q in (action.pose0_rotation, action.pose1_rotation)]
     return round(math.degrees(math.remainder(yaws[1] - yaws[0], math.tau)))
-
-
-def _png_uri(pixels: np.ndarray) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
