@@ -36,8 +36,8 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.runner import Job
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.inputs import EpisodeReader, Reader
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.processor import Processor
 from openvima.render.rasteriser import Rasteriser
 from policy import random_network, tokenizer_of
 from sim import circumstances
@@ -52,7 +52,7 @@ OTHER = "transfer"
 PHASES: dict[str, list[tuple[Any, str]]] = {  # phase → owner and name of the functions that it consists of
     "simulation": [(EnvConfig, "make"), (TabletopEnv, "reset"), (TabletopEnv, "step")],
     "rendering": [(Rasteriser, "scene"), (Rasteriser, "prompt")],
-    "seeing": [(Reader, "read_prompt"), (EpisodeReader, "read_step")],
+    "seeing": [(Processor, "encode_prompts"), (Processor, "encode_observations")],
     "inference": [
         (PolicyNetwork, "encode_images"),
         (PolicyNetwork, "encode_prompts"),

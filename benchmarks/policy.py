@@ -24,7 +24,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,14 @@ from torch.utils.flop_counter import FlopCounterMode
 from openvima.data.object_cache.episode import preprocess
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
-from openvima.perception.image_stack import ImageStack
 from openvima.policies import preset
+from openvima.policies.batch import HistoryBatch
 from openvima.policies.heads.base import ACTION_WIDTH, ActionTargets
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts
 from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
-from openvima.training.collate import Collator
-from openvima.training.dataset import input_kind, stack_images
+from openvima.training.dataset import stack_images
 from sim import circumstances
 
 HISTORY = 5
@@ -80,24 +79,23 @@ class Decision:
 
     def __init__(self, policy: NetworkPolicy, episode: Demonstration) -> None:
         self._policy, self._network, self._episode = policy, policy.network, episode
-        reader = policy.reader.begin_episode()
-        self._prompt = policy.reader.read_prompt(episode.prompt)
-        self._steps = [reader.read_step(episode.observation(t)) for t in range(HISTORY)]
-        self._images = [self._prompt.objects.crops, *(step.objects.crops for step in self._steps)]
+        self._prompt, stack = policy.processor.encode_prompts([episode.prompt])
+        observations = [episode.observation(t) for t in range(HISTORY)]
+        self._history, stack = policy.processor.encode_observations([observations], stack=stack)
+        self._images = torch.from_numpy(stack.images())
         self._actions = torch.full((1, HISTORY, ACTION_WIDTH), 0.3)
         with torch.inference_mode():
-            self._features, self._numbers = self._encode(share=False)
-            self._memory = self._read_prompt(self._features, self._numbers[0])
+            self._features = self._network.encode_images(self._images)
+            self._memory = self._network.encode_prompts(self._prompt, self._features)
 
     def sizes(self) -> dict[str, int]:
         """Return how much there is to read."""
+        crop_index, masks = self._history.crop_index_BTVN, self._history.masks_BTVN
         return {
-            "prompt_places": len(self._prompt.words),
-            "prompt_crops": int(self._prompt.objects.masks.sum()),
-            "crops_in_all_steps": sum(int(step.objects.masks.sum()) for step in self._steps),
-            "different_ones": len(
-                {crop.tobytes() for step in self._steps for crop in _flat(step.objects.crops)}
-            ),
+            "prompt_places": self._prompt.word_ids_BL.shape[1],
+            "prompt_crops": int(self._prompt.masks_VS.sum()),
+            "crops_in_all_steps": int(masks.sum()),
+            "different_ones": len(crop_index[masks].unique()),
         }
 
     def approach(self) -> None:
@@ -113,31 +111,27 @@ class Decision:
     @torch.inference_mode()
     def anew(self, *, share: bool = False) -> None:
         """Decide from scratch; `share` encodes equal crops once."""
-        features, numbers = self._encode(share=share)
-        self._decode(self._read_prompt(features, numbers[0]), features, numbers)
+        prompt, history, images = self._prompt, self._history, self._images
+        if not share:
+            prompt_index, step_index = prompt.crop_index_VS, history.crop_index_BTVN
+            images = images[torch.cat([prompt_index.flatten(), step_index.flatten()])]
+            prompt_numbers, step_numbers = torch.arange(len(images)).split(
+                [prompt_index.numel(), step_index.numel()]
+            )
+            prompt = replace(prompt, crop_index_VS=prompt_numbers.view_as(prompt_index))
+            history = replace(history, crop_index_BTVN=step_numbers.view_as(step_index))
+        features = self._network.encode_images(images)
+        self._decode(self._network.encode_prompts(prompt, features), history, features)
 
     @torch.inference_mode()
     def trunk_anew(self) -> None:
         """Decide with prompt and tokens kept, but nothing in the trunk."""
-        self._network.encode_images(torch.from_numpy(_flat(self._images[-1])))
-        self._decode(self._memory, self._features, self._numbers)
+        self._network.encode_images(self._images[self._history.crop_index_BTVN[:, -1].flatten()])
+        self._decode(self._memory, self._history, self._features)
 
-    def _encode(self, *, share: bool) -> tuple[torch.Tensor, list[np.ndarray]]:
-        if share:
-            stack = ImageStack(self._policy.reader.image_size)
-            numbers = [stack.add(images) for images in self._images]
-            return self._network.encode_images(torch.from_numpy(stack.images())), numbers
-        images = np.concatenate([_flat(images) for images in self._images])
-        ends = np.cumsum([images.shape[0] * images.shape[1] for images in self._images])
-        numbers = np.split(np.arange(len(images)), ends[:-1])
-        shaped = [part.reshape(images.shape[:2]) for part, images in zip(numbers, self._images, strict=True)]
-        return self._network.encode_images(torch.from_numpy(images)), shaped
-
-    def _read_prompt(self, features: torch.Tensor, numbers: np.ndarray) -> Any:  # Any: the network's memory
-        return self._network.encode_prompts(batch_prompts([self._prompt], [numbers]), features)
-
-    def _decode(self, memory: Any, features: torch.Tensor, numbers: Sequence[np.ndarray]) -> None:
-        history = batch_histories([self._steps], [numbers[1:]])
+    def _decode(
+        self, memory: Any, history: HistoryBatch, features: torch.Tensor
+    ) -> None:  # Any: the network's
         self._network.head.decide(self._network(memory, history, features, self._actions))
 
 
@@ -149,10 +143,10 @@ class Training:
 
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
-        reader = Reader.of(network.config.images, tokenizer_of(network))
-        episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
-        examples, images = stack_images(episodes, reader)
-        batch = Collator(reader)(examples)
+        processor = Processor.of(network.config.images, tokenizer_of(network))
+        episodes = [preprocess(demo, processor.input_kind) for demo in demos]
+        examples, images = stack_images(episodes, processor)
+        batch = processor.collate(episodes, [example.base for example in examples])
         used = torch.cat(
             [batch.prompts.crop_index_VS.flatten(), batch.history.crop_index_BTVN.flatten()]
         ).unique()
@@ -181,10 +175,6 @@ class Training:
         loss.backward()
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
-
-
-def _flat(images: np.ndarray) -> np.ndarray:
-    return images.reshape(-1, *images.shape[-3:])
 
 
 def random_network(name: str) -> PolicyNetwork:

@@ -20,7 +20,7 @@ from openvima.evaluation import score
 from openvima.perception.objects import observe, observe_prompt_image
 from openvima.policies import RandomPolicy
 from openvima.policies.base import checkpoint_folder
-from openvima.policies.inputs import Reader
+from openvima.policies.processor import Processor
 from openvima.scene import Action
 from openvima.training.learner import Learner, PolicyCollate
 
@@ -37,7 +37,7 @@ class Matcher(Learner):
 
     def collator(self):
         """The crops, boxes and targets that policies of the package learn from; 5 % false detections."""
-        return PolicyCollate(Reader("objects"), 0.05, with_images=True)
+        return PolicyCollate(Processor("objects"), 0.05, with_images=True)
 
     def forward(self, batch):
         """Cross-entropy of the object to pick and of the one to place it on."""

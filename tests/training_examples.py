@@ -7,23 +7,30 @@ import pytest
 
 from openvima.data import Demonstration
 from openvima.data.object_cache.episode import preprocess
-from openvima.policies.inputs import Reader
+from openvima.policies.batch import Batch
+from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
-from openvima.training.dataset import Example, input_kind, stack_images
+from openvima.training.dataset import Example, stack_images
 from openvima.training.source import ExampleSource
 
 
-def examples_of(demos: Iterable[Demonstration], reader: Reader):
+def examples_of(demos: Iterable[Demonstration], processor: Processor):
     """Examples that share a stack of images, and the stack."""
-    return stack_images([preprocess(demo, input_kind(reader)) for demo in demos], reader)
+    return stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
 
 
-def source_of(demos: Iterable[Demonstration], reader: Reader) -> ExampleSource:
+def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSource:
     """The same as if they had come out of a token cache."""
-    episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
+    episodes = [preprocess(demo, processor.input_kind) for demo in demos]
     counts = np.array([len(episode.images) for episode in episodes])
     lengths = np.array([[episode.num_steps, len(episode.objects)] for episode in episodes])
     return ExampleSource(episodes, np.arange(len(episodes)), np.cumsum(counts) - counts, lengths)
+
+
+def collate_examples(processor: Processor, examples: Iterable[Example]) -> Batch:
+    """A batch whose images are numbered as in the examples' stack."""
+    examples = list(examples)
+    return processor.collate([each.episode for each in examples], [each.base for each in examples])
 
 
 def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]:

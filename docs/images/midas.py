@@ -16,7 +16,7 @@ from openvima.env import TabletopEnv
 from openvima.policies import preset
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
 from openvima.policies.heads.bins import encode_bins
-from openvima.policies.inputs import Reader
+from openvima.policies.processor import Processor
 from openvima.scene import Action
 from openvima.training.inverse_dynamics import motion_prompt
 from policy import (
@@ -67,11 +67,11 @@ def component_tokens(action: Action) -> list[Token]:
 
 def draw_step(axes: Any, demo: Demonstration) -> None:
     """Draw prompt, first observation and first action as one sequence."""
-    reader = Reader.of(preset("midas-nano").images)
+    processor = Processor.of(preset("midas-nano").images)
     text = "one decoder over encoded prompt and history; actions component by component"
     draw_title(axes, 0.25, "MIDAS", text)
     draw_text(axes, LEFT, 0.62, f"“{demo.prompt.text}”", family="DejaVu Sans Mono", fontsize=8)
-    asked = prompt_tokens(reader, demo.prompt)
+    asked = prompt_tokens(processor, demo.prompt)
     shown = [token if isinstance(token.content, str) else _unnamed(token) for token in asked]
     *middles, end = draw_tokens(axes, shown, LEFT, 1.1, SIZE)
     draw_box(axes, LEFT, 1.42, (end - LEFT, 0.34), facecolor=LAYERS)
@@ -85,7 +85,7 @@ def draw_step(axes: Any, demo: Demonstration) -> None:
     draw_text(axes, end + 0.06, 1.95, "visual residual", fontsize=8, color=RESIDUAL)
     separator, right = draw_tokens(axes, [Token("sep")], end + 1.1, 1.1, SIZE)
     start = right + 0.12
-    seen = [_unnamed(token) for token in step_tokens(reader, demo.observation(0))]
+    seen = [_unnamed(token) for token in step_tokens(processor, demo.observation(0))]
     *slots, right = draw_tokens(axes, seen, start, 1.1, SIZE)
     for name, colour, at in ((*VIEWS[0], start), (*VIEWS[1], slots[len(slots) // 2] - SIZE / 2)):
         draw_text(axes, at, 0.82, f"step 1, {name}", fontsize=8, color=colour)
@@ -119,9 +119,9 @@ def draw_motion(axes: Any, demo: Demonstration) -> None:
         if t < demo.num_steps:
             draw_arrow(axes, (x + width + 0.1, 4.45), (x + width + 1.4, 4.45), colour=ACTION, width=1.6)
             draw_text(axes, x + width + 0.75, 4.3, f"action {t + 1}", ha="center", fontsize=8.5, color=ACTION)
-    reader = Reader.of(preset("midas-nano").images)
+    processor = Processor.of(preset("midas-nano").images)
     frames = [demo.observation(t) for t in range(demo.num_steps + 1)]
-    tokens = [_unnamed(token) for token in prompt_tokens(reader, motion_prompt(frames, demo.objects))]
+    tokens = [_unnamed(token) for token in prompt_tokens(processor, motion_prompt(frames, demo.objects))]
     draw_text(axes, LEFT, 5.4, "prompt", fontweight="bold")
     *_, end = draw_tokens(axes, tokens, LEFT, 5.72, 0.26)
     draw_text(axes, LEFT, 6.12, "answer", fontweight="bold")

@@ -15,8 +15,9 @@ from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.perception.objects import ObjectViews, observe, observe_prompt_image
 from openvima.policies import preset
+from openvima.policies.batch import WORD
 from openvima.policies.heads.candidates import FreePoints
-from openvima.policies.inputs import WORD, Reader
+from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render.camera import TOP, project
 from openvima.scene import PromptImage
@@ -61,28 +62,28 @@ def draw_word(axes: Any, text: str, x: float, y: float) -> float:
     return width
 
 
-def draw_object(axes: Any, objects: ObjectViews, slot: int, x: float, y: float) -> float:
+def draw_object(axes: Any, crops: np.ndarray, slot: int, x: float, y: float) -> float:
     """Draw an object as a token, the front view above the top view; return its width."""
     for view, (_, colour) in enumerate(VIEWS):
         top = y - SIZE + view * SIZE
-        draw_picture(axes, picture(objects.crops[view, slot]), x, top, (SIZE, SIZE))
+        draw_picture(axes, picture(crops[view, slot]), x, top, (SIZE, SIZE))
         draw_frame(axes, x, top, (SIZE, SIZE), edgecolor=colour, linewidth=1.2)
     return SIZE
 
 
 def draw_prompt(axes: Any, demo: Demonstration) -> None:
     """Draw the prompt, its encoder, and the scene that it shows."""
-    reader = Reader.of(preset("small").images)
-    read = reader.read_prompt(demo.prompt)
+    batch, stack = Processor.of(preset("small").images).encode_prompts([demo.prompt])
+    crops = stack.images()[batch.crop_index_VS]
     words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
     draw_text(axes, LEFT + 0.75, 0.62, f"“{demo.prompt.text}”", family="DejaVu Sans Mono", fontsize=8.5)
     x, middles = LEFT, []
-    for word, entry in zip(read.words, read.entries, strict=True):
+    for word, entry in zip(batch.word_ids_BL[0].tolist(), batch.object_index_BL[0].tolist(), strict=True):
         if entry == WORD:
-            width = draw_word(axes, words[int(word)], x, 1.2)
+            width = draw_word(axes, words[word], x, 1.2)
         else:
-            width = draw_object(axes, read.objects, entry, x, 1.2)
+            width = draw_object(axes, crops, entry, x, 1.2)
         middles.append(x + width / 2)
         x += width + 0.06
     end = x - 0.06
@@ -116,7 +117,7 @@ def draw_step(axes: Any, demo: Demonstration) -> None:
     x = start = LEFT + 2 * width + 0.55
     middles = []
     for slot in range(len(objects)):
-        middles.append(x + draw_object(axes, objects, slot, x, 3.1) / 2)
+        middles.append(x + draw_object(axes, objects.crops, slot, x, 3.1) / 2)
         x += SIZE + 0.1
     right = WIDTH - 0.9
     middles.append(right + draw_word(axes, "query", right, 3.1) / 2)

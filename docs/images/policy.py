@@ -16,12 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 import openvima
-from openvima.perception.objects import ObjectViews, observe, whole_frames
+from openvima.perception.objects import observe, whole_frames
 from openvima.policies import preset
+from openvima.policies.batch import WORD
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
 from openvima.policies.heads.bins import NUM_BINS, encode_bins
-from openvima.policies.inputs import WORD, Reader
 from openvima.policies.nn.trunk import PrefixConfig
+from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render import channels_last
 from openvima.scene import PromptImage, RenderedPrompt
@@ -80,38 +81,42 @@ def play() -> Story:
     return Story(env.prompt, observations, bins)
 
 
-# From what the readers give to what is drawn.
+# From what the processors give to what is drawn.
 
 
-def prompt_tokens(reader: Reader, prompt: RenderedPrompt) -> list[Token]:
+def prompt_tokens(processor: Processor, prompt: RenderedPrompt) -> list[Token]:
     """Return the tokens of a prompt."""
-    read = reader.read_prompt(prompt)
+    batch, stack = processor.encode_prompts([prompt])
+    crops, num_objects = stack.images()[batch.crop_index_VS], batch.crop_index_VS.shape[1]
     words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
     return [
-        Token(words[int(word)]) if entry == WORD else image_token(reader, read.objects, entry, part)
-        for word, entry, part in zip(read.words, read.entries, read.parts, strict=True)
+        Token(words[word])
+        if index == WORD
+        else image_token(processor, crops, index % num_objects, index // num_objects)
+        for word, index in zip(batch.word_ids_BL[0].tolist(), batch.object_index_BL[0].tolist(), strict=True)
     ]
 
 
-def step_tokens(reader: Reader, observation: Mapping[str, Any]) -> list[Token]:
+def step_tokens(processor: Processor, observation: Mapping[str, Any]) -> list[Token]:
     """Return the tokens of an observation."""
-    objects = reader.begin_episode().read_step(observation).objects
-    if reader.layout == "frames":
-        return [image_token(reader, objects, 0, part) for part in range(reader.tokens_per_frame_pair)]
-    slots = [(k, view) for view in range(len(VIEWS)) for k in range(len(objects))]
-    return [replace(image_token(reader, objects, k, view), name=str(k + 1)) for k, view in slots]
+    batch, stack = processor.encode_observations([[observation]])
+    crops = stack.images()[batch.crop_index_BTVN[0, 0]]
+    if processor.layout == "frames":
+        return [image_token(processor, crops, 0, part) for part in range(processor.tokens_per_frame_pair)]
+    slots = [(k, view) for view in range(len(VIEWS)) for k in range(crops.shape[1])]
+    return [replace(image_token(processor, crops, k, view), name=str(k + 1)) for k, view in slots]
 
 
-def image_token(reader: Reader, images: ObjectViews, entry: int, part: int) -> Token:
+def image_token(processor: Processor, crops: np.ndarray, entry: int, part: int) -> Token:
     """Return one token of an image: a crop, a patch, or a blank where frames are summed up."""
-    if reader.layout == "views":
+    if processor.layout == "views":
         name, colour = VIEWS[part]
-        return Token(picture(images.crops[part, entry]), colour, f"{chr(ord('A') + entry)} {name}")
-    if reader.tokens_per_frame_pair < 2 * PATCHES:
+        return Token(picture(crops[part, entry]), colour, f"{chr(ord('A') + entry)} {name}")
+    if processor.tokens_per_frame_pair < 2 * PATCHES:
         return Token("", SUMMARY)
     view, place = divmod(part, PATCHES)
     row, column = (PATCH * index for index in divmod(place, PATCHES_IN_ROW))
-    frame = images.crops[view, entry]
+    frame = crops[view, entry]
     return Token(picture(frame[:, row : row + PATCH, column : column + PATCH]), VIEWS[view][1])
 
 
@@ -192,16 +197,16 @@ def draw_title(axes: Any, y: float, name: str, text: str) -> None:
 
 def draw_vima(axes: Any, story: Story) -> None:
     """Draw the way of a prompt and two steps through VIMA."""
-    reader = Reader.of(preset("vima-nano").images)
+    processor = Processor.of(preset("vima-nano").images)
     draw_title(axes, 0.25, "VIMA", "one token for each object in each view; cross-attention to the prompt")
-    draw_prompt(axes, reader, story.prompt)
+    draw_prompt(axes, processor, story.prompt)
     draw_text(axes, LEFT, 2.68, "history", fontweight="bold")
     steps = zip((LEFT, SECOND), story.observations, story.bins, strict=True)
     for number, (left, observation, bins) in enumerate(steps, 1):
         draw_views(axes, observation, left, number)
         note = "cut out of the views: 32 × 32 pixels and the box of each object"
         draw_text(axes, left, 4.25, note, fontsize=8, color=FAINT)
-        *middles, end = draw_tokens(axes, step_tokens(reader, observation), left, 4.9, 0.58)
+        *middles, end = draw_tokens(axes, step_tokens(processor, observation), left, 4.9, 0.58)
         draw_text(axes, left, 5.3, "each with the end effector: suction cup", fontsize=8, color=FAINT)
         for middle in middles:
             draw_arrow(axes, (middle, 5.4), (middle, 5.6))
@@ -213,13 +218,13 @@ def draw_vima(axes: Any, story: Story) -> None:
     draw_text(axes, SECOND, 5.83, "causal: each token sees itself and what came before")
 
 
-def draw_prompt(axes: Any, reader: Reader, prompt: RenderedPrompt) -> None:
+def draw_prompt(axes: Any, processor: Processor, prompt: RenderedPrompt) -> None:
     """Draw the prompt and its encoder."""
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
     draw_text(axes, SECOND + 0.3, 1.1, f"“{prompt.text}”", family="DejaVu Sans Mono", fontsize=8.5)
     note = "A, B: the objects in the prompt’s two images,\nin the front view and in the top view."
     draw_text(axes, SECOND + 0.3, 1.5, note, fontsize=8.5, linespacing=1.4)
-    *middles, end = draw_tokens(axes, prompt_tokens(reader, prompt), LEFT, 1.15, 0.58)
+    *middles, end = draw_tokens(axes, prompt_tokens(processor, prompt), LEFT, 1.15, 0.58)
     draw_box(axes, LEFT, 1.65, (end - LEFT, 0.38), facecolor=LAYERS)
     draw_text(axes, (LEFT + end) / 2, 1.84, "text encoder (T5)", ha="center")
     for middle in middles:
@@ -290,11 +295,13 @@ def draw_baselines(axes: Any, story: Story) -> None:
 def draw_baseline(axes: Any, story: Story, family: str, y: float) -> None:
     """Draw the tokens of one baseline below its title: all in one sequence, or prompt and history apart."""
     config = preset(f"{family}-nano")
-    reader = Reader.of(config.images)
+    processor = Processor.of(config.images)
     images = [stacked(part.rgb) for part in story.prompt.sequence() if isinstance(part, PromptImage)]
     is_patches = family == "gato"
     x, y = LEFT, y + (0.32 if is_patches else 0.9)
-    for is_image, group in groupby(prompt_tokens(reader, story.prompt), lambda token: token.colour != FAINT):
+    for is_image, group in groupby(
+        prompt_tokens(processor, story.prompt), lambda token: token.colour != FAINT
+    ):
         x = draw_group(axes, list(group), x, y, images.pop(0) if is_image else None)[-1] + GAP
     if is_patches:  # too long for one line
         draw_text(axes, x, y, "…")
@@ -307,7 +314,9 @@ def draw_baseline(axes: Any, story: Story, family: str, y: float) -> None:
         draw_arrow(axes, (x + 0.02, y), (x + 1.38, y), colour=INK, width=1.2)
         x += 1.45
     for number, observation in enumerate(story.observations, 1):
-        *middles, end = draw_group(axes, step_tokens(reader, observation), x, y, stacked(observation["rgb"]))
+        *middles, end = draw_group(
+            axes, step_tokens(processor, observation), x, y, stacked(observation["rgb"])
+        )
         draw_arrow(axes, (middles[-1], y + 0.12), (middles[-1], y + 0.36), colour=READ, width=1.5)
         draw_text(axes, middles[-1] - 0.08, y + 0.25, f"action {number}", ha="right", fontsize=8, color=READ)
         if number == 1:

@@ -20,11 +20,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from openvima.perception.image_stack import ImageStack
-from openvima.perception.objects import ObjectViews, see_nothing
-from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
-from openvima.policies.heads.bins import BinsHead, decode_bins
-from openvima.policies.inputs import (
+from naive_inputs import (
     WORD,
     HistoryBatch,
     PromptInput,
@@ -33,6 +29,10 @@ from openvima.policies.inputs import (
     batch_histories,
     batch_prompts,
 )
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
+from openvima.policies.heads.bins import BinsHead, decode_bins
 from openvima.policies.network import Memory, PolicyNetwork, outline_network
 from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
@@ -278,7 +278,9 @@ def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:
             ]
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
-        prompts.append(PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers))
+        in_scene = np.zeros(len(numbers), np.bool_)
+        objects = ObjectViews.concatenated(images)
+        prompts.append(PromptInput(words, entries, parts, mask, objects, numbers, in_scene))
     return prompts
 
 

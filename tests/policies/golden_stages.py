@@ -25,8 +25,8 @@ from tests.policies.golden import (
     watched,
 )
 
+from naive_inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, to_unit_range
-from openvima.policies.inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.policies.network import Memory, PolicyNetwork
 from openvima.policies.nn.places import Places
 from openvima.policies.nn.trunk import Decoder, PrefixTrunk

@@ -21,11 +21,10 @@ from openvima.policies.heads.base import (  # noqa: E402
 )
 from openvima.policies.heads.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training.dataset import Batch  # noqa: E402
-from training_examples import examples_of  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
 
 # One decoder, and cross-attention with the last slot, or with a query of its own, as the place to read from.
 CONFIGS = {
@@ -52,9 +51,9 @@ def network(request) -> PolicyNetwork:
 
 def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]:
     """A batch, and the features of its images."""
-    reader = Reader.of(network.config.images)
-    examples, images = examples_of(demonstrations, reader)
-    return Collator(reader)(examples), network.encode_images(images)
+    processor = Processor.of(network.config.images)
+    examples, images = examples_of(demonstrations, processor)
+    return collate_examples(processor, examples), network.encode_images(images)
 
 
 @torch.no_grad()
@@ -135,20 +134,15 @@ def test_the_loss_is_that_of_the_published_head_on_these_scores(network, demonst
 
 def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[dict]]) -> list[np.ndarray]:
     """The actions of one episode after the other, reading all anew for every component."""
-    from openvima.perception.image_stack import ImageStack
-    from openvima.policies.inputs import batch_histories, batch_prompts
-
     network, actions = policy.network, []
     for prompt, observations in zip(prompts, seen, strict=True):
-        stack, reader = ImageStack(policy.reader.image_size), policy.reader.begin_episode()
-        asked, taken = policy.reader.read_prompt(prompt), np.zeros((1, len(observations), ACTION_WIDTH))
-        numbers = stack.add(asked.objects.crops)
-        steps = [reader.read_step(observation) for observation in observations]
-        crops = [stack.add(step.objects.crops) for step in steps]
+        taken = np.zeros((1, len(observations), ACTION_WIDTH))
+        asked, stack = policy.processor.encode_prompts([prompt])
+        policy.processor.encode_observations([observations], stack=stack)
         features = network.encode_images(torch.from_numpy(stack.images()))
-        memory = network.encode_prompts(batch_prompts([asked], [numbers]), features)
-        for t in range(len(steps)):
-            history = batch_histories([steps[: t + 1]], [crops[: t + 1]])
+        memory = network.encode_prompts(asked, features)
+        for t in range(len(observations)):
+            history, _ = policy.processor.encode_observations([observations[: t + 1]], stack=stack)
             bins = torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.int64)
             for component in range(ACTION_WIDTH):
                 taken[:, t] = from_unit_range(decode_bins(bins, torch.float64))[0].numpy()
@@ -267,7 +261,7 @@ def chance_of_either(config: PolicyConfig, demonstration) -> float:
     actions = batch.targets.actions_BTC.clone()
     actions[1, :, [0, 1, 6]] = actions[1, :, [1, 0, 7]] + 0.3  # another place to pick from, and one to put
     targets, prompts, history = replace(batch.targets, actions_BTC=actions), batch.prompts, batch.history
-    _, images = examples_of([demonstration] * 2, Reader.of(config.images))
+    _, images = examples_of([demonstration] * 2, Processor.of(config.images))
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.0)
     for _ in range(50):
         features = network.encode_images(images)

@@ -22,8 +22,8 @@ from tests.policies.golden import (
     tiny_network,
 )
 
+from naive_inputs import PromptInput, StepInput
 from openvima.perception.objects import ObjectViews
-from openvima.policies.inputs import PromptInput, StepInput
 from openvima.policies.network import PolicyNetwork
 
 NAMES = ("vima_tiny", "gato_tiny", "flamingo_tiny", "gpt_tiny")
@@ -63,6 +63,7 @@ def longer_companion(inputs: Inputs) -> Inputs:
         np.concatenate([first.mask, second.mask]),
         ObjectViews.concatenated([first.objects, second.objects]),
         np.concatenate([first.numbers, second.numbers]),
+        np.concatenate([first.in_scene, second.in_scene]),
     )
     history = [*inputs.histories[0], *inputs.histories[1][:2]]
     if len(history[0].objects) > 1:  # whole frames are always one

@@ -17,14 +17,13 @@ from openvima.policies.families.gpt import gpt  # noqa: E402
 from openvima.policies.families.midas import midas  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
-from training_examples import examples_of  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
 
 FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
 NUM_LAYERS = 3  # of the text encoder
@@ -75,9 +74,9 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
     with torch.no_grad():  # layers that start at zero stop gradients on their first step
         for parameter in model.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    reader = Reader.of(sizes.images)
-    examples, images = examples_of(demonstrations, reader)
-    batch = Collator(reader)(examples)
+    processor = Processor.of(sizes.images)
+    examples, images = examples_of(demonstrations, processor)
+    batch = collate_examples(processor, examples)
     features = model.encode_images(images)
     memory = model.encode_prompts(batch.prompts, features)
     inputs = model(memory, batch.history, features, batch.targets.actions_BTC)

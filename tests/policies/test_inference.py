@@ -10,12 +10,10 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
-from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
 from openvima.policies.inference import NetworkPolicy, drawing  # noqa: E402
-from openvima.policies.inputs import batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.nn.trunk import MAX_PLACES  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
@@ -95,26 +93,19 @@ def played(policy: NetworkPolicy, prompts, pool, rows: Sequence[int] = (0, 1, 2,
 @torch.no_grad()
 def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
     """For every step of every episode read prompt and history from scratch; return (row, step) -> query."""
-    network, reader = policy.network, policy.reader
+    network, processor = policy.network, policy.processor
     result = {}
     for step in range(max(LENGTHS)):
         rows = [row for row, length in enumerate(LENGTHS) if step < length]
-        stack = ImageStack(reader.image_size)
-        inputs = [reader.read_prompt(prompts[row]) for row in rows]
-        numbers = [stack.add(prompt.objects.crops) for prompt in inputs]
-        histories, history_numbers = [], []
-        for row in rows:
-            episode = reader.begin_episode()
-            histories.append([episode.read_step(seen_by(row, t, pool)) for t in range(step + 1)])
-            history_numbers.append([stack.add(each.objects.crops) for each in histories[-1]])
+        batch, stack = processor.encode_prompts([prompts[row] for row in rows])
+        observations = [[seen_by(row, t, pool) for t in range(step + 1)] for row in rows]
+        history, stack = processor.encode_observations(observations, stack=stack)
         features = network.encode_images(torch.from_numpy(stack.images()))
-        memory = network.encode_prompts(batch_prompts(inputs, numbers), features)
+        memory = network.encode_prompts(batch, features)
         taken = np.zeros((len(rows), step + 1, ACTION_WIDTH))
         for place, row in enumerate(rows):
             taken[place, :-1] = [actions[row, t][0] for t in range(step)] or taken[place, :-1]
-        heads = network(
-            memory, batch_histories(histories, history_numbers), features, torch.from_numpy(taken)
-        )
+        heads = network(memory, history, features, torch.from_numpy(taken))
         for place, row in enumerate(rows):
             result[row, step] = heads.query_BTD[place, step].double().numpy()
     return result
@@ -132,7 +123,7 @@ def assert_same_actions(some: dict, others: dict) -> None:
 
 def test_keeping_what_was_read_changes_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
     steps = played(policy, prompts, pool)
-    assert len({len(policy.reader.read_prompt(prompt).words) for prompt in prompts}) > 2
+    assert len(set(policy.processor.encode_prompts(prompts)[0].mask_BL.sum(1).tolist())) > 2
     assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-9
 
 
@@ -237,7 +228,7 @@ def test_half_precision_does_not_blur_the_places_that_it_points_at(prompts, pool
     policy = NetworkPolicy(network_of("nano"), dtype=torch.bfloat16)
     policy.reset([prompts[0]])
     (action,) = policy.act([pool[0]])
-    grasps = policy.reader.begin_episode().read_step(pool[0]).grasps
+    grasps = policy.processor.encode_observations([[pool[0]]])[0].grasps_BTN2[0, 0].numpy()
     assert np.abs(grasps - action["pose0_position"]).max(axis=1).min() < 1e-6
 
 
@@ -347,7 +338,7 @@ def test_an_observation_without_objects_is_refused_where_objects_are_what_is_see
     policy, prompts, pool
 ) -> None:
     policy.reset([prompts[0]])
-    if policy.reader.layout == "frames":
+    if policy.processor.layout == "frames":
         assert policy.act([blank(pool[0])]) != [None]
         return
     with pytest.raises(PolicyError, match="shows no object"):

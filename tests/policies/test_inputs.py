@@ -12,8 +12,8 @@ from openvima.perception.objects import GROUND_TRUTH, GroundTruth  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
 VIEWS = ("front", "top")
@@ -53,35 +53,42 @@ LEFT, RIGHT = [20, 60, 40, 80], [200, 60, 220, 80]
 
 def test_slots_of_a_missed_object_are_kept_black_at_the_end_of_each_view() -> None:
     extractor = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], [], [LEFT, RIGHT]))
-    episode = Reader("views", extractor=extractor).begin_episode()
-    steps = [episode.read_step(seen()).objects for _ in range(4)]
-    assert [len(step) for step in steps] == [len(steps[0])] * 4
-    both, missed, none, again = steps
+    processor = Processor("views", extractor=extractor)
+    steps, num_slots = [], None
+    for _ in range(4):
+        batch, stack = processor.encode_observations([[seen()]], num_slots)
+        num_slots = batch.num_slots_BT[:, -1].tolist()
+        crops = stack.images()[batch.crop_index_BTVN[0, 0]]
+        steps.append((num_slots, crops, batch.masks_BTVN[0, 0].numpy(), batch.boxes_BTVN4[0, 0].numpy()))
+    assert [slots for slots, *_ in steps] == [steps[0][0]] * 4
+    both, missed, none, again = ((crops, masks, boxes) for _, crops, masks, boxes in steps)
     for view in range(2):
-        assert missed.masks[view].sum() == 1
-        assert missed.masks[view, 0]
-        np.testing.assert_array_equal(missed.boxes[view, 0], both.boxes[view, both.masks[view]][-1])
-        assert not missed.crops[view, 1:].any()
-        assert not missed.boxes[view, 1:].any()
-    assert not none.masks.any()
-    assert not none.crops.any()
-    np.testing.assert_array_equal(again.crops, both.crops)
-    np.testing.assert_array_equal(again.masks, both.masks)
+        crops, masks, boxes = (array[view] for array in missed)
+        assert masks.sum() == 1
+        assert masks[0]
+        np.testing.assert_array_equal(boxes[0], both[2][view, both[1][view]][-1])
+        assert not crops[1:].any()
+        assert not boxes[1:].any()
+    assert not none[1].any()
+    assert not none[0].any()
+    np.testing.assert_array_equal(again[0], both[0])
+    np.testing.assert_array_equal(again[1], both[1])
 
 
 def test_fused_slots_follow_what_is_found() -> None:
     extractor = DetectedObjects(Scripted([LEFT, RIGHT], [RIGHT], []))
-    episode = Reader("objects", extractor=extractor).begin_episode()
-    counts = [episode.read_step(seen()).objects.visible().sum() for _ in range(2)]
+    processor = Processor("objects", extractor=extractor)
+    batches = [processor.encode_observations([[seen()]])[0] for _ in range(2)]
+    counts = [batch.masks_BTVN.any(2).sum() for batch in batches]
     assert counts[1] < counts[0]
     with pytest.raises(PolicyError, match=r"shows no object.*min_score"):
-        episode.read_step(seen())
+        processor.encode_observations([[seen()]])
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_a_first_observation_without_objects_is_refused(layout: str) -> None:
     with pytest.raises(PolicyError, match="shows no object"):
-        Reader(layout).begin_episode().read_step(seen())
+        Processor(layout).encode_observations([[seen()]])
 
 
 def test_detected_objects_act(small_sizes, demonstrations) -> None:
@@ -98,55 +105,55 @@ def test_detected_objects_act(small_sizes, demonstrations) -> None:
 @pytest.mark.parametrize("layout", ["objects", "views", "frames"])
 @pytest.mark.parametrize("effector", [2, -1, 0.5, None])
 def test_an_end_effector_that_does_not_exist_is_refused(layout: str, effector: object) -> None:
-    reader = Reader(**FRAMES) if layout == "frames" else Reader(layout)
+    processor = Processor(**FRAMES) if layout == "frames" else Processor(layout)
     with pytest.raises(PolicyError, match=r"0 \(suction\) or 1 \(spatula\)"):
-        reader.begin_episode().read_step(seen(ee=effector))
+        processor.encode_observations([[seen(ee=effector)]])
 
 
 @pytest.mark.parametrize("part", ["rgb", "ee"])
 def test_a_missing_part_of_an_observation_is_named(part: str) -> None:
     observation = seen()
     del observation[part]
-    for reader in (Reader("objects"), Reader(**FRAMES)):
+    for processor in (Processor("objects"), Processor(**FRAMES)):
         with pytest.raises(PolicyError, match=f"no '{part}'"):
-            reader.begin_episode().read_step(observation)
+            processor.encode_observations([[observation]])
 
 
 def test_frames_need_no_segmentation() -> None:
     observation = seen()
     del observation["segm"]
-    step = Reader(**FRAMES).begin_episode().read_step(observation)
-    assert step.objects.crops.shape == (2, 1, 3, 64, 128)
+    batch, stack = Processor(**FRAMES).encode_observations([[observation]])
+    assert stack.images()[batch.crop_index_BTVN[0, 0]].shape == (2, 1, 3, 64, 128)
 
 
 def test_frames_of_another_size_are_refused() -> None:
-    reader = Reader(**FRAMES)
+    processor = Processor(**FRAMES)
     with pytest.raises(ShapeError, match=r"\(3, 256, 512\); this policy takes those of \(3, 128, 256\)"):
-        reader.begin_episode().read_step(seen(rgb=noise(shape=(256, 512))))
+        processor.encode_observations([[seen(rgb=noise(shape=(256, 512)))]])
     with pytest.raises(ShapeError, match="even height and width"):
-        reader.begin_episode().read_step(seen(rgb=noise(shape=(127, 256))))
+        processor.encode_observations([[seen(rgb=noise(shape=(127, 256)))]])
 
 
 @pytest.mark.parametrize("layout", ["objects", "views", "frames"])
 def test_prompts_that_do_not_fit_together_are_refused(layout: str, demonstrations) -> None:
-    reader = Reader(**FRAMES) if layout == "frames" else Reader(layout)
+    processor = Processor(**FRAMES) if layout == "frames" else Processor(layout)
     prompt = demonstrations[0].prompt
     name = next(iter(prompt.images))
     without = {key: image for key, image in prompt.images.items() if key != name}
     for text in ("", "   "):
         with pytest.raises(PromptError, match="empty; it must hold at least one word or image"):
-            reader.read_prompt(RenderedPrompt(text, {}))
+            processor.encode_prompts([RenderedPrompt(text, {})])
     with pytest.raises(PromptError, match=f"names images.*{name}.*but got"):
-        reader.read_prompt(RenderedPrompt(prompt.text, without))
+        processor.encode_prompts([RenderedPrompt(prompt.text, without)])
     with pytest.raises(PromptError, match="names images"):
-        reader.read_prompt(RenderedPrompt("put it down.", prompt.images))
+        processor.encode_prompts([RenderedPrompt("put it down.", prompt.images)])
     image = prompt.images[name]
     blind = replace(image, rgb={"front": image.rgb["front"]})
     with pytest.raises(PolicyError, match="lacks the view top"):
-        reader.read_prompt(replace(prompt, images={**prompt.images, name: blind}))
+        processor.encode_prompts([replace(prompt, images={**prompt.images, name: blind})])
     real = replace(image, rgb={view: frame / 255 for view, frame in image.rgb.items()})
     with pytest.raises(ShapeError, match=r"float64.*must be uint8"):
-        reader.read_prompt(replace(prompt, images={**prompt.images, name: real}))
+        processor.encode_prompts([replace(prompt, images={**prompt.images, name: real})])
 
 
 @pytest.mark.parametrize("name", ["nano", "vima-nano"])
@@ -164,7 +171,7 @@ def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it
     for _, seen in starts:
         in_order = GroundTruth(left_to_right=False).in_observation(seen)
         assert (np.diff(in_order.ids) > 0).all()
-        step = Reader.of(preset("vima-nano").images).begin_episode().read_step(seen)
-        np.testing.assert_array_equal(step.objects.crops, in_order.compacted().crops)
-        step = Reader.of(preset("nano").images).begin_episode().read_step(seen)
-        np.testing.assert_array_equal(step.objects.ids, in_order.left_to_right().ids)
+        for name, expected in (("vima-nano", in_order.compacted()), ("nano", in_order.left_to_right())):
+            batch, stack = Processor.of(preset(name).images).encode_observations([[seen]])
+            crops = stack.images()[batch.crop_index_BTVN[0, 0]]
+            np.testing.assert_array_equal(crops, expected.crops)

@@ -10,10 +10,9 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
-from training_examples import examples_of  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -50,9 +49,9 @@ def test_images_and_trunk_of_different_widths_are_refused():
 )
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
-    reader = Reader.of(network.config.images)
-    examples, images = examples_of(demonstrations, reader)
-    batch = Collator(reader)(examples)
+    processor = Processor.of(network.config.images)
+    examples, images = examples_of(demonstrations, processor)
+    batch = collate_examples(processor, examples)
 
     def loss() -> torch.Tensor:
         features = network.encode_images(images)

@@ -7,13 +7,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import UnknownPolicyError  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.base import Policy  # noqa: E402
 from openvima.policies.heads.bins import BinsConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402
 

@@ -103,7 +103,7 @@ def test_a_device_that_is_not_there_is_refused(device: str) -> None:
 def test_a_published_file_is_a_policy_once_it_has_a_tokenizer(published, tokenizer, demonstrations) -> None:
     policy = load_policy(str(published), tokenizer=tokenizer)
     assert policy.network.config == replace(small_vima(), prompt=policy.network.config.prompt)
-    assert policy.reader.tokenizer is tokenizer
+    assert policy.processor.tokenizer is tokenizer
     assert first_action(policy, demonstrations)["pose0_position"].shape == (2,)
 
 
@@ -113,7 +113,7 @@ def test_a_tokenizer_is_stored_with_the_policy_and_read_again(
     policy = load_policy(str(published), tokenizer=tokenizer)
     policy.save_pretrained(tmp_path / "saved")
     loaded = load_policy(str(tmp_path / "saved"))
-    assert loaded.reader.tokenizer.encode("Put the z.") == tokenizer.encode("Put the z.")
+    assert loaded.processor.tokenizer.encode("Put the z.") == tokenizer.encode("Put the z.")
     assert_same_actions(loaded, policy, demonstrations)
 
 
@@ -130,7 +130,7 @@ def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
 
 
 def test_the_closed_vocabulary_is_for_networks_that_were_made_for_it(policy) -> None:
-    assert policy.reader.tokenizer is CLOSED_TOKENIZER
+    assert policy.processor.tokenizer is CLOSED_TOKENIZER
 
 
 def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:

@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from naive_inputs import Reader, batch_prompts  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies.inputs import Reader, batch_prompts  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.nn.referents import referents  # noqa: E402
 from small_networks import narrow_small  # noqa: E402

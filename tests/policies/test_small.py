@@ -11,17 +11,17 @@ torch = pytest.importorskip("torch")
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
+from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
-from training_examples import examples_of  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
 
 TASKS = ("rearrange_then_restore", "follow_order", "twist", "visual_manipulation", "scene_understanding")
 
@@ -54,9 +54,9 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
 
     Actions are those of the demonstrations, or others that were taken.
     """
-    reader = Reader.of(network.config.images)
-    examples, images = examples_of(demos, reader)
-    batch = Collator(reader)(examples)
+    processor = Processor.of(network.config.images)
+    examples, images = examples_of(demos, processor)
+    batch = collate_examples(processor, examples)
     features = network.encode_images(images)
     memory = network.encode_prompts(batch.prompts, features)
     actions_BTC = batch.targets.actions_BTC if taken_BTC is None else taken_BTC
@@ -67,9 +67,9 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
 @torch.no_grad()
 def read_stepwise(network: PolicyNetwork, demo: Demonstration) -> list[HeadInputs]:
     """The same as one episode is played, with the actions of the demonstration."""
-    reader = Reader.of(network.config.images)
-    (example,), images = examples_of([demo], reader)
-    batch = Collator(reader)([example])
+    processor = Processor.of(network.config.images)
+    (example,), images = examples_of([demo], processor)
+    batch = collate_examples(processor, [example])
     features = network.encode_images(images)
     memory = network.encode_prompts(batch.prompts, features)
     state, given = network.begin(memory), []
@@ -191,15 +191,15 @@ def test_comparisons_serve_the_other_heads_as_well(demos):
 
 
 def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(demos):
-    reader = Reader("objects")
+    processor = Processor("objects")
     for demo, task in zip(demos, TASKS, strict=True):
-        prompt = reader.read_prompt(demo.prompt)
-        batch = batch_prompts([prompt], [np.zeros((2, len(prompt.objects)), np.int64)])
+        batch, _ = processor.encode_prompts([demo.prompt])
         counts = [len(image.objects) for image in demo.prompt.images.values()]
         assert batch.image_index_S.tolist() == np.repeat(np.arange(len(counts)), counts).tolist()
         kinds = [image.kind == "scene" for image in demo.prompt.images.values()]
         assert batch.in_scene_S.tolist() == np.repeat(kinds, counts).tolist(), task
-        np.testing.assert_array_equal(batch.positions_S2, prompt.objects.positions())
+        objects = [GROUND_TRUTH.in_prompt_image(image) for image in demo.prompt.images.values()]
+        np.testing.assert_array_equal(batch.positions_S2, ObjectViews.concatenated(objects).positions())
 
 
 def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tell(network, demos):
@@ -210,11 +210,9 @@ def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tel
     )
     told = []
     for prompt in (frames, with_object):
-        read = Reader.of(network.config.images).read_prompt(prompt)
-        images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
-        numbers = np.arange(len(images)).reshape(2, -1)
+        batch, stack = Processor.of(network.config.images).encode_prompts([prompt])
         with torch.no_grad():
-            batch, features = batch_prompts([read], [numbers]), network.encode_images(images)
+            features = network.encode_images(torch.from_numpy(stack.images()))
             scenes = network.encode_prompts(batch, features).scenes
             shown = network._shown(
                 batch, batch.object_index_BL >= 0, features[batch.crop_index_VS], scenes.appearance_BKA[0]
@@ -226,24 +224,22 @@ def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tel
 
 
 def test_motions_show_the_table(demos):
-    reader = Reader("objects")
-    examples, _ = examples_of(demos[:1], reader)
+    processor = Processor("objects")
+    examples, _ = examples_of(demos[:1], processor)
     motion = as_motion(preprocess(demos[0], "objects"))
-    batch = Collator(reader)([replace(examples[0], episode=motion)])
+    batch = collate_examples(processor, [replace(examples[0], episode=motion)])
     assert batch.prompts.in_scene_S.all()
     assert batch.prompts.image_index_S.max() == demos[0].num_steps
 
 
 def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):
     demo = demos[3]
-    reader = Reader.of(network.config.images)
-    prompt = reader.read_prompt(replace(demo.prompt, text="Rotate it 30 degrees.", images={}))
-    step = reader.begin_episode().read_step(demo.observation(0))
-    images = torch.from_numpy(step.objects.crops.reshape(-1, 3, 32, 32))
-    numbers = np.arange(len(images)).reshape(2, -1)
-    features = network.encode_images(images)
-    memory = network.encode_prompts(batch_prompts([prompt], [numbers[:, :0]]), features)
-    history = batch_histories([[step]], [[numbers]])
+    processor = Processor.of(network.config.images)
+    prompt = replace(demo.prompt, text="Rotate it 30 degrees.", images={})
+    batch, stack = processor.encode_prompts([prompt])
+    history, stack = processor.encode_observations([[demo.observation(0)]], stack=stack)
+    features = network.encode_images(torch.from_numpy(stack.images()))
+    memory = network.encode_prompts(batch, features)
     inputs = network(memory, history, features, torch.zeros(1, 1, 12))
     assert network.head.decide(inputs).isfinite().all()
 
@@ -253,13 +249,11 @@ def test_roles_do_not_follow_from_names_of_textures_and_looks_of_words_do(networ
     first, rest = prompt.text.removeprefix("Put the ").split(" object in ", 1)
     memories = []
     for named in (first, *(("green", "purple") if first != "green" else ("purple", "green"))):
-        read = Reader.of(network.config.images).read_prompt(
-            replace(prompt, text=f"Put the {named} object in {rest}")
-        )
-        images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
-        batch = batch_prompts([read], [np.arange(len(images)).reshape(2, -1)])
+        named_prompt = replace(prompt, text=f"Put the {named} object in {rest}")
+        batch, stack = Processor.of(network.config.images).encode_prompts([named_prompt])
         with torch.no_grad():
-            memories.append(network.encode_prompts(batch, network.encode_images(images)))
+            features = network.encode_images(torch.from_numpy(stack.images()))
+            memories.append(network.encode_prompts(batch, features))
     _, green, purple = memories
     torch.testing.assert_close(green.roles_BLD, purple.roles_BLD)
     assert (green.tokens_BLD - purple.tokens_BLD).abs().max() > 1e-3

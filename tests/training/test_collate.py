@@ -7,25 +7,26 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
-from openvima.perception.objects import PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
+from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS  # noqa: E402
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import Example, input_kind, stack_images  # noqa: E402
-from training_examples import examples_of  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
+from openvima.training.dataset import stack_images  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
 
-READERS = {
-    "objects": Reader("objects"),
-    "views": Reader("views", extractor=PUBLISHED_ORDER),
-    "frames": Reader("frames", (64, 128), tokens_per_frame_pair=3),
+SETTINGS = {
+    "objects": {"layout": "objects"},
+    "views": {"layout": "views"},
+    "frames": {"layout": "frames", "image_size": (64, 128), "tokens_per_frame_pair": 3},
 }
+OBJECTS = Processor("objects")
 
 
 def as_when_acting(demos, reader: Reader):
-    """Prompts and histories as a policy reads them step by step, and their images."""
+    """Prompts and histories read one by one by the naive twin, and their images."""
     stack = ImageStack(reader.image_size)
 
     def add(objects: ObjectViews) -> np.ndarray:
@@ -43,24 +44,45 @@ def as_when_acting(demos, reader: Reader):
     return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.images())
 
 
-@pytest.mark.parametrize("layout", READERS)
+def acting(demos, processor: Processor):
+    """Prompts and histories as a policy encodes them, and their images."""
+    prompts, stack = processor.encode_prompts([demo.prompt for demo in demos])
+    histories = [[demo.observation(t) for t in range(demo.num_steps)] for demo in demos]
+    history, stack = processor.encode_observations(histories, stack=stack)
+    return prompts, history, torch.from_numpy(stack.images())
+
+
+@pytest.mark.parametrize("layout", SETTINGS)
 def test_training_and_acting_see_the_same(layout, demonstrations_of_several_steps):
-    reader, demos = READERS[layout], demonstrations_of_several_steps
-    examples, images = stack_images([preprocess(demo, input_kind(reader)) for demo in demos], reader)
-    batch = Collator(reader)(examples)
-    *expected, expected_images = as_when_acting(demos, reader)
-    for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
-        for field in fields(ours):
-            got, asked = getattr(ours, field.name), getattr(theirs, field.name)
-            if field.name.startswith("crops"):  # the numbers differ, what they name does not
-                got, asked = images[got], expected_images[asked]
-            assert got.dtype == asked.dtype, field.name
-            assert torch.equal(got, asked), field.name
+    processor, demos = Processor(**SETTINGS[layout]), demonstrations_of_several_steps
+    examples, images = stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
+    batch = collate_examples(processor, examples)
+    reader = Reader(**SETTINGS[layout], extractor=PUBLISHED_ORDER if layout == "views" else GROUND_TRUTH)
+    for *expected, expected_images in (as_when_acting(demos, reader), acting(demos, processor)):
+        for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
+            for field in fields(ours):
+                got, asked = getattr(ours, field.name), getattr(theirs, field.name)
+                if field.name.startswith("crop_index"):  # the numbers differ, what they name does not
+                    got, asked = images[got], expected_images[asked]
+                assert got.dtype == asked.dtype, field.name
+                assert torch.equal(got, asked), field.name
+
+
+def test_slots_of_views_never_fall_from_step_to_step(demonstrations_of_several_steps):
+    processor = Processor("views")
+    for demo in demonstrations_of_several_steps:
+        observations = [demo.observation(t) for t in range(demo.num_steps)]
+        whole, _ = processor.encode_observations([observations])
+        num_slots = None
+        for t, observation in enumerate(observations):
+            step, _ = processor.encode_observations([[observation]], num_slots)
+            num_slots = step.num_slots_BT[:, -1].tolist()
+            assert num_slots == [whole.num_slots_BT[0, t]]
 
 
 def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
-    batch = Collator(READERS["objects"])(examples_of(demos, READERS["objects"])[0])
+    batch = collate_examples(OBJECTS, examples_of(demos, OBJECTS)[0])
     for b, demo in enumerate(demos):
         assert batch.targets.steps_BT[b].sum() == demo.num_steps
         for t, action in enumerate(demo.actions):
@@ -72,8 +94,8 @@ def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
 
 def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
-    examples, images = stack_images([preprocess(demo, "objects") for demo in demos], READERS["objects"])
-    spurious = Collator(READERS["objects"])(examples).false_positives
+    examples, images = stack_images([preprocess(demo, "objects") for demo in demos], OBJECTS)
+    spurious = collate_examples(OBJECTS, examples).false_positives
     for b, demo in enumerate(demos):
         for t in range(demo.num_steps):
             for v, view in enumerate(("front", "top")):
@@ -85,9 +107,8 @@ def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_ste
 
 
 def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps):
-    collator = Collator(READERS["objects"])
-    examples, _ = examples_of(demonstrations_of_several_steps, READERS["objects"])
-    together, alone = collator(examples), collator(examples[2:3])
+    examples, _ = examples_of(demonstrations_of_several_steps, OBJECTS)
+    together, alone = (collate_examples(OBJECTS, part) for part in (examples, examples[2:3]))
     steps, slots = alone.history.crop_index_BTVN.shape[1], alone.history.crop_index_BTVN.shape[3]
     assert torch.equal(together.history.boxes_BTVN4[2, :steps, :, :slots], alone.history.boxes_BTVN4[0])
     assert not together.history.masks_BTVN[2, steps:].any()
@@ -100,4 +121,4 @@ def test_an_episode_in_which_nothing_is_seen_is_named(demonstrations_of_several_
     none = np.zeros_like(tokens.objects_per_step)
     blind = replace(tokens, objects=tokens.objects.select(slice(0)), objects_per_step=none)
     with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
-        Collator(READERS["objects"])([Example(blind)])
+        OBJECTS.collate([blind])

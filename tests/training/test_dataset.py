@@ -1,6 +1,7 @@
 """Examples, their order, and what augmentation does to them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,9 +12,8 @@ from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training.augment import augmented  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     ExampleSource,
     Parts,
@@ -22,9 +22,9 @@ from openvima.training.source import (  # noqa: E402
     order_of,
     split_examples,
 )
-from training_examples import examples_of, rngs_of  # noqa: E402
+from training_examples import collate_examples, examples_of, rngs_of  # noqa: E402
 
-OBJECTS, VIEWS = Reader("objects"), Reader("views")
+OBJECTS, VIEWS = Processor("objects"), Processor("views")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def examples(data):
 
 
 def test_slots_point_at_the_objects_that_were_picked(data, examples):
-    batch = Collator(OBJECTS)(examples)
+    batch = collate_examples(OBJECTS, examples)
     for b, demo in enumerate(Dataset(data)):
         for t, action in enumerate(demo.actions):
             slot = batch.targets.pick_BT[b, t]
@@ -120,9 +120,9 @@ def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_augmentation_of_an_example_does_not_depend_on_its_company(layout, demonstrations_of_several_steps):
-    reader = Reader(layout)
-    examples, _ = examples_of(demonstrations_of_several_steps, reader)
-    collate, rngs = Collator(reader), rngs_of(examples)
+    processor = Processor(layout)
+    examples, _ = examples_of(demonstrations_of_several_steps, processor)
+    collate, rngs = partial(collate_examples, processor), rngs_of(examples)
     together = augmented(collate(examples), layout, probability=0.5, rngs=rngs)
     for b, example in enumerate(examples):
         alone = augmented(collate([example]), layout, probability=0.5, rngs=rngs_of(examples)[b : b + 1])
@@ -134,7 +134,7 @@ def test_augmentation_of_an_example_does_not_depend_on_its_company(layout, demon
 
 
 def test_targets_follow_their_objects_through_shuffling(examples):
-    batch = Collator(OBJECTS)(examples)
+    batch = collate_examples(OBJECTS, examples)
     changed = augmented(batch, "objects", probability=0.5, rngs=rngs_of(examples))
     for b, t in np.argwhere(batch.targets.steps_BT.numpy()):
         for targets in ("pick_BT", "place_BT"):
@@ -151,7 +151,7 @@ def test_targets_follow_their_objects_through_shuffling(examples):
 
 
 def test_a_false_detection_shows_in_one_view_only(examples):
-    batch = Collator(OBJECTS)(examples[:4])
+    batch = collate_examples(OBJECTS, examples[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
     changed = augmented(
         replace(batch, history=nothing),
@@ -178,7 +178,7 @@ def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
 
 
 def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_their_order(views):
-    batch = Collator(VIEWS)(views[0])
+    batch = collate_examples(VIEWS, views[0])
     changed = augmented(batch, "views", probability=0.5, rngs=rngs_of(views[0], 1))
     before, after = batch.history, changed.history
     places = []
@@ -200,7 +200,7 @@ def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_t
 
 
 def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
-    batch = Collator(VIEWS)(views[0])
+    batch = collate_examples(VIEWS, views[0])
     after = augmented(batch, "views", probability=0.3, rngs=rngs_of(views[0], 1)).history
     visible_BTV = after.masks_BTVN.sum(dim=3)
     for b, t in np.argwhere(batch.history.steps_BT.numpy()):
@@ -217,7 +217,7 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
 
 
 def test_without_false_detections_views_stay_as_they_are(views):
-    batch = Collator(VIEWS)(views[0])
+    batch = collate_examples(VIEWS, views[0])
     after = augmented(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
     count = batch.history.masks_BTVN.shape[3]
     assert torch.equal(after.num_slots_BT, batch.history.num_slots_BT)
@@ -227,9 +227,9 @@ def test_without_false_detections_views_stay_as_they_are(views):
 
 
 def test_whole_frames_know_no_false_detections_and_stay_bytes(demonstrations_of_several_steps):
-    reader = Reader("frames", (64, 128), tokens_per_frame_pair=1)
-    examples, images = examples_of(demonstrations_of_several_steps, reader)
+    processor = Processor("frames", (64, 128), tokens_per_frame_pair=1)
+    examples, images = examples_of(demonstrations_of_several_steps, processor)
     assert images.dtype == torch.uint8
     assert images.shape[1:] == (3, 64, 128)
-    batch = Collator(reader)(examples)
+    batch = collate_examples(processor, examples)
     assert augmented(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
 
+from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
 from noisy_extractor import HOOK, Clumsy  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
@@ -21,7 +22,7 @@ from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import ObjectViews  # noqa: E402
 from openvima.policies import load_policy  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
-from openvima.policies.inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.inverse_dynamics import motion_prompt  # noqa: E402
@@ -46,9 +47,8 @@ EXTRACTORS = {"clumsy": PluggedExtractor(Clumsy()), "guesses": PluggedExtractor(
 
 
 def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
-    """Compare a batch with what a policy reads step by step."""
+    """Compare a batch with what a policy encodes, and with what the naive twin reads step by step."""
     stack = ImageStack(reader.image_size)
-    stack.add(np.zeros((3, *reader.image_size), np.uint8))
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)
@@ -64,14 +64,21 @@ def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
     expected_prompts = batch_prompts(read, [add(prompt.objects) for prompt in read])
     numbers = [[add(step.objects) for step in history] for history in histories]
     expected_history = batch_histories(histories, numbers)
-    images = torch.from_numpy(stack.images())
-    for ours, theirs in ((batch.prompts, expected_prompts), (batch.history, expected_history)):
-        for field in fields(ours):
-            got, asked = getattr(ours, field.name), getattr(theirs, field.name)
-            if field.name.startswith("crops"):  # the numbers differ, what they name does not
-                got, asked = batch.images[got], images[asked]
-            assert got.dtype == asked.dtype, field.name
-            assert torch.equal(got, asked), field.name
+    processor = Processor(reader.layout, extractor=reader.extractor)
+    acting_prompts, acting_stack = processor.encode_prompts(prompts)
+    observations = [[demo.observation(t) for t in range(demo.num_steps)] for demo in demos]
+    acting_history, _ = processor.encode_observations(observations, stack=acting_stack)
+    for images, *expected in (
+        (stack.images(), expected_prompts, expected_history),
+        (acting_stack.images(), acting_prompts, acting_history),
+    ):
+        for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
+            for field in fields(ours):
+                got, asked = getattr(ours, field.name), getattr(theirs, field.name)
+                if field.name.startswith("crop_index"):  # the numbers differ, what they name does not
+                    got, asked = batch.images[got], torch.from_numpy(images)[asked]
+                assert got.dtype == asked.dtype, field.name
+                assert torch.equal(got, asked), field.name
 
 
 @pytest.mark.parametrize("name", EXTRACTORS)
@@ -85,10 +92,10 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
     )
     reader = Reader(layout, extractor=extractor)
     examples = [Example(preprocess(demo, "objects", extractor)) for demo in demos]
-    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(examples)
+    batch = PolicyCollate(Processor(layout), 0.0, with_images=True)(examples)
     assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
-    motions = PolicyCollate(Reader(layout), 0.0, with_images=True, retelling=Retelling(motion_share=1.0))(
+    motions = PolicyCollate(Processor(layout), 0.0, with_images=True, retelling=Retelling(motion_share=1.0))(
         examples
     )
     shown = [
@@ -121,7 +128,7 @@ def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrati
         },
     )
     demo = replace(demo, prompt=prompt)
-    batch = PolicyCollate(Reader(layout), 0.0, with_images=True)(
+    batch = PolicyCollate(Processor(layout), 0.0, with_images=True)(
         [Example(preprocess(demo, "objects", blind))]
     )
     assert batch.prompts.crop_index_VS.shape == (2, 0)

@@ -14,20 +14,19 @@ from openvima.cli.main import main  # noqa: E402
 from openvima.data import Demonstration  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import observe, whole_frames  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.inputs import Reader, batch_prompts  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
-from openvima.training.dataset import Example, input_kind  # noqa: E402
+from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion, motion_prompt, motion_text  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
-READERS = {
-    name: Reader.of(preset(name).images) for name in ("nano", "midas-nano", "gpt-nano")
+PROCESSORS = {
+    name: Processor.of(preset(name).images) for name in ("nano", "midas-nano", "gpt-nano")
 }  # objects, views, frames
 
 
@@ -64,17 +63,16 @@ def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
         assert getattr(motion, name) is getattr(tokens, name)
 
 
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("name", PROCESSORS)
 def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
     name, demonstrations_of_several_steps
 ) -> None:
-    reader, demos = READERS[name], demonstrations_of_several_steps
-    episodes = [preprocess(demo, input_kind(reader)) for demo in demos]
-    collate = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=1.0))
+    processor, demos = PROCESSORS[name], demonstrations_of_several_steps
+    episodes = [preprocess(demo, processor.input_kind) for demo in demos]
+    collate = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=1.0))
     ours = collate([Example(episode) for episode in episodes])
-    read = [reader.read_prompt(motion_prompt(whole_motion(demo), demo.objects)) for demo in demos]
-    stack = ImageStack(reader.image_size)
-    theirs = batch_prompts(read, [stack.add(prompt.objects.crops) for prompt in read])
+    prompts = [motion_prompt(whole_motion(demo), demo.objects) for demo in demos]
+    theirs, stack = processor.encode_prompts(prompts)
     for field in ("word_ids_BL", "object_index_BL", "mask_BL", "boxes_VS4", "masks_VS"):
         assert torch.equal(getattr(ours.prompts, field), getattr(theirs, field)), field
     seen = torch.from_numpy(stack.images())[theirs.crop_index_VS]
@@ -94,12 +92,12 @@ def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:
 
 def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_steps) -> None:
     """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
-    reader = READERS["midas-nano"]
+    processor = PROCESSORS["midas-nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps] * 4
-    mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
-    tasks = prompts_of(PolicyCollate(reader, 0.0, with_images=True), episodes)
+    mixed = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
+    tasks = prompts_of(PolicyCollate(processor, 0.0, with_images=True), episodes)
     motions = prompts_of(
-        PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=1.0)), episodes
+        PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=1.0)), episodes
     )
     with_motions = prompts_of(mixed, episodes, rngs_of(episodes))
     are_motions = [prompt == motion for prompt, motion in zip(with_motions, motions, strict=True)]
@@ -116,13 +114,13 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
         )
         for tokens in episodes
     ]
-    assert prompts_of(PolicyCollate(reader, 0.0, with_images=True), elsewhere) == tasks
+    assert prompts_of(PolicyCollate(processor, 0.0, with_images=True), elsewhere) == tasks
 
 
 def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
-    reader = READERS["nano"]
+    processor = PROCESSORS["nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
-    mixed = PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
+    mixed = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
     examples = [Example(episode) for episode in episodes]
     together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
     assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
@@ -131,11 +129,11 @@ def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of
 def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
     demonstrations_of_several_steps,
 ) -> None:
-    reader = READERS["nano"]
+    processor = PROCESSORS["nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
     plain, half, all_of_them = (
         prompts_of(
-            PolicyCollate(reader, 0.0, with_images=True, retelling=Retelling(motion_share=share)), episodes
+            PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=share)), episodes
         )
         for share in (0.0, 0.5, 1.0)
     )

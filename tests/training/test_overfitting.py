@@ -10,21 +10,20 @@ torch = pytest.importorskip("torch")
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.heads.base import ACTION_PARTS, to_unit_range  # noqa: E402
 from openvima.policies.heads.bins import encode_bins  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
 from openvima.training.config import AugmentationConfig, LoaderConfig  # noqa: E402
-from openvima.training.dataset import Batch  # noqa: E402
 from openvima.training.learner import PolicyLearner  # noqa: E402
 from openvima.training.parallel import Parallel  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
-from training_examples import examples_of, source_of  # noqa: E402
+from training_examples import collate_examples, examples_of, source_of  # noqa: E402
 
 DEMONSTRATIONS = {
     "rotate": 22,
@@ -67,9 +66,9 @@ def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family
 
 def read(model: PolicyNetwork, runs: Sequence[Demonstration]) -> tuple[Batch, "torch.Tensor"]:
     """One batch of all, and its images."""
-    reader = Reader.of(model.config.images)
-    examples, images = examples_of(runs, reader)
-    return Collator(reader)(examples), images
+    processor = Processor.of(model.config.images)
+    examples, images = examples_of(runs, processor)
+    return collate_examples(processor, examples), images
 
 
 def learn_by_heart(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]]) -> None:
@@ -142,10 +141,10 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
         trunk=replace(sizes.trunk, width=64, num_layers=1, dropout=0.0),
     )
     runs = [run for group in demonstrations.values() for run in group]
-    reader = Reader.of(sizes.images)
-    source = source_of(runs, reader)
+    processor = Processor.of(sizes.images)
+    source = source_of(runs, processor)
     model = build_network(sizes, seed=0)
-    learner = PolicyLearner(model, reader)
+    learner = PolicyLearner(model, processor)
     config = TrainingConfig(
         data=tmp_path,
         out=tmp_path,
@@ -175,9 +174,9 @@ def test_the_copying_network_learns_places_by_heart_that_prompt_and_past_show(ta
     sizes = narrow_small(width=64)
     images, trunk = replace(sizes.images, crop_dropout=0.0), replace(sizes.trunk, dropout=0.0)
     sizes = replace(sizes, images=images, trunk=trunk)
-    reader = Reader.of(sizes.images)
-    source, model = source_of(runs, reader), build_network(sizes, seed=0)
-    learner = PolicyLearner(model, reader)
+    processor = Processor.of(sizes.images)
+    source, model = source_of(runs, processor), build_network(sizes, seed=0)
+    learner = PolicyLearner(model, processor)
     config = TrainingConfig(
         data=tmp_path,
         out=tmp_path,

@@ -12,7 +12,7 @@ from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.tasks.novel_words import NOUNS  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
@@ -83,8 +83,9 @@ def test_prompts_with_invented_words_or_without_single_objects_stay(task, episod
 
 def test_names_are_read_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    collate = PolicyCollate(Reader("objects"), 0.0, with_images=True, retelling=Retelling(naming_share=1.0))
-    plain = PolicyCollate(Reader("objects"), 0.0, with_images=True)
+    naming = Retelling(naming_share=1.0)
+    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, retelling=naming)
+    plain = PolicyCollate(Processor("objects"), 0.0, with_images=True)
     assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)
     lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
     assert (lengths[0] > lengths[1]).all()

@@ -9,12 +9,10 @@ from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
 from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.nn import trunk  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
-from openvima.training.collate import Collator  # noqa: E402
-from openvima.training.dataset import input_kind  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
 
 NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
@@ -22,14 +20,14 @@ NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
 
 @pytest.fixture(scope="module", params=NAMES)
 def case(request, data):
-    """A cache, a network and its reader."""
+    """A cache, a network and its processor."""
     sizes = preset(request.param)
-    reader = Reader.of(sizes.images)
-    return open_object_cache(Dataset(data), input_kind(reader)), build_network(sizes, seed=0), reader
+    processor = Processor.of(sizes.images)
+    return open_object_cache(Dataset(data), processor.input_kind), build_network(sizes, seed=0), processor
 
 
-def num_places(tokens, reader) -> int:
-    return len(Collator(reader)._prompt(tokens).places.words)
+def num_places(tokens, processor) -> int:
+    return processor.batch_prompts([tokens.prompt]).word_ids_BL.shape[1]
 
 
 def test_widths_are_those_of_the_episodes(case) -> None:
@@ -46,26 +44,26 @@ def test_widths_are_those_of_the_episodes(case) -> None:
 
 @pytest.mark.parametrize("is_motion", [False, True])
 def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
-    cache, _, reader = case
-    prompt, whole = sequence_lengths._at_most(cache, reader, is_motion)
+    cache, _, processor = case
+    prompt, whole = sequence_lengths._at_most(cache, processor, is_motion)
     episodes = [as_motion(tokens) if is_motion else tokens for tokens in cache]
-    found = np.array([num_places(tokens, reader) for tokens in episodes])
+    found = np.array([num_places(tokens, processor) for tokens in episodes])
     assert (found <= prompt).all() and (prompt < whole).all()
     assert prompt.max() <= 2 * found.max()  # or else too many would be read
 
 
 def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
-    cache, network, reader = case
-    tasks, motions = ([num_places(f(t), reader) for t in cache] for f in (lambda t: t, as_motion))
+    cache, network, processor = case
+    tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, as_motion))
     limit = max(motions) - 1
     for module in (sequence_lengths, trunk):
         monkeypatch.setattr(module, "MAX_PROMPT_PLACES", limit)
     with pytest.raises(DatasetError, match=r"^episode \d+ of \w+ read as a motion is too long to learn from"):
-        sequence_lengths.check_lengths(cache, network, reader, motion_share=1.0)
+        sequence_lengths.check_lengths(cache, network, processor, motion_share=1.0)
     if max(tasks) <= limit:
-        sequence_lengths.check_lengths(cache, network, reader)
+        sequence_lengths.check_lengths(cache, network, processor)
         with pytest.raises(DatasetError, match="read as a motion"):
-            sequence_lengths.check_lengths(cache, network, reader, motion_share=0.5)
+            sequence_lengths.check_lengths(cache, network, processor, motion_share=0.5)
 
 
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
@@ -80,9 +78,9 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
 
 
 def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
-    cache, network, reader = case
+    cache, network, processor = case
     monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_PLACES", 1)  # so that all are read
     before = torch.get_rng_state()
-    sequence_lengths.check_lengths(cache, network.train(), reader, motion_share=0.5)
+    sequence_lengths.check_lengths(cache, network.train(), processor, motion_share=0.5)
     assert torch.equal(torch.get_rng_state(), before)
     assert all(parameter.grad is None for parameter in network.parameters())

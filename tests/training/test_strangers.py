@@ -12,7 +12,7 @@ from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.inputs import Reader  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.dataset import Example, stack_images  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
@@ -33,7 +33,7 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def stacked(episodes):
-    return stack_images(episodes, Reader("objects"))
+    return stack_images(episodes, Processor("objects"))
 
 
 def _rows(table):
@@ -95,7 +95,7 @@ def test_few_tasks_receive_strangers(episodes):
 
 def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes):
     examples = [Example(episode, row=row) for row, episode in enumerate(episodes)]
-    collate = PolicyCollate(Reader("objects"), 0.0, with_images=True)
+    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
     def counts(share: float) -> torch.Tensor:
         parts = Parts(collate, 0, 99, count=1, strangers=examples, stranger_share=share)
@@ -116,7 +116,7 @@ def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes
 def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, stacked):
     examples, stack = stacked
     borrowing = [replace(e, other=o) for e, o in zip(examples[:4], examples[2:], strict=True)]
-    collate = PolicyCollate(Reader("objects"), 0.0, with_images=with_images)
+    collate = PolicyCollate(Processor("objects"), 0.0, with_images=with_images)
     batch = collate(borrowing, rngs_of(borrowing))
     images = stack if batch.images is None else batch.images
     for b, example in enumerate(borrowing):

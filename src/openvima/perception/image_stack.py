@@ -15,6 +15,7 @@ class ImageStack:
     """
 
     def __init__(self, image_size: tuple[int, int]) -> None:
+        self.image_size = image_size
         self._shape = (3, *image_size)
         self._images = [np.zeros(self._shape, np.uint8)]
         self._index: dict[bytes, int] = {b"": 0}  # by digest, which is shorter than the image

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from openvima.errors import ShapeError
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.kernels import CROP_SIZE
 from openvima.perception.objects import (
@@ -21,6 +22,7 @@ from openvima.perception.objects import (
     part_of,
     whole_frames,
 )
+from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 
 InputKind = Literal["objects", "frames"]
@@ -67,7 +69,7 @@ class ObjectTable:
             self.select(slice(int(end - count), int(end))) for count, end in zip(counts, ends, strict=True)
         ]
 
-    def with_image_offset(self, offset: int) -> "ObjectTable":
+    def with_image_offset(self, offset: int | np.ndarray) -> "ObjectTable":
         """Return the same objects, their images `offset` further down a larger stack."""
         return replace(self, crop_index=offset_index(self.crop_index, offset))
 
@@ -137,7 +139,7 @@ def preprocess_prompt(
         ShapeError: An image has another shape or dtype.
     """
     images = [prompt.images[name] for name in image_names(prompt.text)]
-    found = [_extract_prompt_image(image, kind, extractor) for image in images]
+    found = [_extract_prompt_image(image, kind, extractor, stack.image_size) for image in images]
     return PreprocessedPrompt(
         prompt.text,
         ObjectTable.from_views(ObjectViews.concatenated(found), stack),
@@ -147,7 +149,10 @@ def preprocess_prompt(
 
 
 def extract_observation(
-    observation: Mapping, kind: InputKind, extractor: ObjectExtractor | None = None
+    observation: Mapping,
+    kind: InputKind,
+    extractor: ObjectExtractor | None = None,
+    image_size: tuple[int, int] | None = None,
 ) -> ObjectViews:
     """Extract the objects of an observation, or take both frames whole as one object.
 
@@ -155,13 +160,14 @@ def extract_observation(
         observation: `rgb`, `segm` where the segmentation is used, and `ee`.
         kind: "objects" or "frames".
         extractor: Finds the objects; None takes the segmentation, in left-to-right order.
+        image_size: Height and width that halved frames must have; None means those of `IMAGE_SIZES`.
 
     Raises:
         PolicyError: A part or a view is missing, or there is no such end effector.
         ShapeError: An image has another shape or dtype.
     """
     if kind == "frames":
-        return whole_frames(part_of(observation, "rgb"))
+        return _whole_frames(part_of(observation, "rgb"), image_size or IMAGE_SIZES[kind])
     if extractor is None:
         return GROUND_TRUTH.in_observation(observation)
     return _numbered(extractor.in_observation(observation))
@@ -191,13 +197,23 @@ def split_prompt(text: str) -> tuple[str | int, ...]:
 
 
 def _extract_prompt_image(
-    image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None
+    image: PromptImage, kind: InputKind, extractor: ObjectExtractor | None, image_size: tuple[int, int]
 ) -> ObjectViews:
     if kind == "frames":
-        return whole_frames(image.rgb)
+        return _whole_frames(image.rgb, image_size)
     if extractor is None:
         return GROUND_TRUTH.in_prompt_image(image)
     return _numbered(extractor.in_prompt_image(image))
+
+
+def _whole_frames(rgb: Mapping[str, np.ndarray], image_size: tuple[int, int]) -> ObjectViews:
+    frames = whole_frames(rgb)
+    if frames.crops.shape[-2:] != image_size:
+        height, width = (2 * length for length in image_size)
+        raise ShapeError(
+            f"the frames are {rgb[VIEWS[0]].shape}; this policy takes those of (3, {height}, {width})."
+        )
+    return frames
 
 
 def _numbered(found: ObjectViews) -> ObjectViews:

@@ -191,7 +191,7 @@ def load_pretrained(
 
 def save_pretrained(policy: NetworkPolicy, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
     """Write a policy into a folder, which `load_pretrained` reads; see `save_checkpoint`."""
-    save_checkpoint(policy.network, folder, policy.reader.tokenizer, dtype=dtype)
+    save_checkpoint(policy.network, folder, policy.processor.tokenizer, dtype=dtype)
 
 
 def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None]:

@@ -15,13 +15,8 @@ from openvima.perception.objects import ObjectExtractor
 from openvima.policies.base import Policy, prompt_number
 from openvima.policies.devices import usable_device
 from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
-from openvima.policies.inputs import (
-    EpisodeReader,
-    Reader,
-    batch_histories,
-    batch_prompts,
-)
 from openvima.policies.network import HistoryState, Memory, PolicyNetwork
+from openvima.policies.processor import Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
@@ -35,18 +30,18 @@ class _Episodes:
 
     Args:
         places: Where in the batch each one stands.
-        readers: Readers of their observations.
+        num_slots: Their numbers of slots for objects, see `Processor.encode_observations`.
         generators: Generators of their draws.
         memory: Their prompts.
         state: What has been read of them.
         actions_BC: Their last actions, metres and quaternions, float32; None before the first.
         margins_B: How far the best class of their last action lay above the next, in its tightest choice;
             None before the first.
-        features: Features of the images that were encoded for the last step, by the bytes of the images.
+        features: Features of the images of the last step, or of the prompts, by digest.
     """
 
     places: tuple[int, ...]
-    readers: tuple[EpisodeReader, ...]
+    num_slots: tuple[int, ...]
     generators: tuple[torch.Generator, ...]
     memory: Memory
     state: HistoryState
@@ -61,7 +56,7 @@ class _Episodes:
             return self
         return _Episodes(
             tuple(places),
-            tuple(self.readers[row] for row in rows),
+            tuple(self.num_slots[row] for row in rows),
             tuple(self.generators[row] for row in rows),
             self.memory.select(rows),
             self.state.select(rows),
@@ -85,7 +80,7 @@ class NetworkPolicy(Policy):
     Args:
         network: The network; it is moved to the device and precision, and set to evaluation.
         tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
-        extractor: Finds the objects in images; by default by the simulator's segmentation, see `Reader.of`.
+        extractor: Finds the objects in images; by default by the simulator's segmentation.
         device: Where to compute, such as "cpu" or "cuda".
         dtype: Precision; by default float64 on a processor and float32 elsewhere.
         temperature: 0 takes the likeliest action. Above 0 actions are drawn, with scores divided by it.
@@ -113,7 +108,7 @@ class NetworkPolicy(Policy):
                 f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to draw with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
-        self.reader = Reader.of(network.config.images, tokenizer, extractor)
+        self.processor = Processor.of(network.config.images, tokenizer, extractor)
         self.device = usable_device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
@@ -137,21 +132,19 @@ class NetworkPolicy(Policy):
         """
         if not prompts:
             raise PolicyError("reset got no prompts; give one for each episode.")
-        inputs = [self.reader.read_prompt(prompt) for prompt in prompts]
-        stack = ImageStack(self.reader.image_size)
-        numbers = [stack.add(prompt.objects.crops) for prompt in inputs]
-        features, _ = self._encode(stack.images(), {})
-        memory = self.network.encode_prompts(batch_prompts(inputs, numbers).to(self.device), features)
+        batch, stack = self.processor.encode_prompts(prompts)
+        features_KF, features = self._encode(stack, {})
+        memory = self.network.encode_prompts(batch.to(self.device), features_KF)
         seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
         self._episodes = _Episodes(
             places=tuple(range(len(prompts))),
-            readers=tuple(self.reader.begin_episode() for _ in prompts),
+            num_slots=(0,) * len(prompts),
             generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
             memory=memory,
             state=self.network.begin(memory),
             actions_BC=None,
             margins_B=None,
-            features={},
+            features=features,
         )
         self._num_prompts = len(prompts)
 
@@ -238,16 +231,15 @@ class NetworkPolicy(Policy):
 
     def _decide(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
         """Make one step of all episodes."""
-        readers = tuple(copy(reader) for reader in episodes.readers)
-        steps = [reader.read_step(seen) for reader, seen in zip(readers, observations, strict=True)]
-        stack = ImageStack(self.reader.image_size)
-        numbers = [[stack.add(step.objects.crops)] for step in steps]
-        features_KF, features = self._encode(stack.images(), episodes.features)
-        history = batch_histories([[step] for step in steps], numbers).to(self.device)
+        batch, stack = self.processor.encode_observations(
+            [[observation] for observation in observations], episodes.num_slots
+        )
+        features_KF, features = self._encode(stack, episodes.features)
+        history = batch.to(self.device)
         has_previous_B1 = torch.full_like(history.steps_BT, episodes.actions_BC is not None)
         previous_BC = episodes.actions_BC
         if previous_BC is None:
-            previous_BC = torch.zeros(len(steps), ACTION_WIDTH, device=self.device)
+            previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)
         inputs, state = self.network.extend(
             episodes.memory, episodes.state, history, features_KF, previous_BC[:, None], has_previous_B1
         )
@@ -257,7 +249,7 @@ class NetworkPolicy(Policy):
         actions_BC = self.network.decide(inputs, state, _noting(choose, margins))[:, 0].to(torch.float32)
         return replace(
             episodes,
-            readers=readers,
+            num_slots=tuple(batch.num_slots_BT[:, 0].tolist()),
             state=state,
             actions_BC=actions_BC,
             margins_B=torch.stack(margins).amin(0) if margins else None,
@@ -265,14 +257,14 @@ class NetworkPolicy(Policy):
         )
 
     def _encode(
-        self, images: np.ndarray, known: Mapping[bytes, torch.Tensor]
+        self, stack: ImageStack, known: Mapping[bytes, torch.Tensor]
     ) -> tuple[torch.Tensor, dict[bytes, torch.Tensor]]:
-        """Encode images that are not known by their bytes; most objects look as they did a step ago.
+        """Encode the images that are new; most objects look as they did a step ago.
 
         Returns:
-            Features of all images, and by their bytes.
+            Features of all images, and by digest.
         """
-        keys = [image.tobytes() for image in images]
+        images, keys = stack.images(), stack.digests()
         new = [number for number, key in enumerate(keys) if key not in known]
         encoded = self.network.encode_images(torch.from_numpy(images[new]).to(self.device))
         if len(new) == len(keys):

@@ -15,6 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.config import PolicyConfig
 from openvima.policies.heads.autoregressive import (
     AutoregressiveConfig,
@@ -33,7 +34,6 @@ from openvima.policies.heads.base import (
 from openvima.policies.heads.bins import BinsConfig, BinsHead
 from openvima.policies.heads.copying import CopyingConfig, CopyingHead
 from openvima.policies.heads.pointing import PointingHead
-from openvima.policies.inputs import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.comparison import Comparison, Sights, TurnBetween, alike_shown, earlier, others
 from openvima.policies.nn.frame_encoder import FrameEncoder

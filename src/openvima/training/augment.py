@@ -10,9 +10,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from openvima.policies.inputs import HistoryBatch
+from openvima.policies.batch import Batch, HistoryBatch
 from openvima.render.camera import VIEWS
-from openvima.training.dataset import Batch
 
 NUM_VIEWS = len(VIEWS)
 MOST_SLOTS = 256  # numbers drawn for a step; more than there are ids
@@ -30,7 +29,7 @@ def augmented(
 
     Args:
         batch: Demonstrations.
-        layout: What a token shows, as in `Reader`. Fused objects are shuffled, since that head points at
+        layout: What a token shows, as in `Processor`. Fused objects are shuffled, since that head points at
             them. With a token for each view they keep their order, as in the published policies, and a false
             detection comes anywhere among them. Whole frames stay as they are.
         probability: Chance that a view of a step shows an object that is none.
@@ -86,7 +85,7 @@ def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatc
 def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: torch.Tensor) -> Batch:
     """Put false detections anywhere among the visible slots of their view.
 
-    The numbers of slots become what `EpisodeReader` would make of such detections: each is an object that one
+    The numbers of slots become what `Processor` would make of such detections: each is an object that one
     view shows, so that the other view gets an empty slot; and slots once there stay for the episode.
     """
     history = _with_spurious_objects(batch, shows_BTV)

@@ -164,7 +164,7 @@ def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
     if count > MAX_FEATURES:
         return
     device = next(learner.parameters()).device
-    height, width = learner.reader.image_size
+    height, width = learner.processor.image_size
     parts = [np.zeros((1, 3, height, width), np.uint8)]  # number 0 is black
     features = []
     with torch.no_grad():

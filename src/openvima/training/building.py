@@ -10,10 +10,10 @@ from openvima.policies.base import find_checkpoint
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import PolicyConfig
 from openvima.policies.families.midas import with_autoregression, with_visual_residual
-from openvima.policies.inputs import Reader
 from openvima.policies.network import PolicyNetwork, build_network
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.presets import preset
+from openvima.policies.processor import Processor
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
@@ -128,11 +128,11 @@ def build_learner(config: TrainingConfig) -> Learner:
             f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
             "folder that holds it, or to 't5-base'. Its weights are then not read."
         )
-    reader = Reader.of(sizes.images, tokenizer_for(sizes.prompt, where))
+    processor = Processor.of(sizes.images, tokenizer_for(sizes.prompt, where))
     augmentation = config.augmentation
     return PolicyLearner(
         network,
-        reader,
+        processor,
         spurious_probability=augmentation.false_positive_prob,
         retelling=Retelling(
             motion_share=augmentation.inverse_dynamics_prob,

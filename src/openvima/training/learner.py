@@ -14,12 +14,12 @@ from torch import nn
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import WEIGHTS_FILE
+from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
-from openvima.policies.inputs import Reader
 from openvima.policies.network import PolicyNetwork
+from openvima.policies.processor import Processor
 from openvima.training.augment import augmented
-from openvima.training.collate import Collator
-from openvima.training.dataset import Batch, Example, input_kind, stack_images
+from openvima.training.dataset import Example, stack_images
 from openvima.training.retelling import AS_TOLD, Retelling
 
 # From examples and, while training, one generator for each of them, to a batch.
@@ -82,7 +82,7 @@ class PolicyLearner(Learner):
 
     Args:
         network: The network; it is trained in place.
-        reader: How it sees prompts and observations.
+        processor: How it sees prompts and observations.
         spurious_probability: How often each view of each step shows an object that is none.
         retelling: How demonstrations are told otherwise.
     """
@@ -90,15 +90,15 @@ class PolicyLearner(Learner):
     def __init__(
         self,
         network: PolicyNetwork,
-        reader: Reader,
+        processor: Processor,
         *,
         spurious_probability: float = 0.0,
         retelling: Retelling = AS_TOLD,
     ) -> None:
         super().__init__()
         self.network = network
-        self.reader = reader
-        self.input_kind = input_kind(reader)
+        self.processor = processor
+        self.input_kind = processor.input_kind
         self.score = network.head.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
         self._spurious_probability, self._retelling = spurious_probability, retelling
@@ -107,7 +107,7 @@ class PolicyLearner(Learner):
         """Return what makes batches; see `Learner`."""
         with_images = self.features is None
         return PolicyCollate(
-            self.reader, self._spurious_probability, with_images=with_images, retelling=self._retelling
+            self.processor, self._spurious_probability, with_images=with_images, retelling=self._retelling
         )
 
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -124,7 +124,7 @@ class PolicyLearner(Learner):
         """Write a checkpoint that `load_policy` takes."""
         prefix = "network."
         own = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
-        write_checkpoint(self.network, folder, self.reader.tokenizer, weights=own)
+        write_checkpoint(self.network, folder, self.processor.tokenizer, weights=own)
 
     def read(self, folder: Path) -> None:
         """Load the weights of a checkpoint."""
@@ -140,7 +140,7 @@ class PolicyCollate:
     """Makes batches for a network of the family.
 
     Args:
-        reader: How the network sees prompts and observations.
+        processor: How the network sees prompts and observations.
         spurious_probability: How often each view of each step shows an object that is none.
         with_images: Put the images that are used into the batch, each once. Without, numbers count through
             the images of all demonstrations.
@@ -149,13 +149,13 @@ class PolicyCollate:
 
     def __init__(
         self,
-        reader: Reader,
+        processor: Processor,
         spurious_probability: float,
         *,
         with_images: bool,
         retelling: Retelling = AS_TOLD,
     ) -> None:
-        self._collate = Collator(reader)
+        self._processor = processor
         self._probability, self._with_images = spurious_probability, with_images
         self._retelling = retelling
 
@@ -163,14 +163,14 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
     ) -> Batch:
         """Make a batch; see `Learner.collator`."""
-        reader, stack = self._collate.reader, None
+        processor, stack = self._processor, None
         if self._with_images:
-            examples, stack = _stacked(examples, reader)
+            examples, stack = _stacked(examples, processor)
         drawn = [None] * len(examples) if rngs is None else rngs
         examples = [self._retelling(example, rng) for example, rng in zip(examples, drawn, strict=True)]
-        batch = self._collate(examples)
+        batch = processor.collate([e.episode for e in examples], [e.base for e in examples])
         if rngs is not None:
-            batch = augmented(batch, reader.layout, probability=self._probability, rngs=rngs)
+            batch = augmented(batch, processor.layout, probability=self._probability, rngs=rngs)
         return batch if stack is None else _with_used_images(batch, stack)
 
 
@@ -214,10 +214,10 @@ def read_tensors(file: Path) -> dict[str, torch.Tensor]:
         ) from error
 
 
-def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example], torch.Tensor]:
+def _stacked(examples: Sequence[Example], processor: Processor) -> tuple[list[Example], torch.Tensor]:
     """Put the images of demonstrations into one stack, and of those from which they borrow objects."""
     others = [example.other for example in examples if example.other is not None]
-    stacked, stack = stack_images([example.episode for example in (*examples, *others)], reader)
+    stacked, stack = stack_images([example.episode for example in (*examples, *others)], processor)
     own, behind = stacked[: len(examples)], iter(stacked[len(examples) :])
     return [
         replace(ours, other=None if example.other is None else next(behind))
@@ -226,12 +226,13 @@ def _stacked(examples: Sequence[Example], reader: Reader) -> tuple[list[Example]
 
 
 def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:
-    """Keep the images that the batch shows, each once, and number them anew."""
+    """Keep the blank image and those that the batch contains, and number them anew."""
     prompts, history = batch.prompts, batch.history
-    numbers = torch.cat([prompts.crop_index_VS.flatten(), history.crop_index_BTVN.flatten()])
-    used, places = numbers.unique(return_inverse=True)
-    prompt_places, history_places = places.split(
-        [prompts.crop_index_VS.numel(), history.crop_index_BTVN.numel()]
+    blank = torch.zeros(1, dtype=torch.int64)
+    index = torch.cat([blank, prompts.crop_index_VS.flatten(), history.crop_index_BTVN.flatten()])
+    used, places = index.unique(return_inverse=True)
+    _, prompt_places, history_places = places.split(
+        [1, prompts.crop_index_VS.numel(), history.crop_index_BTVN.numel()]
     )
     return replace(
         batch,

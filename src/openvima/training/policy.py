@@ -117,11 +117,11 @@ class _Stages:
         caches, config, learner = self._caches, self.config, self.learner
         if isinstance(learner, PolicyLearner):
             prob = config.augmentation.inverse_dynamics_prob
-            check_words(caches[0], learner.reader)
+            check_words(caches[0], learner.processor)
             if prob:
-                learner.reader.tokenizer.encode(MOTION_TEXT.format(frames=""))
+                learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))
             for cache in caches:
-                check_lengths(cache, learner.network, learner.reader, motion_share=prob)
+                check_lengths(cache, learner.network, learner.processor, motion_share=prob)
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches)
         if config.runtime.compile:

@@ -8,26 +8,24 @@ from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.errors import DatasetError, PolicyError
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.heads.base import ACTION_WIDTH
-from openvima.policies.inputs import Reader
 from openvima.policies.network import PolicyNetwork
 from openvima.policies.nn.trunk import MAX_PLACES, MAX_PROMPT_PLACES
+from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
-from openvima.training.collate import Collator
-from openvima.training.dataset import Example
 from openvima.training.inverse_dynamics import as_motion, motion_text
 
 MAX_READ = 256  # only those that may be too long are read, and of them the longest
 
 
 def check_lengths(
-    cache: ObjectCache, network: PolicyNetwork, reader: Reader, *, motion_share: float = 0.0
+    cache: ObjectCache, network: PolicyNetwork, processor: Processor, *, motion_share: float = 0.0
 ) -> None:
     """Read the longest demonstrations, if one of them may be too long.
 
     Args:
         cache: The tokens of all.
         network: What is trained; it is left in evaluation mode.
-        reader: How it sees prompts and observations.
+        processor: How it sees prompts and observations.
         motion_share: Share of demonstrations that are read as motions.
 
     Raises:
@@ -36,43 +34,44 @@ def check_lengths(
     if not len(cache):
         return
     network.eval()
-    collate = Collator(reader)
     for is_motion in [*([False] if motion_share < 1 else []), *([True] if motion_share else [])]:
-        prompt, whole = _at_most(cache, reader, is_motion)
+        prompt, whole = _at_most(cache, processor, is_motion)
         excess = np.maximum(prompt / MAX_PROMPT_PLACES, whole / MAX_PLACES)
         longest = np.argsort(-excess, kind="stable")[:MAX_READ]
         for row in longest[excess[longest] > 1]:
             tokens = cache[int(row)]
-            _read(network, collate, as_motion(tokens) if is_motion else tokens, is_motion)
+            _read(network, processor, as_motion(tokens) if is_motion else tokens, is_motion)
 
 
-def _at_most(cache: ObjectCache, reader: Reader, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
+def _at_most(cache: ObjectCache, processor: Processor, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
     """Bounds on the places of each prompt, and of prompt and history together, shape (N,)."""
     steps, (shown, seen) = cache.lengths()[:, 0], cache.widths().T
     texts = [motion_text(1)] if is_motion else cache.texts()
     pieces = [split_prompt(text) for text in texts]
-    words = max(sum(len(reader.tokenizer.encode(p)) for p in text if isinstance(p, str)) for text in pieces)
+    words = max(
+        sum(len(processor.tokenizer.encode(p)) for p in text if isinstance(p, str)) for text in pieces
+    )
     if is_motion:
-        images = (steps + 1) * _tokens_of(seen, reader)
+        images = (steps + 1) * _tokens_of(seen, processor)
     else:
-        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * _tokens_of(shown, reader)
+        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * _tokens_of(shown, processor)
     prompt = words + images + 1  # the end
-    return prompt, prompt + 1 + steps * (_tokens_of(seen + len(VIEWS), reader) + 1 + ACTION_WIDTH)
+    return prompt, prompt + 1 + steps * (_tokens_of(seen + len(VIEWS), processor) + 1 + ACTION_WIDTH)
 
 
-def _tokens_of(num_objects: np.ndarray, reader: Reader) -> np.ndarray:
+def _tokens_of(num_objects: np.ndarray, processor: Processor) -> np.ndarray:
     """Tokens of an image that shows so many objects."""
-    if reader.layout == "frames":
-        return np.full_like(num_objects, reader.tokens_per_frame_pair)
-    return num_objects * (len(VIEWS) if reader.layout == "views" else 1)
+    if processor.layout == "frames":
+        return np.full_like(num_objects, processor.tokens_per_frame_pair)
+    return num_objects * (len(VIEWS) if processor.layout == "views" else 1)
 
 
 @torch.no_grad()
-def _read(network: PolicyNetwork, collate: Collator, tokens: PreprocessedEpisode, is_motion: bool) -> None:
+def _read(network: PolicyNetwork, processor: Processor, tokens: PreprocessedEpisode, is_motion: bool) -> None:
     """Let the network read one demonstration, with black images."""
     device = next(network.parameters()).device
-    batch = collate([Example(tokens)]).to(device)
-    height, width = collate.reader.image_size
+    batch = processor.collate([tokens]).to(device)
+    height, width = processor.image_size
     black = network.encode_images(torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device))
     features = black.expand(1 + len(tokens.images), *black.shape[1:])
     try:

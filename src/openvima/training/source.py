@@ -10,7 +10,7 @@ from openvima.data.batching import BatchOrder
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.errors import ConfigError, DatasetError
 from openvima.perception.preprocessing import split_prompt
-from openvima.policies.inputs import Reader
+from openvima.policies.processor import Processor
 from openvima.training.dataset import Example
 from openvima.training.hash_split import lots_of
 from openvima.training.learner import Collate
@@ -145,7 +145,7 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
     return ExampleSource(detected, source.rows, bases, detected.lengths()[source.rows])
 
 
-def check_words(cache: ObjectCache, reader: Reader) -> None:
+def check_words(cache: ObjectCache, processor: Processor) -> None:
     """Look at every text before training rather than in the middle of it.
 
     Raises:
@@ -154,7 +154,7 @@ def check_words(cache: ObjectCache, reader: Reader) -> None:
     for text in cache.texts():
         for piece in split_prompt(text):
             if isinstance(piece, str):
-                reader.tokenizer.encode(piece)
+                processor.tokenizer.encode(piece)
 
 
 def order_of(

@@ -1,15 +1,14 @@
-"""Prompts and observations as tensors: sequences, slots, masks.
+"""The naive twin of `Processor`: prompts and observations one by one, as a policy that acts reads them.
 
-Numpy records of single prompts and steps come first, batches of them after. Nothing here has weights. Images
-(crops of objects, or whole frames) are given by their number in one stack, so that each is encoded once, or
-taken from a store of encoded ones.
+It shares only the extraction of objects with the processor. Golden recordings, whose slots are given as they
+are, are batched with it too.
 
-Shape suffixes: B batch, T steps, L prompt places, S objects in all prompts, V views, N objects in view.
+Shape suffixes: see `openvima.policies.batch`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,14 +24,13 @@ from openvima.perception.objects import (
     part_of,
     whole_frames,
 )
+from openvima.policies.batch import WORD, HistoryBatch, PromptBatch
 from openvima.policies.nn.frame_encoder import FrameEncoderConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.trunk import MAX_PLACES
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
-
-WORD = -1  # entry of a place that holds a word
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,45 +58,6 @@ class PromptInput:
     in_scene: np.ndarray
 
 
-class _Tensors:
-    """A record of tensors that can be moved as a whole."""
-
-    __slots__ = ()
-
-    def to(self, device: torch.device | str) -> Self:
-        """Return the record on another device."""
-        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
-        return type(self)(*(value.to(device) for value in values))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PromptBatch(_Tensors):
-    """Prompts of a batch; image tokens are numbered through the batch.
-
-    Args:
-        word_ids_BL: Word ids.
-        object_index_BL: Image token that stands at a place, numbered through the first tokens of all
-            objects, then all second ones, and so on; `WORD` where a word stands.
-        mask_BL: Which places exist.
-        crop_index_VS: Number of each object's image in the stack of images.
-        boxes_VS4: Boxes in pixels.
-        masks_VS: Whether the object is visible in the view.
-        positions_S2: Table points under the boxes, metres.
-        image_index_S: Which image of its prompt shows the object, counted from 0 in reading order.
-        in_scene_S: Whether that is a picture of the table, where the object has a place.
-    """
-
-    word_ids_BL: torch.Tensor
-    object_index_BL: torch.Tensor
-    mask_BL: torch.Tensor
-    crop_index_VS: torch.Tensor
-    boxes_VS4: torch.Tensor
-    masks_VS: torch.Tensor
-    positions_S2: torch.Tensor
-    image_index_S: torch.Tensor
-    in_scene_S: torch.Tensor
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class StepInput:
     """One observation.
@@ -114,31 +73,6 @@ class StepInput:
     positions: np.ndarray
     grasps: np.ndarray
     end_effector: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HistoryBatch(_Tensors):
-    """Observations of a batch of episodes, padded to equal numbers of steps and objects.
-
-    Args:
-        crop_index_BTVN: Number of each object's image in the stack of images.
-        boxes_BTVN4: Boxes in pixels.
-        masks_BTVN: Whether the object is visible in the view.
-        num_slots_BT: Number of objects of the step, padding of the batch not counted.
-        positions_BTN2: Table points under the boxes, metres.
-        grasps_BTN2: Table points under the most interior pixels, metres.
-        end_effector_BT: 0 suction cup, 1 spatula.
-        steps_BT: Which steps exist.
-    """
-
-    crop_index_BTVN: torch.Tensor
-    boxes_BTVN4: torch.Tensor
-    masks_BTVN: torch.Tensor
-    num_slots_BT: torch.Tensor
-    positions_BTN2: torch.Tensor
-    grasps_BTN2: torch.Tensor
-    end_effector_BT: torch.Tensor
-    steps_BT: torch.Tensor
 
 
 @dataclass(frozen=True, slots=True)

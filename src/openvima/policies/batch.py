@@ -1,0 +1,127 @@
+"""Batches as networks take them: padded prompts, observations and targets.
+
+Images (crops of objects, or whole frames) are named by their index in a stack, so that each is encoded once.
+Index 0 is a blank image and stands for a hidden object.
+
+Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, V views, N objects of an
+observation.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+import numpy as np
+import torch
+
+from openvima.policies.heads.base import ActionTargets
+
+WORD = -1  # object index at a position that holds a word
+
+
+class _Tensors:
+    """A record of tensors that can be moved as a whole."""
+
+    __slots__ = ()
+
+    def to(self, device: torch.device | str) -> Self:
+        """Return the record on another device."""
+        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
+        return type(self)(*(value.to(device) for value in values))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PromptBatch(_Tensors):
+    """Prompts of a batch; image tokens are numbered through the batch.
+
+    Args:
+        word_ids_BL: Word ids.
+        object_index_BL: Image token at a position, numbered through the first tokens of all objects, then all
+            second ones, and so on; `WORD` for a word.
+        mask_BL: False for padding, and for tokens of objects hidden in their view.
+        crop_index_VS: Index of each object's image in the stack.
+        boxes_VS4: Boxes in pixels.
+        masks_VS: Whether the object is visible in the view.
+        positions_S2: Table points under the boxes, metres.
+        image_index_S: Which image of its prompt contains the object, counted from 0 in reading order.
+        in_scene_S: Whether that image is a scene, where the object has a position on the table.
+    """
+
+    word_ids_BL: torch.Tensor
+    object_index_BL: torch.Tensor
+    mask_BL: torch.Tensor
+    crop_index_VS: torch.Tensor
+    boxes_VS4: torch.Tensor
+    masks_VS: torch.Tensor
+    positions_S2: torch.Tensor
+    image_index_S: torch.Tensor
+    in_scene_S: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryBatch(_Tensors):
+    """Observations of a batch of episodes, padded to equal numbers of steps and objects.
+
+    Args:
+        crop_index_BTVN: Index of each object's image in the stack.
+        boxes_BTVN4: Boxes in pixels.
+        masks_BTVN: Whether the object is visible in the view.
+        num_slots_BT: Number of objects of the step, padding of the batch not counted.
+        positions_BTN2: Table points under the boxes, metres.
+        grasps_BTN2: Table points under the most interior pixels, metres.
+        end_effector_BT: 0 suction cup, 1 spatula.
+        steps_BT: Which steps exist.
+    """
+
+    crop_index_BTVN: torch.Tensor
+    boxes_BTVN4: torch.Tensor
+    masks_BTVN: torch.Tensor
+    num_slots_BT: torch.Tensor
+    positions_BTN2: torch.Tensor
+    grasps_BTN2: torch.Tensor
+    end_effector_BT: torch.Tensor
+    steps_BT: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FalsePositiveBatch:
+    """One false detection for each step and view of a batch, to augment with; all 0 with frames.
+
+    Args:
+        crop_index: Indices of the crops, shape (B, T, 2).
+        boxes: Boxes in pixels, shape (B, T, 2, 4).
+        points: Table points under their centres, shape (B, T, 2, 2), metres.
+    """
+
+    crop_index: np.ndarray
+    boxes: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Several demonstrations, padded.
+
+    Args:
+        prompts: Their prompts.
+        history: Their observations.
+        targets: Their actions.
+        false_positives: A false detection for each step and view.
+        images: The stack that image indices refer to, shape (K, 3, height, width), uint8; None where that is
+            a stack of all demonstrations.
+    """
+
+    prompts: PromptBatch
+    history: HistoryBatch
+    targets: ActionTargets
+    false_positives: FalsePositiveBatch
+    images: torch.Tensor | None = None
+
+    def to(self, device: torch.device | str) -> "Batch":
+        """Return the batch on another device; false positives, inserted before, stay."""
+        return replace(
+            self,
+            prompts=self.prompts.to(device),
+            history=self.history.to(device),
+            targets=self.targets.to(device),
+            images=None if self.images is None else self.images.to(device, non_blocking=True),
+        )

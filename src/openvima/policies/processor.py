@@ -1,0 +1,452 @@
+"""From prompts and observations to padded batches: one way for training and for acting.
+
+Inputs are first preprocessed into tables of objects (`openvima.perception.preprocessing`): by the object
+cache for training, here for acting. Acting is a batch with one step. All steps of a batch are laid out at
+once, without a loop over steps.
+
+Shape suffixes: see `openvima.policies.batch`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+
+from openvima.errors import DatasetError, PolicyError, PromptError
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.kernels import CROP_SIZE
+from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews, end_effector_of
+from openvima.perception.preprocessing import (
+    InputKind,
+    ObjectTable,
+    PreprocessedPrompt,
+    extract_observation,
+    offset_index,
+    preprocess_prompt,
+    split_prompt,
+)
+from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
+from openvima.policies.heads.base import ActionTargets
+from openvima.policies.nn.frame_encoder import FrameEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.trunk import MAX_PLACES
+from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
+from openvima.render.camera import CAMERAS, VIEWS, unproject
+from openvima.scene import RenderedPrompt
+
+if TYPE_CHECKING:  # acting needs no demonstrations
+    from openvima.data.object_cache.episode import PreprocessedEpisode
+
+MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
+
+_LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Processor:
+    """Makes the inputs of a network from prompts and observations.
+
+    Args:
+        layout: What a token encodes: "objects", an object in both views; "views", an object in one view (the
+            published VIMA); "frames", part of a whole frame.
+        image_size: Height and width of a crop or frame.
+        tokens_per_frame_pair: With frames, number of tokens of the two frames of a step.
+        tokenizer: Splits text into word ids.
+        extractor: Finds the objects when acting; None takes the segmentation.
+    """
+
+    layout: Literal["objects", "views", "frames"]
+    image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
+    tokens_per_frame_pair: int = 0
+    tokenizer: Tokenizer = CLOSED_TOKENIZER
+    extractor: ObjectExtractor | None = None
+    _layouts: "dict[_LayoutKey, _Layout]" = field(default_factory=dict, init=False, repr=False)
+
+    @staticmethod
+    def of(
+        images: ObjectEncoderConfig | FrameEncoderConfig,
+        tokenizer: Tokenizer | None = None,
+        extractor: ObjectExtractor | None = None,
+    ) -> "Processor":
+        """Make the processor for a network whose images are encoded in this way."""
+        tokenizer = tokenizer or CLOSED_TOKENIZER
+        if isinstance(images, FrameEncoderConfig):
+            size = (images.frame.image_height, images.frame.image_width)
+            return Processor("frames", size, images.num_tokens, tokenizer)
+        layout = "objects" if images.fuse_views else "views"
+        return Processor(layout, tokenizer=tokenizer, extractor=extractor)
+
+    @property
+    def input_kind(self) -> InputKind:
+        """What the images contain: objects, or whole frames."""
+        return "frames" if self.layout == "frames" else "objects"
+
+    def encode_prompts(
+        self, prompts: Sequence[RenderedPrompt], stack: ImageStack | None = None
+    ) -> tuple[PromptBatch, ImageStack]:
+        """Encode prompts to act on.
+
+        Args:
+            prompts: One for each episode.
+            stack: Images so far; None begins a new stack.
+
+        Returns:
+            The batch, and the stack that its image indices refer to.
+
+        Raises:
+            PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
+            PolicyError: An image lacks a view.
+            ShapeError: An image has another shape or dtype.
+        """
+        if not all(prompt.sequence() for prompt in prompts):
+            raise PromptError("the prompt is empty; it must hold at least one word or image.")
+        stack = stack or ImageStack(self.image_size)
+        preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
+        return self.batch_prompts(preprocessed), stack
+
+    def encode_observations(
+        self,
+        histories: Sequence[Sequence[Mapping]],
+        num_slots: Sequence[int] | None = None,
+        stack: ImageStack | None = None,
+    ) -> tuple[HistoryBatch, ImageStack]:
+        """Encode observations to act on.
+
+        Args:
+            histories: Consecutive observations of each episode, just the last one when acting: `rgb` and
+                `segm`, each view name to array, and `ee`, the index of the end effector. `segm` only where it
+                is used.
+            num_slots: With layout "views", slots of each episode before these observations, the last of
+                `num_slots_BT`; None at the start of episodes. An object keeps its slot when it is hidden in
+                both views, so their number never falls within an episode, as in the published evaluation.
+            stack: Images so far; None begins a new stack.
+
+        Returns:
+            The batch, and the stack that its image indices refer to.
+
+        Raises:
+            PolicyError: A part or a view is missing, there is no such end effector, or there are too many
+                objects or none. With layout "views" there may be none after the first step.
+            ShapeError: An image has another shape or dtype.
+        """
+        stack = stack or ImageStack(self.image_size)
+        if num_slots is None or self.layout != "views":
+            num_slots = [0] * len(histories)
+        found: list[ObjectViews] = []
+        end_effectors: list[int] = []
+        for history, slots in zip(histories, num_slots, strict=True):
+            for observation in history:
+                end_effectors.append(end_effector_of(observation))
+                objects = extract_observation(observation, self.input_kind, self.extractor, self.image_size)
+                self._check_count(len(objects), slots)
+                slots = max(slots, len(objects)) if self.layout == "views" else 0
+                found.append(objects)
+        steps = _Steps.of([len(history) for history in histories])
+        counts = np.array([len(objects) for objects in found], np.int64)
+        objects = ObjectTable.from_views(ObjectViews.concatenated(found), stack)
+        slots_BT = self._num_slots(steps, counts, np.array(num_slots))
+        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
+
+    def batch_prompts(
+        self, prompts: Sequence[PreprocessedPrompt], image_offsets: Sequence[int] | None = None
+    ) -> PromptBatch:
+        """Pad prompts to equal length and number their objects through.
+
+        Args:
+            prompts: The prompts.
+            image_offsets: Images of the stack before those of each prompt; None where there is one stack.
+        """
+        sequences = [self._token_sequence(prompt) for prompt in prompts]
+        counts = [len(sequence.objects) for sequence in sequences]
+        length = max(len(sequence.layout.words) for sequence in sequences)
+        word_ids_BL = np.full((len(prompts), length), PADDING_ID, np.int64)
+        object_index_BL = np.full((len(prompts), length), WORD, np.int64)
+        mask_BL = np.zeros((len(prompts), length), np.bool_)
+        first, total = 0, sum(counts)
+        for b, sequence in enumerate(sequences):
+            layout, size = sequence.layout, len(sequence.layout.words)
+            word_ids_BL[b, :size] = layout.words
+            numbered = layout.entries + (first + layout.parts * total)
+            object_index_BL[b, :size] = np.where(layout.is_word, WORD, numbered)
+            mask_BL[b, :size] = True if sequence.mask is None else sequence.mask
+            first += counts[b]
+        objects = ObjectTable.concatenate([sequence.objects for sequence in sequences])
+        offsets = np.repeat([0] * len(prompts) if image_offsets is None else image_offsets, counts)[:, None]
+        visible = objects.masks
+        arrays = (
+            word_ids_BL,
+            object_index_BL,
+            mask_BL,
+            np.ascontiguousarray(offset_index(objects.crop_index, offsets).T),
+            np.ascontiguousarray(objects.boxes.swapaxes(0, 1).astype(np.int64)),
+            np.ascontiguousarray(visible.T),
+            _on_table(objects.boxes[..., :2], visible[:, TOP]),
+            np.concatenate([sequence.layout.images for sequence in sequences]),
+            np.concatenate([sequence.is_scene[sequence.layout.images] for sequence in sequences]),
+        )
+        return PromptBatch(*(torch.from_numpy(array) for array in arrays))
+
+    def collate(
+        self, episodes: "Sequence[PreprocessedEpisode]", image_offsets: Sequence[int] | None = None
+    ) -> Batch:
+        """Pad demonstrations to equal lengths.
+
+        Args:
+            episodes: The demonstrations.
+            image_offsets: Images of the stack before those of each demonstration; None where there is one
+                stack.
+
+        Raises:
+            DatasetError: A demonstration has a step without visible objects.
+            PromptError: A prompt has a word that the vocabulary lacks.
+        """
+        offsets = np.array([0] * len(episodes) if image_offsets is None else image_offsets, np.int64)
+        steps = _Steps.of([episode.num_steps for episode in episodes])
+        counts = np.concatenate([episode.objects_per_step for episode in episodes]).astype(np.int64)
+        slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes), np.int64))
+        for b, t in np.argwhere(steps.exists & (slots_BT == 0))[:1]:
+            raise DatasetError(
+                f"episode {episodes[b].seed} of {episodes[b].task} shows no object before action {t}, so "
+                "there is nothing to learn from it; leave it out."
+            )
+        objects = ObjectTable.concatenate([episode.objects for episode in episodes])
+        step, slot = _steps_and_slots(counts)
+        pick, place = np.full((2, len(counts)), -1)
+        if self.layout == "objects":  # elsewhere slots of two views need not be one object
+            for slots, name in ((pick, "pick_ids"), (place, "place_ids")):
+                ids = np.concatenate([getattr(episode, name) for episode in episodes])
+                is_target = objects.ids == ids[step]
+                slots[step[is_target]] = slot[is_target]
+        objects = objects.with_image_offset(offsets[steps.b[step]][:, None])
+        end_effectors = np.array([episode.end_effector for episode in episodes], np.int64)[steps.b]
+        history = self._batch_history(objects, counts, steps, slots_BT, end_effectors)
+        targets = ActionTargets(
+            torch.from_numpy(steps.pad(np.concatenate([episode.actions for episode in episodes]))),
+            torch.from_numpy(steps.pad(pick, fill=-1)),
+            torch.from_numpy(steps.pad(place, fill=-1)),
+            history.steps_BT,
+        )
+        prompts = self.batch_prompts([episode.prompt for episode in episodes], offsets.tolist())
+        return Batch(prompts, history, targets, self._batch_false_positives(episodes, steps, offsets))
+
+    def _batch_history(
+        self,
+        objects: ObjectTable,
+        counts: np.ndarray,
+        steps: "_Steps",
+        slots_BT: np.ndarray,
+        end_effectors: np.ndarray,
+    ) -> HistoryBatch:
+        """Lay the objects of all steps out in slots; counts and end effectors have one entry a step."""
+        step, slot = _steps_and_slots(counts)
+        if self.layout == "views":
+            objects = _visible_first(objects, step)
+        visible = objects.masks
+        shape = (*steps.exists.shape, len(VIEWS), max(1, int(slots_BT.max(initial=0))))
+        b, t = steps.b[step], steps.t[step]
+        crop_index_BTVN = np.zeros(shape, np.int64)
+        boxes_BTVN4 = np.zeros((*shape, 4), np.int64)
+        masks_BTVN = np.zeros(shape, np.bool_)
+        crop_index_BTVN[b, t, :, slot] = objects.crop_index
+        boxes_BTVN4[b, t, :, slot] = objects.boxes
+        masks_BTVN[b, t, :, slot] = visible
+        is_slot = np.arange(shape[3]) < slots_BT[..., None]
+        # The box of a slot without an object is at the image's corner.
+        positions_BTN2 = np.where(is_slot[..., None], unproject(np.zeros(2), CAMERAS["front"]), 0.0)
+        grasps_BTN2 = positions_BTN2.copy()
+        positions_BTN2[b, t, slot] = _on_table(objects.boxes[..., :2], visible[:, TOP])
+        grasps_BTN2[b, t, slot] = _on_table(objects.grasps, visible[:, TOP])
+        arrays = (
+            crop_index_BTVN,
+            boxes_BTVN4,
+            masks_BTVN,
+            slots_BT,
+            positions_BTN2,
+            grasps_BTN2,
+            steps.pad(end_effectors),
+            steps.exists,
+        )
+        return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
+
+    def _num_slots(self, steps: "_Steps", counts: np.ndarray, before_B: np.ndarray) -> np.ndarray:
+        """Slots at each step, shape (B, T), int64; with layout "views" their number never falls."""
+        slots_BT = steps.pad(counts)
+        if self.layout != "views":
+            return slots_BT
+        slots_BT = np.maximum.accumulate(np.maximum(slots_BT, before_B[:, None]), axis=1)
+        return np.where(steps.exists, slots_BT, 0)
+
+    def _check_count(self, count: int, num_slots: int) -> None:
+        """Refuse an observation without objects, or with more than a history has room for."""
+        if not count and not num_slots:
+            raise PolicyError(
+                "the observation shows no object; there is nothing to act on. Check its segmentation, or the "
+                "detector and its min_score."
+            )
+        limit = MAX_PLACES // (len(VIEWS) if self.layout == "views" else 1) - 1
+        if count > limit:
+            raise PolicyError(
+                f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."
+            )
+
+    def _batch_false_positives(
+        self, episodes: "Sequence[PreprocessedEpisode]", steps: "_Steps", offsets: np.ndarray
+    ) -> FalsePositiveBatch:
+        crop_index = np.concatenate([episode.false_positives.crop_index for episode in episodes])
+        boxes = np.concatenate([episode.false_positives.boxes for episode in episodes]).astype(np.int64)
+        if self.layout == "frames":
+            points = np.zeros((len(boxes), len(VIEWS), 2))
+        else:
+            points = np.stack([unproject(boxes[:, v, :2], CAMERAS[view]) for v, view in enumerate(VIEWS)], 1)
+        crop_index = offset_index(crop_index, offsets[steps.b][:, None])
+        return FalsePositiveBatch(steps.pad(crop_index), steps.pad(boxes), steps.pad(points))
+
+    def _token_sequence(self, prompt: PreprocessedPrompt) -> "_TokenSequence":
+        """Lay out one prompt: words, and one token or several for each object of an image.
+
+        With layout "views" every image takes as many slots as the prompt's fullest one, as in the published
+        evaluation: T5 sees by them how far words and images are apart.
+        """
+        counts = tuple(prompt.objects_per_image.tolist())
+        in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
+        is_scene = prompt.is_scene[in_text]
+        if self.layout != "views":
+            layout = self._layout_of(prompt.text, counts, ())
+            objects = prompt.objects if layout.order is None else prompt.objects.select(layout.order)
+            return _TokenSequence(layout, objects, is_scene, None)
+        tables = prompt.objects.split(prompt.objects_per_image)
+        images = [tables[number] for number in in_text]
+        num_visible = np.array([image.masks.sum(axis=0) for image in images], np.int64).reshape(
+            -1, len(VIEWS)
+        )
+        slots = tuple(num_visible.max(axis=0, initial=0).tolist())
+        layout = self._layout_of(prompt.text, counts, slots)
+        padded = [_compact(image, max(slots)) for image in images]
+        objects = ObjectTable.concatenate(padded) if padded else prompt.objects.select(slice(0))
+        mask, is_image = layout.is_word.copy(), ~layout.is_word
+        mask[is_image] = objects.masks[layout.entries[is_image], layout.parts[is_image]]
+        return _TokenSequence(layout, objects, is_scene, mask)
+
+    def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
+        """Lay out a text whose images contain so many objects; few texts differ, so layouts are kept."""
+        key = (text, counts, slots)
+        if key not in self._layouts:
+            if len(self._layouts) >= MAX_LAYOUTS:
+                self._layouts.clear()
+            self._layouts[key] = self._lay_out(*key)
+        return self._layouts[key]
+
+    def _lay_out(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
+        tokens: list[tuple[int, int, int]] = []  # word, entry, part
+        starts, order, count = np.cumsum([0, *counts]), [], 0
+        sizes: list[int] = []  # rows of each image
+        for piece in split_prompt(text):
+            if isinstance(piece, str):
+                tokens += [(word, WORD, 0) for word in self.tokenizer.encode(piece)]
+                continue
+            order += range(starts[piece], starts[piece + 1])
+            sizes.append({"views": max(slots, default=0), "frames": 1, "objects": counts[piece]}[self.layout])
+            if self.layout == "views":
+                tokens += [(PADDING_ID, count + k, v) for v, size in enumerate(slots) for k in range(size)]
+            elif self.layout == "frames":
+                tokens += [(PADDING_ID, count, part) for part in range(self.tokens_per_frame_pair)]
+            else:
+                tokens += [(PADDING_ID, count + k, 0) for k in range(counts[piece])]
+            count += sizes[-1]
+        tokens.append((self.tokenizer.end_id, WORD, 0))
+        words, entries, parts = np.array(tokens).T
+        is_word, images = entries == WORD, np.repeat(np.arange(len(sizes)), sizes)
+        in_other_order = None if order == list(range(starts[-1])) else np.array(order)
+        return _Layout(words, np.maximum(entries, 0), parts, is_word, images, in_other_order)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """The tokens of a prompt: word, or row and part of its object.
+
+    `images` is the image of each row, counted in reading order; `order` the rows in reading order, None where
+    they are stored so.
+    """
+
+    words: np.ndarray
+    entries: np.ndarray
+    parts: np.ndarray
+    is_word: np.ndarray
+    images: np.ndarray
+    order: np.ndarray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TokenSequence:
+    """One prompt: its layout, its objects, which images are scenes, and which tokens count (None: all)."""
+
+    layout: _Layout
+    objects: ObjectTable
+    is_scene: np.ndarray
+    mask: np.ndarray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """Episode `b` and time `t` of each step, and which steps of a padded array exist, (B, T)."""
+
+    b: np.ndarray
+    t: np.ndarray
+    exists: np.ndarray
+
+    @staticmethod
+    def of(lengths: Sequence[int]) -> "_Steps":
+        """Number the steps of episodes of these lengths."""
+        exists = np.arange(max(lengths, default=0)) < np.array(lengths)[:, None]
+        b, t = np.nonzero(exists)
+        return _Steps(b, t, exists)
+
+    def pad(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
+        """Spread one row a step over an array of shape (B, T, …)."""
+        result = np.full((*self.exists.shape, *column.shape[1:]), fill, column.dtype)
+        result[self.b, self.t] = column
+        return result
+
+
+def _steps_and_slots(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Step and slot of each object, from the number of objects of each step."""
+    step = np.repeat(np.arange(len(counts)), counts)
+    return step, np.arange(len(step)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
+    """Sort the objects of each step in each view by itself: visible ones first, then by id."""
+    masks = objects.masks
+    order = np.stack([np.lexsort((objects.ids, ~masks[:, v], step)) for v in (FRONT, TOP)], axis=1)
+    return _reorder_views(objects, order)
+
+
+def _compact(image: ObjectTable, count: int) -> ObjectTable:
+    """Move the visible objects of an image to the front of each view, in so many slots."""
+    order = np.argsort(~image.masks, axis=0, kind="stable")[:count]
+    image = _reorder_views(image, order)
+    extra = count - len(image)
+
+    def pad(column: np.ndarray) -> np.ndarray:
+        return np.pad(column, [(0, extra)] + [(0, 0)] * (column.ndim - 1))
+
+    return ObjectTable(pad(image.ids), pad(image.crop_index), pad(image.boxes), pad(image.grasps))
+
+
+def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
+    """Reorder each view by itself, order (N, 2); a row need not be one object afterwards."""
+    views = np.arange(len(VIEWS))
+    return ObjectTable(
+        np.full(len(order), -1),
+        objects.crop_index[order, views],
+        objects.boxes[order, views],
+        objects.grasps[order, views],
+    )
+
+
+def _on_table(pixels: np.ndarray, from_top: np.ndarray) -> np.ndarray:
+    """Points under pixels of both views, shape (N, 2, 2): those of the top view where it shows the object."""
+    front = unproject(pixels[:, FRONT], CAMERAS["front"])
+    return np.where(from_top[:, None], unproject(pixels[:, TOP], CAMERAS["top"]), front)
