@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError, PolicyError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.families.midas import with_autoregression, with_visual_residual  # noqa: E402
 from openvima.policies.heads.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
@@ -23,7 +24,6 @@ from openvima.policies.heads.bins import NUM_BINS, BinsHead, decode_bins, encode
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training.dataset import Batch  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
 # One decoder, and cross-attention with the last slot, or with a query of its own, as the place to read from.
