@@ -195,7 +195,7 @@ def record_clip(job: RecordingJob, count: Callable[[int], None]) -> Clip:
     from openvima.video.recorder import SceneRenderer
 
     batch = job.batch
-    env = batch.setup.make(batch.task, batch.level, domain="eval", realtime=True)
+    env = batch.env_config.make(batch.task, batch.level, domain="eval", realtime=True)
     env.reset(seed=batch.first_seed)
     poster = png(Image.fromarray(SceneRenderer(env, enlarge=2).draw(env.scene)))
     prompt = tuple(part if isinstance(part, str) else png(thumbnail(part)) for part in env.prompt.sequence())
@@ -228,7 +228,7 @@ def command_of(config: EvaluationConfig) -> str:
         f"--levels {','.join(config.levels)}",
         f"--episodes {config.episodes}",
         f"--seed {config.seed}",
-        *config.setup.words(),
+        *config.env_config.words(),
         *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
         *([f"--ablations {','.join(config.ablations)}"] if config.ablations else []),
         *([f"--boxes {shlex.quote(config.boxes)}"] if config.boxes else []),
@@ -261,7 +261,7 @@ def _job(
         row.level,
         seed,
         1,
-        config.setup,
+        config.env_config,
         device=config.device,
         precision=config.precision or "",
     )

@@ -28,7 +28,7 @@ def save_task_gallery(
     folder: Path,
     *,
     tasks: Sequence[str] = (),
-    setup: EnvConfig = DEFAULT_ENV_CONFIG,
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG,
     seed: int = 0,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Path:
@@ -37,7 +37,7 @@ def save_task_gallery(
     Args:
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
         tasks: Names of tasks; by default all.
-        setup: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
         seed: First seed to try for each task; the first episode that the oracle solves is shown.
         report: Called with tasks done, tasks in all, and the task's name.
 
@@ -49,7 +49,7 @@ def save_task_gallery(
     specs = [task_spec(name) for name in tasks or list_tasks()]
     panels = []
     for number, spec in enumerate(specs):
-        env = setup.make(spec.name, spec.levels[0], domain="user")
+        env = env_config.make(spec.name, spec.levels[0], domain="user")
         solved = _first_solved(env, seed)
         save_episode_image(env, folder / f"{spec.name}.png", seed=solved)
         panels.append(_panel(env, spec.name, solved))

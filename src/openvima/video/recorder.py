@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from openvima.env.tabletop import FRAMES_PER_SECOND, Frame, TabletopEnv
+from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv, VideoFrame
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
 from openvima.sim.arm_view import arm_drawables
@@ -68,7 +68,7 @@ class EpisodeRecorder:
     ) -> None:
         self._renderer, self._title, self._width = SceneRenderer(env, enlarge), title, 256 * enlarge
         self._strip = draw_prompt_strip(env.prompt, width=self._width) if with_prompt else None
-        self._last = Frame(env.scene, HOME)
+        self._last = VideoFrame(env.scene, HOME)
         first = self._compose(_caption(title, self._width))
         self._video = VideoWriter(path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND)
         self._video.write(first, repeat=math.ceil(_STILL_START_S * FRAMES_PER_SECOND))
