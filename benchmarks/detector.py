@@ -26,8 +26,8 @@ import numpy as np
 import torch
 
 from openvima.data.records import rollout_oracle
-from openvima.detector import PACKAGED, detector_config, load_detector
-from openvima.detector.augment import augmented
+from openvima.detector import BUNDLED, detector_config, load_detector
+from openvima.detector.augmentation import augment_frame
 from openvima.detector.detector import FrameDetector
 from openvima.detector.frames import Frame, frame_of
 from openvima.detector.network import MaskRCNN
@@ -64,10 +64,10 @@ def frames_of(observation: dict[str, Any]) -> list[Frame]:
 
 def detector_to_measure(folder: Path | None, preset: str, objects: int) -> tuple[FrameDetector, str]:
     """Return a detector, and whose weights it has."""
-    if folder is not None or (preset == "small" and PACKAGED.is_dir()):
+    if folder is not None or (preset == "small" and BUNDLED.is_dir()):
         return load_detector(folder), "the package's" if folder is None else str(folder)
     torch.manual_seed(0)
-    network = MaskRCNN(replace(detector_config(preset), score=0.0, most=objects))
+    network = MaskRCNN(replace(detector_config(preset), score_threshold=0.0, max_detections=objects))
     return FrameDetector(network.eval()), f"random weights of {preset}"
 
 
@@ -83,7 +83,7 @@ def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
-        loss, _ = learner(FrameBatch.of([augmented(frame, rng) for frame in chosen], generator))
+        loss, _ = learner(FrameBatch.of([augment_frame(frame, rng) for frame in chosen], generator))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(learner.parameters(), DEFAULTS.optimizer.max_grad_norm)
         optimizer.step()

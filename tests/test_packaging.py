@@ -42,10 +42,10 @@ def test_a_wheel_holds_the_trained_detector_and_policy(project: Path, tmp_path: 
 
 def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
     pytest.importorskip("torch")
-    from openvima.detector import PACKAGED, load_detector
+    from openvima.detector import BUNDLED, load_detector
 
-    assert {file.name for file in PACKAGED.iterdir()} == {"model.safetensors", "config.yaml"}
-    assert sum(file.stat().st_size for file in PACKAGED.iterdir()) <= 8e6
+    assert {file.name for file in BUNDLED.iterdir()} == {"model.safetensors", "config.yaml"}
+    assert sum(file.stat().st_size for file in BUNDLED.iterdir()) <= 8e6
     assert load_detector().network.config
 
 

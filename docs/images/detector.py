@@ -16,10 +16,10 @@ import openvima
 from openvima.detector.anchors import pyramid_anchors
 from openvima.detector.config import FIRST_STRIDE, small
 from openvima.detector.frames import Frame, frame_of
-from openvima.detector.masks import cut_masks, paste_masks
+from openvima.detector.masks import crop_masks, paste_masks
 from openvima.detector.matching import match
-from openvima.detector.proposals import BACKGROUND_OVERLAP
 from openvima.detector.roi_align import box_levels
+from openvima.detector.rpn import BACKGROUND_IOU
 from openvima.render import channels_last
 from openvima.render.camera import FRONT
 from openvima.scene import FIRST_OBJECT_ID
@@ -46,9 +46,9 @@ def draw_anchors(axes: Any, shown: Frame) -> None:
     _, labels = match(
         torch.cat(levels),
         torch.from_numpy(shown.boxes),
-        low=BACKGROUND_OVERLAP,
-        high=sizes.anchor_overlap,
-        every_object=True,
+        low=BACKGROUND_IOU,
+        high=sizes.rpn_foreground_iou,
+        allow_low_quality=True,
     )
     parts = labels.split([len(level) for level in levels])
     for colour, level, own in zip(COLOURS, levels, parts, strict=True):
@@ -66,18 +66,18 @@ def draw_grids(axes: Any, shown: Frame) -> None:
         boxes, 3, canonical_size=sizes.canonical_size, canonical_level=sizes.canonical_level
     ).tolist()
     for (left, upper, right, lower), level in zip(shown.boxes.tolist(), levels, strict=True):
-        columns = np.linspace(left, right, sizes.box_size + 1)
-        rows = np.linspace(upper, lower, sizes.box_size + 1)
+        columns = np.linspace(left, right, sizes.box_pool_size + 1)
+        rows = np.linspace(upper, lower, sizes.box_pool_size + 1)
         axes.vlines(columns, upper, lower, COLOURS[level], linewidth=0.7)
         axes.hlines(rows, left, right, COLOURS[level], linewidth=0.7)
-    axes.set_title(f"2  RoIAlign: {sizes.box_size} × {sizes.box_size} cells a box", fontsize=9)
+    axes.set_title(f"2  RoIAlign: {sizes.box_pool_size} × {sizes.box_pool_size} cells a box", fontsize=9)
 
 
 def draw_masks(axes: Any, shown: Frame) -> None:
     """Masks after they were put on the grid of the mask head and back."""
     sizes = small()
     boxes = torch.from_numpy(shown.boxes)
-    grids = cut_masks(torch.from_numpy(shown.masks), boxes, size=2 * sizes.mask_size)
+    grids = crop_masks(torch.from_numpy(shown.masks), boxes, size=2 * sizes.mask_pool_size)
     pasted = paste_masks(grids.float(), boxes, height=FRONT.height, width=FRONT.width).numpy()
     for number, (mask, edges) in enumerate(zip(pasted, shown.boxes.tolist(), strict=True)):
         colour = np.array([int(COLOURS[number % 3][k : k + 2], 16) for k in (1, 3, 5)]) / 255
@@ -86,7 +86,7 @@ def draw_masks(axes: Any, shown: Frame) -> None:
         axes.imshow(overlay, extent=(0, FRONT.width, FRONT.height, 0))
         draw_box(axes, edges, COLOURS[number % 3])
     shared = (pasted & shown.masks).sum() / (pasted | shown.masks).sum()
-    side = 2 * sizes.mask_size
+    side = 2 * sizes.mask_pool_size
     axes.set_title(f"3  masks on {side} × {side} cells and back keep {100 * shared:.0f} %", fontsize=9)
 
 

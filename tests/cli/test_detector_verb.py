@@ -27,8 +27,15 @@ def data(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def tiny() -> DetectorConfig:
-    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, pyramid_width=8)
-    return DetectorConfig(backbone, (32.0,), box_widths=(8,), mask_widths=(8,), proposals=4, candidates=8)
+    backbone = BackboneConfig("basic", (1,), (8,), stem_width=4, stem_kernel=3, fpn_width=8)
+    return DetectorConfig(
+        backbone,
+        (32.0,),
+        box_head_widths=(8,),
+        mask_head_widths=(8,),
+        rpn_post_nms_top_n=4,
+        rpn_pre_nms_top_n=8,
+    )
 
 
 @pytest.fixture
@@ -38,7 +45,7 @@ def detector(tiny, tmp_path) -> Path:
     return tmp_path / "detector"
 
 
-def test_train_makes_a_run_that_evaluate_and_show_take(data, tiny, tmp_path, monkeypatch, capsys):
+def test_evaluate_and_show_accept_a_training_run(data, tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
     run = tmp_path / "run"
     words = ["--data", str(data), "--out", str(run), "--schedule.steps", "1", "--loader.batch-size", "2"]
@@ -58,14 +65,14 @@ def test_train_makes_a_run_that_evaluate_and_show_take(data, tiny, tmp_path, mon
     score = json.loads(capsys.readouterr().out)
     assert (score["detector"], score["data"], score["held_out"]) == (str(run), str(data), 0.4)
     assert score["frames"] == 4 and 0 <= score["boxes"]["ap50"] <= 1
-    picture = tmp_path / "seen.png"
-    words = [str(run), "--data", str(data), "--frames", "2", "--out", str(picture)]
+    image_file = tmp_path / "seen.png"
+    words = [str(run), "--data", str(data), "--frames", "2", "--out", str(image_file)]
     assert main(["detector", "show", *words]) == 0
-    with Image.open(picture) as shown:
+    with Image.open(image_file) as shown:
         assert shown.size[0] > 2 * 256
 
 
-def test_frames_of_a_level_are_played_where_no_folder_is_given(detector, capsys):
+def test_frames_of_a_level_are_generated_without_a_folder(detector, capsys):
     assert main(["detector", "evaluate", str(detector), "--level", "L4", "--frames", "2"]) == 0
     table = capsys.readouterr().out
     assert "AP50" in table and "boxes" in table and "masks" in table
@@ -74,18 +81,18 @@ def test_frames_of_a_level_are_played_where_no_folder_is_given(detector, capsys)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--data", "DATA", "--held-out", "0"], "no demonstration to look at"),
+        (["--data", "DATA", "--held-out", "0"], "no demonstrations to evaluate on"),
         (["--data", "DATA", "--held-out", "1.5"], "held-out is 1.5"),
         (["--data", "DATA", "--level", "L3"], "leave one of them out"),
         (["--data", "nowhere"], "there is no folder nowhere"),
         (["--held-out", "0.1", "--frames", "0"], r"frames is 0; .* no data are given"),
         (["--level", "L9"], "no level 'L9'"),
         (["--seed", "-1"], "seed is -1"),
-        (["--prompt-share", "7"], "prompt-share is 7"),
+        (["--prompt-prob", "7"], "prompt-prob is 7"),
         (["--device", "abacus"], "device 'abacus' cannot be used here"),
     ],
 )
-def test_what_cannot_be_looked_at_is_told_in_one_line(detector, data, capsys, words, message):
+def test_invalid_options_of_evaluate_give_a_one_line_error(detector, data, capsys, words, message):
     words = [str(data) if word == "DATA" else word for word in words]
     assert main(["detector", "evaluate", str(detector), *words]) == 2
     told = capsys.readouterr().err.strip().splitlines()[-1]
@@ -115,7 +122,7 @@ def test_convert_writes_a_folder_once(tiny, tmp_path, monkeypatch, capsys):
     assert main([*words, "--force"]) == 0
 
 
-def test_a_missing_detector_is_told_in_one_line(tmp_path, capsys):
+def test_a_missing_detector_gives_a_one_line_error(tmp_path, capsys):
     assert main(["detector", "show", str(tmp_path / "none")]) == 2
     assert "there is no folder" in capsys.readouterr().err
     assert main(["detector", "show", "--out", "seen.jpg"]) == 2

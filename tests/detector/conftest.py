@@ -23,10 +23,15 @@ def data(tmp_path_factory) -> Path:
 def tiny() -> DetectorConfig:
     """The smallest sizes that make sense."""
     backbone = BackboneConfig(
-        block="basic", depths=(1, 1), widths=(8, 16), stem_width=8, stem_kernel=3, pyramid_width=16
+        block="basic", depths=(1, 1), widths=(8, 16), stem_width=8, stem_kernel=3, fpn_width=16
     )
     return DetectorConfig(
-        backbone, anchor_sizes=(16.0, 32.0), box_widths=(32,), mask_widths=(16,), proposals=20, candidates=30
+        backbone,
+        anchor_sizes=(16.0, 32.0),
+        box_head_widths=(32,),
+        mask_head_widths=(16,),
+        rpn_post_nms_top_n=20,
+        rpn_pre_nms_top_n=30,
     )
 
 

@@ -1,9 +1,9 @@
-"""Anchors: a cell by hand, whole levels against a slow twin."""
+"""Anchors of a cell and of whole levels, against a naive implementation."""
 
 import numpy as np
 import pytest
 
-import slow_detection as slow
+import naive_detection as naive
 
 torch = pytest.importorskip("torch")
 from openvima.detector.anchors import cell_anchors, level_anchors, pyramid_anchors  # noqa: E402
@@ -16,12 +16,12 @@ def test_the_anchors_of_a_cell_have_one_area_and_three_shapes():
     assert np.allclose(cell_anchors(8.0), expected)
 
 
-def test_the_anchors_of_a_level_agree_with_the_slow_twin():
+def test_the_anchors_of_a_level_agree_with_the_naive_twin():
     made = level_anchors(20.0, stride=8, height=3, width=5)
-    assert np.allclose(made, slow.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
+    assert np.allclose(made, naive.anchors(20.0, stride=8, height=3, width=5), atol=1e-5)
 
 
 def test_strides_double_from_level_to_level():
     first, second = pyramid_anchors((16.0, 32.0), [(2, 4), (1, 2)], first_stride=4)
-    assert np.allclose(first, slow.anchors(16.0, stride=4, height=2, width=4), atol=1e-5)
-    assert np.allclose(second, slow.anchors(32.0, stride=8, height=1, width=2), atol=1e-5)
+    assert np.allclose(first, naive.anchors(16.0, stride=4, height=2, width=4), atol=1e-5)
+    assert np.allclose(second, naive.anchors(32.0, stride=8, height=1, width=2), atol=1e-5)

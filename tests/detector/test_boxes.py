@@ -1,14 +1,14 @@
-"""Overlaps, coding of boxes and suppression: small cases by hand, and slow twins."""
+"""Box IoU, regression targets and NMS against hand-computed cases and naive implementations."""
 
 import math
 
 import numpy as np
 import pytest
 
-import slow_detection as slow
+import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.boxes import clip, decode_boxes, encode_boxes, overlaps, suppress  # noqa: E402
+from openvima.detector.boxes import box_iou, clip_boxes, decode_boxes, encode_boxes, nms  # noqa: E402
 
 ROI_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
 
@@ -19,19 +19,19 @@ def random_boxes(count: int, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(np.concatenate([low, low + rng.uniform(1, 40, (count, 2))], axis=1))
 
 
-def test_overlaps_of_small_boxes_are_those_computed_by_hand():
+def test_iou_of_small_boxes():
     boxes = torch.tensor([[0.0, 0, 2, 2], [1, 1, 3, 3], [2, 0, 4, 2], [0, 0, 2, 1], [5, 5, 5, 9]])
     expected = [1, 1 / 7, 0, 1 / 2, 0]
-    assert overlaps(boxes[:1], boxes)[0].tolist() == pytest.approx(expected)
+    assert box_iou(boxes[:1], boxes)[0].tolist() == pytest.approx(expected)
 
 
-def test_overlaps_agree_with_the_slow_twin():
+def test_iou_agrees_with_the_naive_twin():
     first, second = random_boxes(30), random_boxes(20, 1)
-    expected = [[slow.overlap(a, b) for b in second.tolist()] for a in first.tolist()]
-    assert np.allclose(overlaps(first, second), expected, atol=1e-12)
+    expected = [[naive.box_iou(a, b) for b in second.tolist()] for a in first.tolist()]
+    assert np.allclose(box_iou(first, second), expected, atol=1e-12)
 
 
-def test_coding_of_a_small_case_is_that_computed_by_hand():
+def test_regression_targets_of_a_small_case():
     reference, box = torch.tensor([10.0, 20, 30, 60]), torch.tensor([20.0, 10, 60, 50])
     # centres (20, 40) and (40, 30), sizes (20, 40) and (40, 40)
     expected = [20 / 20, -10 / 40, math.log(2), 0.0]
@@ -40,39 +40,39 @@ def test_coding_of_a_small_case_is_that_computed_by_hand():
     assert encode_boxes(box, reference, ROI_WEIGHTS).tolist() == pytest.approx(weighted)
 
 
-def test_coding_agrees_with_the_slow_twin_and_is_undone_by_decoding():
+def test_coding_agrees_with_the_naive_twin_and_is_undone_by_decoding():
     boxes, references = random_boxes(50), random_boxes(50, 1)
-    coded = encode_boxes(boxes, references, ROI_WEIGHTS)
+    deltas = encode_boxes(boxes, references, ROI_WEIGHTS)
     pairs = zip(boxes.tolist(), references.tolist(), strict=True)
-    assert np.allclose(coded, [slow.encode(a, b, ROI_WEIGHTS) for a, b in pairs], atol=1e-9)
-    assert torch.allclose(decode_boxes(coded, references, ROI_WEIGHTS), boxes)
+    assert np.allclose(deltas, [naive.encode(a, b, ROI_WEIGHTS) for a, b in pairs], atol=1e-9)
+    assert torch.allclose(decode_boxes(deltas, references, ROI_WEIGHTS), boxes)
 
 
-def test_a_box_does_not_grow_beyond_all_bounds():
+def test_the_growth_of_a_box_is_limited():
     grown = decode_boxes(torch.tensor([0.0, 0, 500, 0]), torch.tensor([0.0, 0, 16, 16]), (1.0,) * 4)
     assert float(grown[2] - grown[0]) == pytest.approx(1000)
 
 
-def test_boxes_end_at_the_border():
-    assert clip(torch.tensor([[-3.0, 2, 40, 50]]), height=20, width=30).tolist() == [[0, 2, 30, 20]]
+def test_boxes_are_clipped_to_the_image():
+    assert clip_boxes(torch.tensor([[-3.0, 2, 40, 50]]), height=20, width=30).tolist() == [[0, 2, 30, 20]]
 
 
 def test_of_three_boxes_in_a_chain_the_middle_one_goes():
     # The second overlaps both others by more than a third; it goes, and the third one stays.
     boxes = torch.tensor([[0.0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]])
-    assert suppress(boxes, torch.tensor([0.9, 0.8, 0.7]), 0.3).tolist() == [0, 2]
-    assert suppress(boxes, torch.tensor([0.8, 0.9, 0.7]), 0.3).tolist() == [1]
+    assert nms(boxes, torch.tensor([0.9, 0.8, 0.7]), 0.3).tolist() == [0, 2]
+    assert nms(boxes, torch.tensor([0.8, 0.9, 0.7]), 0.3).tolist() == [1]
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.1, 0.3, 0.5, 0.7])
 @pytest.mark.parametrize("seed", range(5))
-def test_suppression_agrees_with_the_slow_twin(limit, seed):
+def test_nms_agrees_with_the_naive_twin(limit, seed):
     rng = np.random.default_rng(seed)
     boxes = random_boxes(80, seed)
     scores = rng.integers(0, 20, 80) / 20  # with ties
-    kept = suppress(boxes, torch.from_numpy(scores), limit)
-    assert kept.tolist() == slow.suppress(boxes.tolist(), scores.tolist(), limit, [0] * 80)
+    kept = nms(boxes, torch.from_numpy(scores), limit)
+    assert kept.tolist() == naive.nms(boxes.tolist(), scores.tolist(), limit, [0] * 80)
 
 
-def test_nothing_is_left_of_nothing():
-    assert suppress(torch.zeros(0, 4), torch.zeros(0), 0.5).tolist() == []
+def test_nms_of_no_boxes_is_empty():
+    assert nms(torch.zeros(0, 4), torch.zeros(0), 0.5).tolist() == []

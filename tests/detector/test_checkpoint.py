@@ -88,7 +88,7 @@ def test_weights_of_other_sizes_are_refused_by_name(tiny, tmp_path):
     save_network(MaskRCNN(tiny), tmp_path / "detector")
     file = tmp_path / "detector" / "config.yaml"
     values = yaml.safe_load(file.read_text())
-    values["config"]["box_widths"] = [33]
+    values["config"]["box_head_widths"] = [33]
     file.write_text(yaml.safe_dump(values))
     with pytest.raises(CheckpointError, match=re.escape("box_head.hidden.0.weight is float32 (32, 784)")):
         load_network(tmp_path / "detector")
@@ -141,7 +141,9 @@ def test_the_layout_of_detectron2_is_that_of_ours_name_by_name(foreign):
 def test_a_file_of_detectron2_is_read_and_finds_something(foreign, tmp_path):
     torch.save({"model": foreign, "iteration": 7}, tmp_path / "mask_rcnn.pth")
     network = load_detectron2(tmp_path / "mask_rcnn.pth")
-    network.config = replace(network.config, short_side=64, proposals=4, candidates=8, score=0.0)
+    network.config = replace(
+        network.config, min_size=64, rpn_post_nms_top_n=4, rpn_pre_nms_top_n=8, score_threshold=0.0
+    )
     (found,) = network(torch.randint(0, 256, (1, 3, 64, 96), dtype=torch.uint8))
     assert len(found.boxes) and found.masks.shape[1:] == (64, 96)
 
@@ -185,25 +187,25 @@ def test_settings_in_the_file_say_how_images_are_prepared(foreign, settings, tmp
     config = load_detectron2(saved(bare, settings, tmp_path / "with.pth", values)).config
     assert config == replace(
         resnet50(),
-        backbone=replace(resnet50().backbone, stride_first=False),
+        backbone=replace(resnet50().backbone, stride_in_1x1=False),
         num_classes=2,
-        colours="rgb",
-        short_side=None,
+        channel_order="rgb",
+        min_size=None,
         pixel_mean=(1.0, 2.0, 3.0),
         anchor_sizes=(8.0, 16.0, 32.0, 64.0, 128.0),
-        proposals=500,
-        score=0.5,
+        rpn_post_nms_top_n=500,
+        score_threshold=0.5,
     )
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"MODEL": {"ANCHOR_GENERATOR": {"OFFSET": 0.5}}}, "OFFSET is 0.5; only 0.0 is computed"),
-        ({"MODEL": {"ANCHOR_GENERATOR": {"SIZES": [[32, 64, 128, 256, 512]]}}}, "one of each level"),
+        ({"MODEL": {"ANCHOR_GENERATOR": {"OFFSET": 0.5}}}, "OFFSET is 0.5; only 0.0 is supported"),
+        ({"MODEL": {"ANCHOR_GENERATOR": {"SIZES": [[32, 64, 128, 256, 512]]}}}, "one per level"),
         ({"MODEL": {"ROI_BOX_HEAD": {"POOLER_TYPE": "ROIAlign"}}}, "only 'ROIAlignV2'"),
-        ({"INPUT": {"FORMAT": "YUV"}}, "order of colours 'yuv'"),
-        ({"MODEL": {"RPN": {"POST_NMS_TOPK_TEST": "many"}}}, "make no sense"),
+        ({"INPUT": {"FORMAT": "YUV"}}, "channel order 'yuv'"),
+        ({"MODEL": {"RPN": {"POST_NMS_TOPK_TEST": "many"}}}, "invalid settings"),
     ],
 )
 def test_settings_of_another_computation_are_refused(foreign, settings, tmp_path, values, message):

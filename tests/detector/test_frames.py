@@ -1,11 +1,11 @@
-"""Frames out of demonstrations, and what augmentation makes of them."""
+"""Annotated frames of demonstrations, and their augmentation."""
 
 import numpy as np
 import pytest
 
 from openvima.data import Dataset
-from openvima.detector.augment import augmented, mirrored, recoloured
-from openvima.detector.frames import FrameSource, frame_of, held_out_frames
+from openvima.detector.augmentation import augment_frame, flip_horizontally, mix_channels
+from openvima.detector.frames import FrameSampler, frame_of, held_out_frames
 from openvima.perception.objects import observe, observe_prompt_image
 
 
@@ -21,7 +21,7 @@ def test_boxes_reach_from_the_first_pixel_to_the_end_of_the_last():
 def test_frames_show_the_objects_that_policies_see(data):
     dataset = Dataset(data)
     for episode in range(len(dataset)):
-        front, top = FrameSource(dataset, prompt_share=0.0).draw(episode, np.random.default_rng(0))
+        front, top = FrameSampler(dataset, prompt_prob=0.0).sample(episode, np.random.default_rng(0))
         demo = dataset[episode]
         moments = [t for t, rgb in enumerate(demo.rgb["front"]) if np.array_equal(rgb, front.rgb)]
         observation = {
@@ -38,16 +38,16 @@ def test_frames_show_the_objects_that_policies_see(data):
 
 def test_frames_of_prompts_show_the_objects_that_policies_see(data):
     dataset = Dataset(data)
-    source = FrameSource(dataset, prompt_share=1.0)
+    source = FrameSampler(dataset, prompt_prob=1.0)
     for episode in range(len(dataset)):
-        front, _ = source.draw(episode, np.random.default_rng(1))
+        front, _ = source.sample(episode, np.random.default_rng(1))
         images = dataset[episode].prompt.images.values()
         (image,) = [image for image in images if np.array_equal(image.rgb["front"], front.rgb)][:1]
         assert len(front.boxes) == observe_prompt_image(image).masks[0].sum()
 
 
 def test_held_out_frames_are_the_same_for_the_same_seed(data):
-    source = FrameSource(Dataset(data))
+    source = FrameSampler(Dataset(data))
     first, again = (list(held_out_frames(source, 10, seed=3)) for _ in range(2))
     assert len(first) == 10
     assert all(np.array_equal(a.rgb, b.rgb) for a, b in zip(first, again, strict=True))
@@ -56,15 +56,15 @@ def test_held_out_frames_are_the_same_for_the_same_seed(data):
 
 def test_some_episodes_only(data):
     dataset = Dataset(data)
-    some, every = FrameSource(dataset, np.array([4])), FrameSource(dataset)
+    some, every = FrameSampler(dataset, np.array([4])), FrameSampler(dataset)
     assert len(some) == 1
-    ours, theirs = some.draw(0, np.random.default_rng(0)), every.draw(4, np.random.default_rng(0))
+    ours, theirs = some.sample(0, np.random.default_rng(0)), every.sample(4, np.random.default_rng(0))
     assert np.array_equal(ours[0].rgb, theirs[0].rgb)
 
 
 def test_mirroring_twice_changes_nothing_and_once_moves_boxes_with_masks(rectangles):
     frame = rectangles()
-    once, twice = mirrored(frame), mirrored(mirrored(frame))
+    once, twice = flip_horizontally(frame), flip_horizontally(flip_horizontally(frame))
     assert np.array_equal(twice.rgb, frame.rgb) and np.array_equal(twice.boxes, frame.boxes)
     for box, mask in zip(once.boxes.astype(int), once.masks, strict=True):
         assert mask[box[1] : box[3], box[0] : box[2]].all()
@@ -74,7 +74,7 @@ def test_mirroring_twice_changes_nothing_and_once_moves_boxes_with_masks(rectang
 def test_only_objects_change_colour(rectangles):
     frame = rectangles()
     rng = np.random.default_rng(0)
-    changed = [augmented(frame, rng) for _ in range(20)]
+    changed = [augment_frame(frame, rng) for _ in range(20)]
     assert all((one.rgb[:, ~one.masks.any(axis=0)] == 51).all() for one in changed)
     assert any(not np.array_equal(np.unique(one.rgb), np.unique(frame.rgb)) for one in changed)
     assert np.array_equal(frame.rgb, rectangles().rgb)  # left as it was
@@ -83,13 +83,13 @@ def test_only_objects_change_colour(rectangles):
 def test_one_colour_becomes_one_colour_and_two_stay_two():
     pixels = np.array([[200, 200, 10], [40, 40, 90], [0, 0, 255]], np.uint8)
     for seed in range(20):
-        mixed = recoloured(pixels, np.random.default_rng(seed))
+        mixed = mix_channels(pixels, np.random.default_rng(seed))
         assert np.array_equal(mixed[:, 0], mixed[:, 1])
         assert not np.array_equal(mixed[:, 0], mixed[:, 2])
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_equal_generators_draw_equal_frames(data, seed):
-    source = FrameSource(Dataset(data))
-    first, second = (source.draw(2, np.random.default_rng(seed)) for _ in range(2))
+def test_equal_generators_sample_equal_frames(data, seed):
+    source = FrameSampler(Dataset(data))
+    first, second = (source.sample(2, np.random.default_rng(seed)) for _ in range(2))
     assert np.array_equal(first[0].rgb, second[0].rgb)

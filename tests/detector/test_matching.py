@@ -1,4 +1,4 @@
-"""Which object a box is to learn, and which boxes a loss looks at."""
+"""Assignment of objects to boxes, and sampling of boxes."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from openvima.detector.matching import match, subsample  # noqa: E402
 OBJECTS = torch.tensor([[0.0, 0, 10, 10], [50, 50, 60, 60]])
 
 
-def test_boxes_are_objects_background_or_neither():
+def test_boxes_are_foreground_background_or_ignored():
     boxes = torch.tensor(
         [[0.0, 0, 10, 8], [0, 0, 10, 5], [0, 0, 5, 4], [50, 50, 61, 60]]
     )  # 0.8, 0.5, 0.2, 0.91
@@ -17,26 +17,26 @@ def test_boxes_are_objects_background_or_neither():
     assert numbers.tolist() == [0, 0, 0, 1]
 
 
-def test_every_object_is_learnt_by_its_best_boxes_if_so_wanted():
+def test_low_quality_matches_label_the_best_boxes_of_each_object():
     boxes = torch.tensor([[0.0, 0, 10, 2], [0, 0, 2, 10], [0, 0, 1, 1], [50, 50, 60, 60]])
-    _, labels = match(boxes, OBJECTS, low=0.3, high=0.7, every_object=True)
+    _, labels = match(boxes, OBJECTS, low=0.3, high=0.7, allow_low_quality=True)
     assert labels.tolist() == [1, 1, 0, 1]
 
 
 def test_without_objects_everything_is_background():
-    numbers, labels = match(OBJECTS, torch.zeros(0, 4), low=0.3, high=0.7, every_object=True)
+    numbers, labels = match(OBJECTS, torch.zeros(0, 4), low=0.3, high=0.7, allow_low_quality=True)
     assert numbers.tolist() == labels.tolist() == [0, 0]
 
 
-def test_an_object_that_no_box_touches_makes_no_box_its_own():
-    _, labels = match(OBJECTS[:1], OBJECTS[1:], low=0.3, high=0.7, every_object=True)
+def test_an_object_without_intersecting_box_matches_none():
+    _, labels = match(OBJECTS[:1], OBJECTS[1:], low=0.3, high=0.7, allow_low_quality=True)
     assert labels.tolist() == [0]
 
 
-def test_boxes_are_drawn_at_random_with_a_share_of_objects():
+def test_boxes_are_sampled_with_a_fraction_of_foreground():
     labels = torch.tensor([1] * 10 + [0] * 50 + [-1] * 5)
     draw = lambda seed: subsample(  # noqa: E731
-        labels, count=20, positive_share=0.25, generator=torch.Generator().manual_seed(seed)
+        labels, count=20, positive_fraction=0.25, generator=torch.Generator().manual_seed(seed)
     )
     positive, negative = draw(0)
     assert (labels[positive] == 1).all() and (labels[negative] == 0).all()
@@ -44,7 +44,7 @@ def test_boxes_are_drawn_at_random_with_a_share_of_objects():
     assert torch.equal(draw(0)[1], negative) and not torch.equal(draw(1)[1], negative)
 
 
-def test_where_objects_are_few_background_fills_up():
+def test_background_replaces_missing_foreground():
     labels = torch.tensor([1] + [0] * 50)
-    positive, negative = subsample(labels, count=20, positive_share=0.5, generator=torch.Generator())
+    positive, negative = subsample(labels, count=20, positive_fraction=0.5, generator=torch.Generator())
     assert (len(positive), len(negative)) == (1, 19)

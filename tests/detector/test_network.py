@@ -1,4 +1,4 @@
-"""The whole network: what it gives, that it learns, and that padding and folding change nothing."""
+"""The network: inference, training losses, padding, resizing and fused batch normalisation."""
 
 from dataclasses import replace
 
@@ -8,8 +8,8 @@ from PIL import Image
 
 torch = pytest.importorskip("torch")
 from openvima.detector.config import resnet50, small  # noqa: E402
-from openvima.detector.detector import FrameDetector, detections_of, folded  # noqa: E402
-from openvima.detector.network import MaskRCNN, Objects, prepared_size  # noqa: E402
+from openvima.detector.detector import FrameDetector, fuse_batch_norm, to_detections  # noqa: E402
+from openvima.detector.network import Instances, MaskRCNN, resized_shape  # noqa: E402
 from openvima.errors import ShapeError  # noqa: E402
 from openvima.policies.detection import DetectedObjects  # noqa: E402
 
@@ -26,8 +26,10 @@ def images(count: int, height: int = 64, width: int = 96) -> torch.Tensor:
     return torch.randint(0, 256, (count, 3, height, width), dtype=torch.uint8, generator=generator)
 
 
-def objects_of(frame) -> Objects:
-    return Objects(torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes)))
+def objects_of(frame) -> Instances:
+    return Instances(
+        torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes))
+    )
 
 
 @pytest.fixture
@@ -48,7 +50,7 @@ def trained(tiny, rectangles):
     return network.eval()
 
 
-def test_a_trained_network_finds_what_is_there(trained, rectangles):
+def test_a_trained_network_detects_rectangles(trained, rectangles):
     detector = FrameDetector(trained)
     for seed in range(10_000, 10_005):
         frame = rectangles(seed)
@@ -67,13 +69,13 @@ def test_every_weight_gets_a_gradient(tiny, rectangles):
     losses = network.losses(
         images(2), [objects_of(rectangles(k)) for k in range(2)], sampled=16, generator=torch.Generator()
     )
-    assert set(losses) == {"proposal_score", "proposal_box", "kind", "box", "mask"}
+    assert set(losses) == {"rpn_objectness", "rpn_box", "class", "box", "mask"}
     torch.stack(list(losses.values())).sum().backward()
     assert all(parameter.grad is not None for parameter in network.parameters())
 
 
-def test_frames_without_objects_have_losses_too(tiny):
-    nothing = Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96, dtype=torch.bool), torch.zeros(0))
+def test_losses_are_finite_without_objects(tiny):
+    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96, dtype=torch.bool), torch.zeros(0))
     losses = made(tiny).losses(images(2), [nothing, nothing], sampled=16, generator=torch.Generator())
     assert all(torch.isfinite(loss) for loss in losses.values())
     assert losses["mask"] == losses["box"] == 0
@@ -88,7 +90,7 @@ def test_equal_seeds_give_equal_losses(tiny, rectangles):
     assert loss(0) == loss(0) != loss(1)
 
 
-def test_an_image_of_a_batch_gives_what_it_gives_alone(tiny):
+def test_detections_do_not_depend_on_the_batch(tiny):
     network = made(tiny)
     batch = images(3)
     alone = [network(batch[k : k + 1])[0] for k in range(3)]
@@ -98,86 +100,86 @@ def test_an_image_of_a_batch_gives_what_it_gives_alone(tiny):
 
 
 def test_images_of_odd_sizes_are_padded_and_boxes_stay_inside(tiny):
-    (found,) = made(replace(tiny, score=0.0))(images(1, 61, 83))
+    (found,) = made(replace(tiny, score_threshold=0.0))(images(1, 61, 83))
     assert found.masks.shape[1:] == (61, 83)
     assert len(found.boxes) and (found.boxes >= 0).all()
     assert (found.boxes[:, 2] <= 83).all() and (found.boxes[:, 3] <= 61).all()
 
 
 def test_enlarged_images_give_boxes_in_pixels_of_the_image(tiny):
-    (found,) = made(replace(tiny, score=0.0, short_side=128, colours="bgr"))(images(1))
+    (found,) = made(replace(tiny, score_threshold=0.0, min_size=128, channel_order="bgr"))(images(1))
     assert len(found.boxes) and (found.boxes[:, 2] <= 96).all() and (found.boxes[:, 3] <= 64).all()
     assert found.boxes[:, 2].max() > 48
 
 
 @pytest.mark.parametrize(("height", "width"), [(128, 256), (480, 640), (1080, 1920), (333, 500), (801, 800)])
-def test_images_are_enlarged_to_the_size_that_detectron2_gives_them(height, width):
-    # Its rule in its own words: first the shorter side, then the longer one, then halves upwards.
+def test_resized_shapes_equal_those_of_detectron2(height, width):
+    # Detectron2 scales the shorter side, then limits the longer one, then rounds halves up.
     low, high = 800.0, 800.0 * max(height, width) / min(height, width)
     shrink = min(1.0, 1333 / high)
     short, long = int(low * shrink + 0.5), int(high * shrink + 0.5)
-    assert prepared_size(resnet50(), height, width) == ((short, long) if height < width else (long, short))
+    assert resized_shape(resnet50(), height, width) == ((short, long) if height < width else (long, short))
 
 
 def test_a_frame_is_enlarged_to_667_by_1333_pixels():
-    assert prepared_size(resnet50(), 128, 256) == (667, 1333)
-    assert prepared_size(small(), 128, 256) == (128, 256)
+    assert resized_shape(resnet50(), 128, 256) == (667, 1333)
+    assert resized_shape(small(), 128, 256) == (128, 256)
 
 
-@pytest.mark.parametrize("short_side", [30, 100])
-def test_images_are_resized_as_pillow_does(tiny, short_side):
-    network = made(replace(tiny, short_side=short_side, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
-    prepared, scale, (height, width) = network._prepare(images(1))
-    picture = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
-    expected = np.asarray(picture.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
+@pytest.mark.parametrize("min_size", [30, 100])
+def test_images_are_resized_as_pillow_does(tiny, min_size):
+    network = made(replace(tiny, min_size=min_size, pixel_mean=(0.0,) * 3, pixel_std=(1.0,) * 3))
+    prepared, scale, (height, width) = network._preprocess(images(1))
+    image = Image.fromarray(images(1)[0].permute(1, 2, 0).numpy())
+    expected = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR)).transpose(2, 0, 1)
     assert np.abs(prepared[0, :, :height, :width].numpy() - expected).max() <= 1  # it counts in integers
     assert scale.tolist() == pytest.approx([width / 96, height / 64] * 2)
 
 
-def test_edges_grow_in_each_direction_by_as_much_as_the_image(tiny):
+def test_boxes_are_scaled_per_axis(tiny):
     # 64 × 96 pixels become 10 × 15 in both, but 65 × 96 do not grow evenly.
-    network = made(replace(tiny, short_side=10))
-    _, scale, size = network._prepare(images(1, 65, 96))
+    network = made(replace(tiny, min_size=10))
+    _, scale, size = network._preprocess(images(1, 65, 96))
     assert size == (10, 15)
     assert scale.tolist() == pytest.approx([15 / 96, 10 / 65] * 2)
 
 
-def test_folding_batch_normalisation_changes_nothing(tiny):
-    network = made(replace(tiny, score=0.0)).train()
-    network.losses(images(4), [Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))] * 4,
-                   sampled=8, generator=torch.Generator())  # moves the statistics  # fmt: skip
+def test_fusing_batch_normalisation_keeps_the_detections(tiny):
+    network = made(replace(tiny, score_threshold=0.0)).train()
+    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
+    network.losses(images(4), [nothing] * 4, sampled=8, generator=torch.Generator())  # moves the statistics
     network.eval()
-    (plain,), (without,) = network(images(1)), folded(network)(images(1))
+    (plain,), (without,) = network(images(1)), fuse_batch_norm(network)(images(1))
     assert torch.allclose(plain.scores, without.scores, atol=1e-5)
     assert torch.allclose(plain.boxes, without.boxes, atol=1e-3)
 
 
-def test_the_better_of_two_kinds_counts(tiny):
-    (found,) = made(replace(tiny, num_classes=3, score=0.0))(images(1))
+def test_proposals_count_for_their_best_class(tiny):
+    (found,) = made(replace(tiny, num_classes=3, score_threshold=0.0))(images(1))
     assert len(found.boxes)
 
 
-def test_masks_are_those_of_the_kind_that_counts(tiny):
-    network = made(replace(tiny, num_classes=3, score=0.0))
+def test_masks_are_those_of_the_best_class(tiny):
+    network = made(replace(tiny, num_classes=3, score_threshold=0.0))
     with torch.no_grad():
-        network.box_head.kinds.bias.copy_(torch.tensor([0.0, 20.0, 0.0, 0.0]))
-        network.mask_head.masks.bias.copy_(torch.tensor([20.0, -20.0, 20.0]))  # all of the box, or nothing
+        network.box_head.class_logits.bias.copy_(torch.tensor([0.0, 20.0, 0.0, 0.0]))
+        network.mask_head.mask_logits.bias.copy_(torch.tensor([20.0, -20.0, 20.0]))  # full or empty masks
     (found,) = network(images(1))
     assert len(found.masks) and not found.masks.any()
 
 
-def test_where_nothing_is_proposed_nothing_is_found(tiny, monkeypatch):
+def test_no_proposals_give_no_detections(tiny, monkeypatch):
     network = made(tiny)
-    monkeypatch.setattr(network.proposals, "propose", lambda *_, **__: [torch.zeros(0, 4)])
+    monkeypatch.setattr(network.rpn, "propose", lambda *_, **__: [torch.zeros(0, 4)])
     (found,) = network(images(1))
     assert found.masks.shape == (0, 64, 96)
 
 
-def test_frozen_norms_stay_as_they_are(tiny):
-    config = replace(tiny, backbone=replace(tiny.backbone, frozen_norms=True))
+def test_frozen_batch_normalisation_keeps_its_statistics(tiny):
+    config = replace(tiny, backbone=replace(tiny.backbone, frozen_batch_norm=True))
     network = MaskRCNN(config).train()
     before = network.backbone.stem.norm.running_mean.clone()
-    nothing = Objects(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
+    nothing = Instances(torch.zeros(0, 4), torch.zeros(0, 64, 96).bool(), torch.zeros(0))
     network.losses(images(2), [nothing] * 2, sampled=8, generator=torch.Generator())
     assert torch.equal(network.backbone.stem.norm.running_mean, before)
 
@@ -194,21 +196,21 @@ def test_the_published_architecture_has_the_published_number_of_weights():
     assert round(sum(parameter.numel() for parameter in network.parameters()) / 1e6, 1) == 44.4
 
 
-def test_edges_become_the_pixels_that_they_cover():
-    found = Objects(
+def test_boxes_are_converted_to_covered_pixels():
+    found = Instances(
         torch.tensor([[2.4, 3.6, 10.4, 9.6], [95.8, 0.0, 96.0, 64.0]]),
         torch.zeros(2, 64, 96, dtype=torch.bool),
         torch.tensor([0.9, 0.8]),
     )
-    assert detections_of(found).boxes.tolist() == [[2, 4, 9, 9], [95, 0, 95, 63]]
+    assert to_detections(found).boxes.tolist() == [[2, 4, 9, 9], [95, 0, 95, 63]]
 
 
-def test_policies_take_the_detector_for_a_extractor(tiny):
+def test_the_detector_serves_as_an_extractor(tiny):
     extractor = DetectedObjects(FrameDetector(made(tiny)), min_score=0.0)
     rgb = {view: images(1, 128, 256)[0].numpy() for view in ("front", "top")}
     assert len(extractor.in_observation({"rgb": rgb, "ee": 0})) > 0
 
 
-def test_an_image_of_another_kind_is_refused(tiny):
+def test_an_image_of_another_layout_is_rejected(tiny):
     with pytest.raises(ShapeError, match="uint8"):
         FrameDetector(made(tiny)).detect(np.zeros((128, 256, 3), np.uint8), "top")

@@ -1,12 +1,12 @@
-"""RoIAlign and pasting of masks: small cases by hand, and slow twins."""
+"""RoIAlign and mask pasting against hand-computed cases and naive implementations."""
 
 import numpy as np
 import pytest
 
-import slow_detection as slow
+import naive_detection as naive
 
 torch = pytest.importorskip("torch")
-from openvima.detector.masks import cut_masks, paste_masks  # noqa: E402
+from openvima.detector.masks import crop_masks, paste_masks  # noqa: E402
 from openvima.detector.roi_align import box_levels, pyramid_align, roi_align  # noqa: E402
 
 
@@ -15,10 +15,10 @@ def ramp(height: int, width: int) -> torch.Tensor:
     return (10.0 * torch.arange(height)[:, None] + torch.arange(width)).double()[None, None]
 
 
-def cut(features, boxes, *, size, stride=1.0, samples=2, images=None) -> torch.Tensor:
+def cut(features, boxes, *, size, stride=1.0, sampling_ratio=2, images=None) -> torch.Tensor:
     boxes = torch.tensor(boxes, dtype=torch.float64)
     images = torch.zeros(len(boxes), dtype=torch.int64) if images is None else torch.tensor(images)
-    return roi_align(features, boxes, images, size=size, stride=stride, samples=samples)
+    return roi_align(features, boxes, images, size=size, stride=stride, sampling_ratio=sampling_ratio)
 
 
 def test_cells_of_a_ramp_have_the_values_at_their_centres():
@@ -28,29 +28,35 @@ def test_cells_of_a_ramp_have_the_values_at_their_centres():
 
 
 def test_one_cell_on_one_pixel_is_that_pixel():
-    (cells,) = cut(ramp(5, 5), [[3.0, 1, 4, 2]], size=1, samples=1)
+    (cells,) = cut(ramp(5, 5), [[3.0, 1, 4, 2]], size=1, sampling_ratio=1)
     assert cells.item() == 13
 
 
-def test_what_lies_outside_is_zero_beyond_one_pixel():
+def test_samples_more_than_one_pixel_outside_are_zero():
     features = torch.ones(1, 1, 4, 4, dtype=torch.float64)
-    (cells,) = cut(features, [[-4.0, 0, 4, 4]], size=4, samples=1)  # columns of 2 at -3.5, -1.5, 0.5, 2.5
+    (cells,) = cut(
+        features, [[-4.0, 0, 4, 4]], size=4, sampling_ratio=1
+    )  # columns of 2 at -3.5, -1.5, 0.5, 2.5
     assert cells[0].tolist() == [[0, 0, 1, 1]] * 4
 
 
-@pytest.mark.parametrize("samples", [0, 1, 2, 3])
+@pytest.mark.parametrize("sampling_ratio", [0, 1, 2, 3])
 @pytest.mark.parametrize("stride", [1.0, 4.0])
-def test_it_agrees_with_the_slow_twin(samples, stride):
-    rng = np.random.default_rng(int(10 * stride) + samples)
+def test_it_agrees_with_the_naive_twin(sampling_ratio, stride):
+    rng = np.random.default_rng(int(10 * stride) + sampling_ratio)
     features = torch.from_numpy(rng.normal(size=(2, 3, 9, 14)))
     low = rng.uniform(-4, 10, (12, 2)) * stride
     boxes = np.concatenate([low, low + rng.uniform(0.1, 16, (12, 2)) * stride], axis=1)
     images = rng.integers(0, 2, 12)
-    cells = cut(features, boxes.tolist(), size=3, stride=stride, samples=samples, images=images.tolist())
+    cells = cut(
+        features, boxes.tolist(), size=3, stride=stride, sampling_ratio=sampling_ratio, images=images.tolist()
+    )
     for number, (box, image) in enumerate(zip(boxes.tolist(), images.tolist(), strict=True)):
         for channel in range(3):
             plane = features[image, channel].numpy()
-            expected = slow.roi_align(plane, tuple(box), size=3, stride=stride, samples=samples)
+            expected = naive.roi_align(
+                plane, tuple(box), size=3, stride=stride, sampling_ratio=sampling_ratio
+            )
             assert np.allclose(cells[number, channel], expected, atol=1e-12)
 
 
@@ -63,46 +69,46 @@ def test_its_gradient_is_that_of_finite_differences():
 
 def test_no_boxes_give_no_cells():
     assert roi_align(
-        ramp(4, 4), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), size=2, stride=1, samples=2
+        ramp(4, 4), torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), size=2, stride=1, sampling_ratio=2
     ).shape == (0, 1, 2, 2)
 
 
-def test_boxes_are_cut_out_of_the_level_that_fits_their_size():
+def test_the_pyramid_level_follows_from_the_size_of_a_box():
     sides = torch.tensor([5.0, 23.9, 24, 47.9, 48, 96, 500])
     boxes = torch.stack([sides * 0, sides * 0, sides, sides], dim=1)
     levels = box_levels(boxes, 3, canonical_size=48, canonical_level=1)
     assert levels.tolist() == [0, 0, 0, 0, 1, 2, 2]
 
 
-def test_a_pyramid_gives_each_box_what_its_own_level_gives():
+def test_pyramid_align_equals_roi_align_on_the_level_of_each_box():
     levels = [torch.randn(1, 2, 32 // 2**k, 32 // 2**k, dtype=torch.float64) for k in range(3)]
     boxes = torch.tensor([[0.0, 0, 100, 100], [3, 5, 20, 30], [10, 10, 70, 60]], dtype=torch.float64)
     images = torch.zeros(3, dtype=torch.int64)
     whole = pyramid_align(
-        levels, boxes, images, size=3, samples=2, first_stride=4, canonical_size=48, canonical_level=1
+        levels, boxes, images, size=3, sampling_ratio=2, first_stride=4, canonical_size=48, canonical_level=1
     )
     for number, level in ((0, 2), (1, 0), (2, 1)):
         one = boxes[number : number + 1]
-        (expected,) = roi_align(levels[level], one, images[:1], size=3, stride=4 * 2**level, samples=2)
+        (expected,) = roi_align(levels[level], one, images[:1], size=3, stride=4 * 2**level, sampling_ratio=2)
         assert torch.equal(whole[number], expected)
 
 
-def test_pasted_masks_agree_with_the_slow_twin():
+def test_pasted_masks_agree_with_the_naive_twin():
     rng = np.random.default_rng(0)
-    shares = rng.uniform(0, 1, (6, 5, 5))
+    probabilities = rng.uniform(0, 1, (6, 5, 5))
     low = rng.uniform(-4, 20, (6, 2))
     boxes = np.concatenate([low, low + rng.uniform(0.5, 15, (6, 2))], axis=1)
-    pasted = paste_masks(torch.from_numpy(shares), torch.from_numpy(boxes), height=24, width=30)
+    pasted = paste_masks(torch.from_numpy(probabilities), torch.from_numpy(boxes), height=24, width=30)
     for number, box in enumerate(boxes.tolist()):
-        expected = slow.paste(shares[number], tuple(box), height=24, width=30)
+        expected = naive.paste(probabilities[number], tuple(box), height=24, width=30)
         assert np.array_equal(pasted[number].numpy(), expected)
 
 
-def test_a_mask_survives_being_cut_and_pasted():
+def test_cropping_and_pasting_keeps_a_mask():
     mask = torch.zeros(1, 40, 50, dtype=torch.bool)
     mask[0, 10:30, 5:15] = True
     mask[0, 20:30, 5:35] = True
     box = torch.tensor([[5.0, 10, 35, 30]])
-    cells = cut_masks(mask, box, size=28)
+    cells = crop_masks(mask, box, size=28)
     again = paste_masks(cells.float(), box, height=40, width=50)
     assert (again & mask).sum() / (again | mask).sum() > 0.95

@@ -53,7 +53,7 @@ def test_a_run_leaves_a_detector_and_its_metrics(settings):
     seen = []
     run = train_detector(settings, lambda *progress: seen.append(progress))
     assert seen[-1][:2] == (2, 2)
-    names = {"loss", *(f"loss/{name}" for name in ("proposal_score", "proposal_box", "kind", "box", "mask"))}
+    names = {"loss", *(f"loss/{name}" for name in ("rpn_objectness", "rpn_box", "class", "box", "mask"))}
     trained = [line for line in lines(run) if "loss" in line]
     held_out = [line for line in lines(run) if "validation_loss" in line]
     assert names <= trained[-1].keys() and {f"validation_{name}" for name in names} <= held_out[-1].keys()
@@ -134,12 +134,13 @@ def test_other_settings_do_not_continue_a_run(settings):
 
 def test_training_begins_with_the_weights_of_another_detector(settings, tiny, tmp_path):
     torch.manual_seed(5)
-    first = MaskRCNN(replace(tiny, proposals=7))
+    first = MaskRCNN(replace(tiny, rpn_post_nms_top_n=7))
     save_network(first, tmp_path / "first")
     optimizer = replace(settings.optimizer, learning_rate=0.0)
     run = train_detector(replace(settings, init_from=tmp_path / "first", optimizer=optimizer))
-    assert load_network(run).config.proposals == 7
-    assert torch.equal(weights(run)["box_head.kinds.weight"], first.state_dict()["box_head.kinds.weight"])
+    assert load_network(run).config.rpn_post_nms_top_n == 7
+    name = "box_head.class_logits.weight"
+    assert torch.equal(weights(run)[name], first.state_dict()[name])
 
 
 def test_every_demonstration_is_on_one_side_and_stays_there(data):

@@ -16,7 +16,7 @@ from noisy_extractor import HOOK, Clumsy  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
-from openvima.detector.hooks import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
+from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import ObjectViews  # noqa: E402

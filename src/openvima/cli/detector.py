@@ -1,4 +1,4 @@
-"""Train, score and look at the detector, which finds objects in pixels instead of by the segmentation."""
+"""Train, evaluate, visualise and convert the detector, which finds objects in pixels."""
 
 import json
 import sys
@@ -15,14 +15,14 @@ from openvima.cli.progress import Report, progress_bar
 from openvima.training.detector import DetectorTrainingConfig  # tyro reads its fields
 
 if TYPE_CHECKING:
-    from openvima.detector.frames import Frame, FrameSource
-    from openvima.detector.scoring import DetectorScore, Precision
+    from openvima.detector.coco_eval import CocoEvaluation
+    from openvima.detector.frames import Frame, FrameSampler
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Folder = Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DETECTOR")]
 Training = Annotated[DetectorTrainingConfig, tyro.conf.arg(name="")]
-LEVEL = "L3"  # whose objects and textures training never shows
-FRAMES_PER_EPISODE = 2  # one moment in both views
+LEVEL = "L3"  # with objects and textures that are not in the training set
+FRAMES_PER_EPISODE = 2  # one time step in both views
 
 
 def train(config: Training) -> int:
@@ -49,50 +49,49 @@ def evaluate(
     level: str | None = None,
     frames: int = 400,
     held_out: float | None = None,
-    prompt_share: float = 0.25,
+    prompt_prob: float = 0.25,
     seed: int = 0,
     device: str = "cpu",
     as_json: Json = False,
 ) -> int:
-    """Score a detector with COCO's metrics, whatever the kind of object.
+    """Evaluate a detector with class-agnostic COCO metrics.
 
     Example: openvima detector evaluate detector --level L3
 
     Args:
-        detector: Run folder or checkpoint folder; by default the detector that comes with the package.
-        data: Folder of demonstrations; without it the oracle plays episodes of all tasks of the level.
-        level: train, L1, L2, L3 or L4, instead of --data; by default L3, whose objects and textures training
-            never shows.
-        frames: Images to look at, rounded up to pairs of views.
-        held_out: Of --data, look at the demonstrations alone that a training with this validation share
-            keeps aside, such as 0.02; by default at all.
-        prompt_share: Share of the images that show a prompt instead of the table.
-        seed: Decides which images; also the first seed to play.
-        device: Where to compute: cpu or cuda.
+        detector: Run folder or checkpoint folder; by default the bundled detector.
+        data: Folder of demonstrations; by default the oracle generates episodes of all tasks of the level.
+        level: train, L1, L2, L3 or L4, instead of --data; by default L3, with novel objects and textures.
+        frames: Number of images, rounded up to pairs of views.
+        held_out: Use only the demonstrations of --data that a training with this validation fraction holds
+            out, such as 0.02; by default all.
+        prompt_prob: Probability of a prompt image instead of an observation.
+        seed: Seed of the image sampling; also the first seed of generated episodes.
+        device: cpu or cuda.
         as_json: Print JSON instead of a table.
 
     Returns:
         Exit status.
     """
     from openvima.detector import load_detector
+    from openvima.detector.coco_eval import evaluate_detector, require_pycocotools
     from openvima.detector.frames import held_out_frames
-    from openvima.detector.scoring import require_pycocotools, score_detector
 
-    require_pycocotools()  # before what takes a while
+    require_pycocotools()  # fail early
     loaded = load_detector(detector, device=device)
     with (
         _one_thread(),
-        _frames(data, level, frames, held_out, prompt_share, seed) as source,
-        progress_bar("looking") as bar,
+        _frames(data, level, frames, held_out, prompt_prob, seed) as sampler,
+        progress_bar("evaluating") as bar,
     ):
-        shown = _counted(held_out_frames(source, frames, seed=seed), frames, bar)
-        score = score_detector(lambda rgb: loaded.detect(rgb, ""), shown)
+        counted = _counted(held_out_frames(sampler, frames, seed=seed), frames, bar)
+        result = evaluate_detector(lambda rgb: loaded.detect(rgb, ""), counted)
     if as_json:
-        looked_at = {"data": str(data), "held_out": held_out} if data else {"level": level or LEVEL}
-        looked_at |= {"prompt_share": prompt_share, "seed": seed}
-        print(json.dumps({"detector": str(detector or "package"), **looked_at, **asdict(score)}))
+        source = {"data": str(data), "held_out": held_out} if data else {"level": level or LEVEL}
+        source |= {"prompt_prob": prompt_prob, "seed": seed}
+        print(json.dumps({"detector": str(detector or "bundled"), **source, **asdict(result)}))
     else:
-        _print_score(score)
+        _print_result(result)
     return 0
 
 
@@ -103,40 +102,41 @@ def show(
     data: Path | None = None,
     level: str | None = None,
     frames: int = 12,
-    prompt_share: float = 0.25,
+    prompt_prob: float = 0.25,
     score: float = 0.5,
     seed: int = 0,
 ) -> int:
-    """Draw what a detector finds: masks and boxes with scores, and dashed boxes where objects are.
+    """Draw detections: masks, boxes and scores; ground-truth boxes are dashed.
 
     Example: openvima detector show detector --out detections.png
 
     Args:
-        detector: Run folder or checkpoint folder; by default the detector that comes with the package.
+        detector: Run folder or checkpoint folder; by default the bundled detector.
         out: PNG file to write.
-        data: Folder of demonstrations; without it the oracle plays episodes of all tasks of the level.
-        level: train, L1, L2, L3 or L4, instead of --data; by default L3, whose objects and textures training
-            never shows.
-        frames: Images to look at, rounded up to pairs of views.
-        prompt_share: Share of the images that show a prompt instead of the table.
-        score: What is less sure is left out.
-        seed: Decides which images; also the first seed to play.
+        data: Folder of demonstrations; by default the oracle generates episodes of all tasks of the level.
+        level: train, L1, L2, L3 or L4, instead of --data; by default L3, with novel objects and textures.
+        frames: Number of images, rounded up to pairs of views.
+        prompt_prob: Probability of a prompt image instead of an observation.
+        score: Least score of the detections that are drawn.
+        seed: Seed of the image sampling; also the first seed of generated episodes.
 
     Returns:
         Exit status.
     """
     from openvima.detector import load_detector
     from openvima.detector.frames import held_out_frames
-    from openvima.detector.pictures import draw_detections, save_sheet
+    from openvima.detector.visualize import draw_detections, save_grid
     from openvima.errors import ConfigError
 
     if out.suffix.lower() != ".png":
-        raise ConfigError(f"--out is {str(out)!r}; a picture is a PNG file, give a name that ends in .png.")
+        raise ConfigError(f"--out is {str(out)!r}; give the name of a PNG file, ending in .png.")
     loaded = load_detector(detector)
-    with _one_thread(), _frames(data, level, frames, None, prompt_share, seed) as source:
-        shown = held_out_frames(source, frames, seed=seed)
-        pictures = [draw_detections(frame, loaded.detect(frame.rgb, ""), score=score) for frame in shown]
-    save_sheet(pictures, out)
+    with _one_thread(), _frames(data, level, frames, None, prompt_prob, seed) as sampler:
+        images = [
+            draw_detections(frame, loaded.detect(frame.rgb, ""), score=score)
+            for frame in held_out_frames(sampler, frames, seed=seed)
+        ]
+    save_grid(images, out)
     print(out)
     return 0
 
@@ -147,14 +147,14 @@ def convert(
     *,
     force: bool = False,
 ) -> int:
-    """Convert weights of Detectron2's Mask R-CNN with ResNet-50; nothing in the file is executed.
+    """Convert a Detectron2 checkpoint of Mask R-CNN with ResNet-50; nothing in the file is executed.
 
     Example: openvima detector convert mask_rcnn.pth published-detector
 
     Args:
         source: The .pth file.
         out: Folder to write to.
-        force: Replace a checkpoint that is there.
+        force: Replace an existing checkpoint.
 
     Returns:
         Exit status.
@@ -179,24 +179,24 @@ def _frames(
     level: str | None,
     frames: int,
     held_out: float | None,
-    prompt_share: float,
+    prompt_prob: float,
     seed: int,
-) -> "Iterator[FrameSource]":
-    """Frames of a folder, or of demonstrations that are played for the purpose and deleted afterwards."""
+) -> "Iterator[FrameSampler]":
+    """Frames of a folder, or of temporary demonstrations."""
     from openvima.data import Dataset
-    from openvima.detector.frames import FrameSource
+    from openvima.detector.frames import FrameSampler
     from openvima.errors import ConfigError
 
     problems = []
     if frames < 1:
         problems.append(f"frames is {frames}; it must be at least 1.")
-    for name, share in (("held-out", held_out), ("prompt-share", prompt_share)):
-        if share is not None and not 0 <= share <= 1:
-            problems.append(f"{name} is {share:g}; it must be between 0 and 1.")
+    for name, value in (("held-out", held_out), ("prompt-prob", prompt_prob)):
+        if value is not None and not 0 <= value <= 1:
+            problems.append(f"{name} is {value:g}; it must be between 0 and 1.")
     if data is not None and level is not None:
         problems.append(f"both data and level are given ({data} and {level}); leave one of them out.")
     if data is None and held_out is not None:
-        problems.append(f"held-out is {held_out:g}, but no data are given; name the training's with --data.")
+        problems.append(f"held-out is {held_out:g}, but no data are given; add --data.")
     if seed < 0:
         problems.append(f"seed is {seed}; it must not be negative.")
     if problems:
@@ -206,16 +206,16 @@ def _frames(
 
         dataset = Dataset(data)
         episodes = None if held_out is None else split_episodes(dataset, held_out)[1]
-        yield FrameSource(dataset, episodes, prompt_share=prompt_share)
+        yield FrameSampler(dataset, episodes, prompt_prob=prompt_prob)
         return
     with tempfile.TemporaryDirectory() as folder:
-        _play(Path(folder, "played"), level or LEVEL, frames, seed)
-        yield FrameSource(Dataset(Path(folder, "played")), prompt_share=prompt_share)
+        _generate(Path(folder, "demos"), level or LEVEL, frames, seed)
+        yield FrameSampler(Dataset(Path(folder, "demos")), prompt_prob=prompt_prob)
 
 
 @contextmanager
 def _one_thread() -> "Iterator[None]":
-    """Find the same objects on every machine."""
+    """Compute on one thread, so that results are reproducible."""
     from openvima.policies.base import require_torch
 
     require_torch("a detector")
@@ -225,8 +225,8 @@ def _one_thread() -> "Iterator[None]":
         yield
 
 
-def _play(folder: Path, level: str, frames: int, seed: int) -> None:
-    """Let the oracle play as many episodes as there are moments to look at."""
+def _generate(folder: Path, level: str, frames: int, seed: int) -> None:
+    """Generate enough episodes for the frames."""
     from openvima.cli.progress import generation_table
     from openvima.data import GenerateConfig, generate
 
@@ -236,23 +236,19 @@ def _play(folder: Path, level: str, frames: int, seed: int) -> None:
         generate(GenerateConfig(out=folder, level=level, start_seed=seed, episodes=episodes), report)
 
 
-def _counted(shown: "Iterable[Frame]", total: int, report: Report) -> "Iterator[Frame]":
-    for number, frame in enumerate(shown):
+def _counted(frames: "Iterable[Frame]", total: int, report: Report) -> "Iterator[Frame]":
+    for number, frame in enumerate(frames):
         report(number, total, "")
         yield frame
     report(total, total, "")
 
 
-def _print_score(score: "DetectorScore") -> None:
-    print(f"{score.objects:,} objects in {score.frames:,} frames; shares of 1")
+def _print_result(result: "CocoEvaluation") -> None:
+    print(f"{result.objects:,} objects in {result.frames:,} frames")
     print(f"{'':<8}{'AP':>8}{'AP50':>8}{'AP75':>8}{'recall':>8}")
-    for name, precision in (("boxes", score.boxes), ("masks", score.masks)):
-        print(f"{name:<8}{_cells(precision)}")
-
-
-def _cells(precision: "Precision") -> str:
-    numbers = (precision.ap, precision.ap50, precision.ap75, precision.recall)
-    return "".join(f"{number:>8.3f}" for number in numbers)
+    for name, metrics in (("boxes", result.boxes), ("masks", result.masks)):
+        cells = (metrics.ap, metrics.ap50, metrics.ap75, metrics.recall)
+        print(f"{name:<8}" + "".join(f"{cell:>8.3f}" for cell in cells))
 
 
 COMMANDS = {"train": train, "evaluate": evaluate, "show": show, "convert": convert}

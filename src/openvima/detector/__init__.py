@@ -1,4 +1,4 @@
-"""Objects from pixels: a Mask R-CNN in plain torch, and what it is trained on and scored with."""
+"""Object detection in pixels: a Mask R-CNN in plain torch, its training data and its evaluation."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,21 +10,20 @@ if TYPE_CHECKING:
     from openvima.detector.detector import FrameDetector
     from openvima.policies.detection import DetectedObjects
 
-PACKAGED = Path(__file__).parent / "trained"  # the small detector for the default assets
+BUNDLED = Path(__file__).parent / "trained"  # the small detector for the default assets
 
 
 def detector_folder(folder: str | Path | None = None) -> Path:
-    """Return where a trained detector lies, if there is one; `load_detector` takes the same.
+    """Return the folder of a trained detector; None is the bundled one.
 
     Raises:
-        CheckpointError: There is none.
+        CheckpointError: There is no such folder.
     """
-    path = PACKAGED if folder is None else Path(folder)
+    path = BUNDLED if folder is None else Path(folder)
     if path.is_dir():
         return path
     raise CheckpointError(
-        f"there is no folder {path}; `openvima detector train --data DIR --out RUN` makes one. Give its "
-        "folder."
+        f"there is no folder {path}; `openvima detector train --data DIR --out RUN` makes one."
     )
 
 
@@ -34,8 +33,8 @@ def load_detector(
     """Load a trained detector.
 
     Args:
-        folder: A run folder that `openvima detector train` wrote, of which the best checkpoint is taken, or a
-            checkpoint folder; None takes the small detector that comes with the package.
+        folder: A run folder of `openvima detector train`, whose best checkpoint is loaded, or a checkpoint
+            folder; None is the bundled detector.
         **options: Of `FrameDetector`, such as `device`.
 
     Raises:
@@ -52,7 +51,7 @@ def load_detector(
 
 
 def load_extractor(folder: str | Path | None = None, **options: Any) -> "DetectedObjects":  # Any: as above
-    """Load a trained detector as what policies take for an extractor; see `load_detector`.
+    """Load a trained detector as an object extractor for policies; see `load_detector`.
 
     Example:
         >>> load_policy("run", extractor=load_extractor())
@@ -63,8 +62,8 @@ def load_extractor(folder: str | Path | None = None, **options: Any) -> "Detecte
 
 
 __all__ = [
+    "BUNDLED",
     "DETECTORS",
-    "PACKAGED",
     "BackboneConfig",
     "DetectorConfig",
     "detector_config",

@@ -1,4 +1,4 @@
-"""Residual network and feature pyramid: from an image to features at several resolutions.
+"""ResNet with a feature pyramid network (FPN).
 
 Source: Deep Residual Learning (He et al. 2016); Feature Pyramid Networks (Lin et al. 2017).
 """
@@ -11,13 +11,13 @@ from openvima.detector.config import BackboneConfig
 
 
 class ConvNorm(nn.Module):
-    """A convolution without bias, and batch normalisation.
+    """A convolution without bias, followed by batch normalisation.
 
     Args:
-        inputs: Channels.
-        outputs: Channels.
-        kernel: Size in pixels.
-        stride: Pixels between two outputs.
+        inputs: Input channels.
+        outputs: Output channels.
+        kernel: Kernel size.
+        stride: Stride.
     """
 
     def __init__(self, inputs: int, outputs: int, *, kernel: int, stride: int = 1) -> None:
@@ -30,14 +30,14 @@ class ConvNorm(nn.Module):
         return self.norm(self.conv(x))
 
 
-class Block(nn.Module):
-    """Some convolutions, with a way around them.
+class ResidualBlock(nn.Module):
+    """Convolutions with a shortcut.
 
     Args:
-        inputs: Channels.
-        outputs: Channels.
-        stride: Of the whole block.
-        config: Which kind of block.
+        inputs: Input channels.
+        outputs: Output channels.
+        stride: Stride of the block.
+        config: Decides the kind of block.
     """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int, config: BackboneConfig) -> None:
@@ -46,7 +46,7 @@ class Block(nn.Module):
             layers = [(inputs, outputs, 3, stride), (outputs, outputs, 3, 1)]
         else:
             inner = outputs // 4
-            first, second = (stride, 1) if config.stride_first else (1, stride)
+            first, second = (stride, 1) if config.stride_in_1x1 else (1, stride)
             layers = [(inputs, inner, 1, first), (inner, inner, 3, second), (inner, outputs, 1, 1)]
         self.layers = nn.ModuleList(ConvNorm(a, b, kernel=kernel, stride=s) for a, b, kernel, s in layers)
         self.shortcut = None
@@ -55,38 +55,38 @@ class Block(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map (B, inputs, H, W) to (B, outputs, H / stride, W / stride)."""
-        around = x if self.shortcut is None else self.shortcut(x)
-        for number, layer in enumerate(self.layers):
-            x = layer(x if number == 0 else F.relu(x))
-        return F.relu(x + around)
+        residual = x if self.shortcut is None else self.shortcut(x)
+        for index, layer in enumerate(self.layers):
+            x = layer(x if index == 0 else F.relu(x))
+        return F.relu(x + residual)
 
 
 class Backbone(nn.Module):
-    """Features of an image at strides 4, 8, 16, …, all with the same number of channels.
+    """A ResNet whose stages feed an FPN: features at strides 4, 8, 16, …, with equally many channels.
 
-        image ─ stem ─ stage ─ stage ─ stage ─ …          each at half the resolution of the one before
-                         │       │       │
-                       P2 ◄─── P3 ◄─── P4 ◄─ …  (─► one more)   what is coarse is enlarged and added
+        image ─ stem ─ stage ─ stage ─ stage ─ …     each halves the resolution
+                         │       │       │           lateral 1 × 1 convolutions
+                        P2 ◄─── P3 ◄─── P4 ◄─ …      upsampled and added; (─► extra level by max pooling)
 
     Args:
-        config: All sizes.
+        config: Sizes of the backbone.
     """
 
     def __init__(self, config: BackboneConfig) -> None:
         super().__init__()
-        self.frozen_norms = config.frozen_norms
+        self.frozen_batch_norm = config.frozen_batch_norm
         self.extra_level = config.extra_level
         self.stem = ConvNorm(3, config.stem_width, kernel=config.stem_kernel, stride=2)
         stages, inputs = [], config.stem_width
-        for number, (depth, width) in enumerate(zip(config.depths, config.widths, strict=True)):
+        for stage, (depth, width) in enumerate(zip(config.depths, config.widths, strict=True)):
             blocks = []
-            for place in range(depth):
-                stride = 2 if number and not place else 1
-                blocks.append(Block(inputs, width, stride=stride, config=config))
+            for block in range(depth):
+                stride = 2 if stage and not block else 1
+                blocks.append(ResidualBlock(inputs, width, stride=stride, config=config))
                 inputs = width
             stages.append(nn.Sequential(*blocks))
         self.stages = nn.ModuleList(stages)
-        out = config.pyramid_width
+        out = config.fpn_width
         self.lateral = nn.ModuleList(nn.Conv2d(width, out, 1) for width in config.widths)
         self.smooth = nn.ModuleList(nn.Conv2d(out, out, 3, padding=1) for _ in config.widths)
         for module in self.modules():
@@ -96,21 +96,21 @@ class Backbone(nn.Module):
                     nn.init.zeros_(module.bias)
 
     @property
-    def divisor(self) -> int:
-        """Height and width of images must be multiples of this."""
+    def size_divisor(self) -> int:
+        """Height and width of the input must be multiples of this."""
         return 4 * 2 ** (len(self.stages) - 1)
 
     def train(self, mode: bool = True) -> "Backbone":
-        """Switch to training or evaluation; frozen norms stay in evaluation."""
+        """Set the mode; frozen batch normalisation stays in evaluation mode."""
         super().train(mode)
-        if self.frozen_norms:
+        if self.frozen_batch_norm:
             for module in self.modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.eval()
         return self
 
     def forward(self, images: torch.Tensor) -> list[torch.Tensor]:
-        """Map images (B, 3, H, W) to the levels of the pyramid, the finest first, each (B, C, h, w)."""
+        """Map images (B, 3, H, W) to the pyramid levels, finest first, each (B, C, h, w)."""
         x = F.max_pool2d(F.relu(self.stem(images)), kernel_size=3, stride=2, padding=1)
         laterals = []
         for stage, lateral in zip(self.stages, self.lateral, strict=True):

@@ -1,49 +1,52 @@
-"""Boxes as tensors: overlap, coding relative to a reference box, and suppression of duplicates.
+"""Box operations: intersection over union, box regression targets, non-maximum suppression.
 
-A box is left, upper, right and lower edge in pixels, and pixel 0 reaches from 0 to 1.
+A box is (left, upper, right, lower) in pixels; pixel 0 covers 0 to 1.
 """
 
 import math
 
 import torch
 
-# A box grows at most by 1000 / 16 at once, as in the published Mask R-CNN; keeps exp from overflowing.
-LARGEST_GROWTH = math.log(1000 / 16)
+MAX_LOG_SCALE = math.log(1000 / 16)  # of one regression step, as in Detectron2; keeps exp from overflowing
 
 Weights = tuple[float, float, float, float]
 
 
-def areas(boxes: torch.Tensor) -> torch.Tensor:
-    """Return areas in square pixels of boxes (..., 4), shape (...)."""
+def box_area(boxes: torch.Tensor) -> torch.Tensor:
+    """Return the areas of boxes (..., 4) in square pixels, shape (...)."""
     return (boxes[..., 2] - boxes[..., 0]) * (boxes[..., 3] - boxes[..., 1])
 
 
-def overlaps(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Return intersection over union of boxes (N, 4) and (M, 4), shape (N, M); 0 where both are empty."""
+def box_iou(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Return the intersection over union of boxes (N, 4) and (M, 4), shape (N, M); 0 for two empty boxes."""
     low = torch.maximum(first[:, None, :2], second[:, :2])
     high = torch.minimum(first[:, None, 2:], second[:, 2:])
-    shared = (high - low).clamp(min=0).prod(dim=2)
-    union = areas(first)[:, None] + areas(second) - shared
-    return torch.where(shared > 0, shared / union, 0.0)
+    intersection = (high - low).clamp(min=0).prod(dim=2)
+    union = box_area(first)[:, None] + box_area(second) - intersection
+    return torch.where(intersection > 0, intersection / union, 0.0)
 
 
-def clip(boxes: torch.Tensor, *, height: float, width: float) -> torch.Tensor:
-    """Cut boxes (..., 4) off at the image's border."""
+def clip_boxes(boxes: torch.Tensor, *, height: float, width: float) -> torch.Tensor:
+    """Clip boxes (..., 4) to the image."""
     limits = boxes.new_tensor([width, height, width, height])
     return torch.minimum(boxes.clamp(min=0), limits)
 
 
+def is_solid(boxes: torch.Tensor) -> torch.Tensor:
+    """Return which boxes (..., 4) have a positive width and height, shape (...), bool."""
+    return (boxes[..., 2:] > boxes[..., :2]).all(dim=-1)
+
+
 def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights) -> torch.Tensor:
-    """Express boxes relative to reference boxes.
+    """Return the regression targets that move reference boxes to boxes.
 
     Args:
         boxes: Shape (..., 4); not empty.
-        references: Shape (..., 4); not empty.
-        weights: Factors on the four numbers, which bring them to like size.
+        references: Anchors or proposals, shape (..., 4); not empty.
+        weights: Scale of each of the four targets.
 
     Returns:
-        Shift of the centre in widths and heights of the reference, and logarithms of the ratios of widths and
-        heights, times the weights; shape (..., 4).
+        Weighted deltas (dx, dy, log dw, log dh), shape (..., 4); shifts are relative to the reference's size.
 
     Source: R-CNN (Girshick et al. 2014), appendix C.
     """
@@ -54,42 +57,41 @@ def encode_boxes(boxes: torch.Tensor, references: torch.Tensor, weights: Weights
 
 
 def decode_boxes(deltas: torch.Tensor, references: torch.Tensor, weights: Weights) -> torch.Tensor:
-    """Undo `encode_boxes`, with the growth limited to `LARGEST_GROWTH`.
+    """Invert `encode_boxes`, with the growth limited to `MAX_LOG_SCALE`.
 
     Args:
         deltas: Shape (..., 4).
-        references: Shape (..., 4), or one that broadcasts to it.
+        references: Broadcastable to the shape of `deltas`.
         weights: As for `encode_boxes`.
     """
     deltas = deltas / deltas.new_tensor(weights)
     from_centres, from_sizes = _centres_and_sizes(references)
     centres = from_centres + deltas[..., :2] * from_sizes
-    halves = from_sizes * deltas[..., 2:].clamp(max=LARGEST_GROWTH).exp() / 2
+    halves = from_sizes * deltas[..., 2:].clamp(max=MAX_LOG_SCALE).exp() / 2
     return torch.cat([centres - halves, centres + halves], dim=-1)
 
 
-def suppress(boxes: torch.Tensor, scores: torch.Tensor, overlap: float) -> torch.Tensor:
-    """Leave out boxes that overlap a better one which is itself kept.
+def nms(boxes: torch.Tensor, scores: torch.Tensor, iou_threshold: float) -> torch.Tensor:
+    """Apply greedy non-maximum suppression; of equal scores the first wins.
 
-    The better of two equal scores is the one that comes first. All pairs are compared at once: starting from
-    all boxes, those are struck out that a kept one overlaps, until nothing changes. Each round settles at
-    least the best box that is not settled yet, so this ends, and it ends where going through the boxes one by
-    one does. A few rounds are enough in practice.
+    All pairs are compared at once: boxes that a kept box suppresses are removed until nothing changes. Each
+    round settles at least the best unsettled box, so the result is that of the sequential algorithm. A few
+    rounds suffice in practice.
 
     Args:
         boxes: Shape (N, 4).
         scores: Shape (N,).
-        overlap: Largest intersection over union of two boxes that are kept.
+        iou_threshold: Largest intersection over union of two boxes that are kept.
 
     Returns:
-        Indices of the boxes that are kept, the best first, shape (K,), int64.
+        Indices of the kept boxes by descending score, shape (K,), int64.
     """
     order = scores.argsort(descending=True, stable=True)
     boxes = boxes[order]
-    beats = (overlaps(boxes, boxes) > overlap).triu(diagonal=1)  # row beats column
+    suppresses = (box_iou(boxes, boxes) > iou_threshold).triu(diagonal=1)  # row suppresses column
     kept = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
     while True:
-        now = ~beats[kept].any(dim=0)
+        now = ~suppresses[kept].any(dim=0)
         if torch.equal(now, kept):
             return order[kept]
         kept = now

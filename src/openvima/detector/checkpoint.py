@@ -17,35 +17,35 @@ from openvima.policies.base import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.differences import described, listed
 
 _KIND = "detector"
-_SHOWN = 5  # names of each kind of problem that a message lists
-_COUNTER = "num_batches_tracked"  # of batch normalisation; nothing depends on it
+_MAX_LISTED = 5  # names per kind of problem in a message
+_COUNTER = "num_batches_tracked"  # of batch normalisation; unused
 
 
 def save_network(network: MaskRCNN, folder: str | Path) -> None:
-    """Write a checkpoint folder, whole or not at all; a checkpoint that is there is replaced.
+    """Write a checkpoint folder atomically; an existing checkpoint is replaced.
 
     Raises:
-        CheckpointError: The folder holds other files.
+        CheckpointError: The folder contains other files.
     """
     folder = Path(folder)
     if folder.exists():
         found = {path.name for path in folder.iterdir()} if folder.is_dir() else {folder.name}
         if others := sorted(found - {WEIGHTS_FILE, CONFIG_FILE}):
             raise CheckpointError(
-                f"{folder} holds other files than a checkpoint ({', '.join(others[:_SHOWN])}), which "
-                "would be lost; give another folder."
+                f"{folder} contains other files than a checkpoint ({', '.join(others[:_MAX_LISTED])}), which "
+                "would be deleted; give another folder."
             )
     with atomic_folder(folder) as partial:
         write_network(network, partial)
 
 
 def write_network(network: MaskRCNN, folder: Path, weights: Mapping[str, torch.Tensor] | None = None) -> None:
-    """Write the files of a checkpoint into a folder that is still being filled.
+    """Write the files of a checkpoint into an existing folder.
 
     Args:
         network: The network.
         folder: The folder.
-        weights: Instead of those of the network.
+        weights: State dict to write instead of the network's own.
     """
     weights = network.state_dict() if weights is None else weights
     tensors = {
@@ -59,13 +59,13 @@ def write_network(network: MaskRCNN, folder: Path, weights: Mapping[str, torch.T
 
 
 def load_network(path: str | Path) -> MaskRCNN:
-    """Read a network, in evaluation mode.
+    """Load a network in evaluation mode.
 
     Args:
-        path: A checkpoint folder, or a run folder, of which the best checkpoint is taken.
+        path: A checkpoint folder, or a run folder, whose best checkpoint is loaded.
 
     Raises:
-        CheckpointError: There is none, it is damaged, or weights and sizes do not fit.
+        CheckpointError: There is none, it is damaged, or weights and config do not match.
     """
     path = Path(path)
     restore_folder(path)
@@ -76,16 +76,16 @@ def load_network(path: str | Path) -> MaskRCNN:
 
 
 def read_config(folder: Path) -> DetectorConfig:
-    """Read the sizes of a checkpoint.
+    """Read the config of a checkpoint.
 
     Raises:
-        CheckpointError: There is no config, or it makes no sense.
+        CheckpointError: There is no config, or it is invalid.
     """
     file = folder / CONFIG_FILE
     try:
         values = yaml.safe_load(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.") from error
+        raise CheckpointError(f"{folder} is no checkpoint: it contains no {CONFIG_FILE}.") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise CheckpointError(f"{file} is no valid YAML: {error}") from error
     if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
@@ -97,7 +97,7 @@ def read_config(folder: Path) -> DetectorConfig:
 
 
 def load_weights(network: MaskRCNN, file: Path) -> None:
-    """Copy the weights of a file into a network.
+    """Load the weights of a file into a network.
 
     Raises:
         CheckpointError: The file is missing or damaged, or names or shapes differ.
@@ -113,7 +113,7 @@ def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, sour
     """Copy weights into a network.
 
     Raises:
-        CheckpointError: Names or shapes differ; one message tells all of them.
+        CheckpointError: Names or shapes differ; the message lists them.
     """
     expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
     wrong = [
@@ -123,10 +123,10 @@ def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, sour
         if name in tensors and tensors[name].shape != own.shape
     ]
     problems = [
-        *listed("missing", [name for name in expected if name not in tensors], most=_SHOWN),
-        *listed("unexpected", [name for name in tensors if name not in expected], most=_SHOWN),
-        *listed("wrong", wrong, most=_SHOWN),
+        *listed("missing", [name for name in expected if name not in tensors], most=_MAX_LISTED),
+        *listed("unexpected", [name for name in tensors if name not in expected], most=_MAX_LISTED),
+        *listed("wrong", wrong, most=_MAX_LISTED),
     ]
     if problems:
-        raise CheckpointError(f"{source} does not fit the sizes of the detector: {'; '.join(problems)}.")
+        raise CheckpointError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
     network.load_state_dict(tensors, strict=False)

@@ -1,4 +1,4 @@
-"""Sizes of a detector, as a frozen record that checks itself and travels beside the weights."""
+"""Sizes of a detector, as a frozen dataclass that validates itself."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -6,25 +6,23 @@ from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
 
-FIRST_STRIDE = 4  # pixels between the cells of the finest level of the pyramid
+FIRST_STRIDE = 4  # of the finest pyramid level, in pixels
 
 
 @dataclass(frozen=True, slots=True)
 class BackboneConfig:
-    """A residual network, and the pyramid on top of it.
+    """A ResNet with a feature pyramid network (FPN).
 
     Args:
-        block: "basic" is two 3 × 3 convolutions, "bottleneck" a 3 × 3 one between two of 1 × 1.
-        depths: Blocks of each stage; the first stage has stride 4, and each further one twice that before.
-        widths: Channels that each stage gives.
-        stem_width: Channels of the first convolution.
-        stem_kernel: Its size in pixels.
-        pyramid_width: Channels of all levels of the pyramid.
-        extra_level: Whether the coarsest level is thinned out once more, for the largest anchors.
-        frozen_norms: Whether batch normalisation keeps the statistics it was loaded with. For weights that
-            were trained before, which small batches would spoil.
-        stride_first: Whether the first 1 × 1 convolution of a bottleneck does the stride, rather than the
-            3 × 3 one.
+        block: "basic" (two 3 × 3 convolutions) or "bottleneck" (a 3 × 3 between two 1 × 1 convolutions).
+        depths: Blocks per stage; the first stage has stride 4, and the stride doubles with each further one.
+        widths: Output channels of each stage.
+        stem_width: Channels of the stem.
+        stem_kernel: Kernel size of the stem.
+        fpn_width: Channels of the pyramid levels.
+        extra_level: Max-pool the coarsest level once more, for the largest anchors.
+        frozen_batch_norm: Keep the loaded batch statistics. For pretrained weights and small batches.
+        stride_in_1x1: Put the stride of a bottleneck into its first 1 × 1 convolution instead of the 3 × 3.
     """
 
     block: Literal["basic", "bottleneck"]
@@ -32,101 +30,107 @@ class BackboneConfig:
     widths: tuple[int, ...]
     stem_width: int
     stem_kernel: int
-    pyramid_width: int
+    fpn_width: int
     extra_level: bool = False
-    frozen_norms: bool = False
-    stride_first: bool = False
+    frozen_batch_norm: bool = False
+    stride_in_1x1: bool = False
 
     @property
     def num_levels(self) -> int:
-        """Levels of the pyramid."""
+        """Number of pyramid levels."""
         return len(self.widths) + self.extra_level
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """All sizes of a Mask R-CNN, and what it was trained to look at.
+    """All sizes and thresholds of a Mask R-CNN.
 
     Args:
-        backbone: From the image to the levels of the pyramid.
-        anchor_sizes: Side in pixels of the square anchor of each level; two others have its area and are
-            half and twice as high as wide.
-        anchor_overlap: Anchors that overlap an object at least that much learn it. Where anchors lie far
-            apart for the size of objects, few reach the 0.7 of the published network.
-        num_classes: Kinds of objects that it tells apart; what it finds is an object whatever its kind.
-        short_side: Images are enlarged until their shorter side has so many pixels; None leaves them.
-        long_side: Their longer side stays within so many pixels all the same.
-        colours: Order in which the network takes the channels.
-        pixel_mean: Subtracted from each channel, in the network's order, 0 to 255.
-        pixel_std: Each channel is then divided by this.
-        candidates: Boxes of each level that the proposal network lets compete.
-        proposals: Boxes of an image that are looked at closely.
-        proposal_overlap: Largest overlap (intersection over union) of two proposals.
-        canonical_size: Side in pixels of the objects that are cut out of `canonical_level`; one half as
-            large is cut out of the level before.
-        canonical_level: Number of a level, the finest being 0.
-        samples: Points in each direction that a cell of a cut-out averages; 0 takes about one a feature.
-        box_size: Cells in each direction of what the box head gets.
-        box_widths: Widths of its hidden layers.
-        mask_size: Cells in each direction of what the mask head gets; its masks are twice as fine.
-        mask_widths: Channels of its convolutions.
-        score: Least score of what is found.
-        overlap: Largest overlap of two objects that are found.
-        most: Objects of an image that are found.
+        backbone: ResNet and feature pyramid.
+        anchor_sizes: Anchor size of each level in pixels; each cell has three aspect ratios of equal area.
+        rpn_foreground_iou: Anchors with at least this IoU are foreground. With anchors far apart for the size
+            of the objects, few reach the 0.7 of the published network.
+        num_classes: Classes without background; every detection is an object, whatever its class.
+        min_size: Images are resized until their shorter side has this many pixels; None keeps their size.
+        max_size: Limit of the longer side of resized images.
+        channel_order: Of the input: "rgb" or "bgr".
+        pixel_mean: Subtracted from each channel (0 to 255), in the input's order.
+        pixel_std: Divides each channel, in the input's order.
+        rpn_pre_nms_top_n: Boxes per level before non-maximum suppression (NMS).
+        rpn_post_nms_top_n: Proposals per image after NMS.
+        rpn_nms_iou: NMS threshold of proposals.
+        canonical_size: Side in pixels of the boxes that are pooled from `canonical_level`; boxes half as
+            large are pooled from the level below.
+        canonical_level: Index of a level; the finest is 0.
+        roi_sampling_ratio: RoIAlign samples per cell in each direction; 0 adapts to the size of the box.
+        box_pool_size: RoIAlign output size of the box head.
+        box_head_widths: Hidden widths of the box head.
+        mask_pool_size: RoIAlign output size of the mask head; masks have twice this size.
+        mask_head_widths: Channels of the convolutions of the mask head.
+        score_threshold: Least score of detections.
+        nms_iou: NMS threshold of detections.
+        max_detections: Detections per image.
     """
 
     backbone: BackboneConfig
     anchor_sizes: tuple[float, ...]
-    anchor_overlap: float = 0.5
+    rpn_foreground_iou: float = 0.5
     num_classes: int = 1
-    short_side: int | None = None
-    long_side: int = 1333
-    colours: Literal["rgb", "bgr"] = "rgb"
+    min_size: int | None = None
+    max_size: int = 1333
+    channel_order: Literal["rgb", "bgr"] = "rgb"
     pixel_mean: tuple[float, float, float] = (127.5, 127.5, 127.5)
     pixel_std: tuple[float, float, float] = (63.75, 63.75, 63.75)
-    candidates: int = 100
-    proposals: int = 64
-    proposal_overlap: float = 0.7
+    rpn_pre_nms_top_n: int = 100
+    rpn_post_nms_top_n: int = 64
+    rpn_nms_iou: float = 0.7
     canonical_size: float = 48.0
     canonical_level: int = 1
-    samples: int = 2
-    box_size: int = 7
-    box_widths: tuple[int, ...] = (128,)
-    mask_size: int = 14
-    mask_widths: tuple[int, ...] = (64, 64)
-    score: float = 0.05
-    overlap: float = 0.5
-    most: int = 100
+    roi_sampling_ratio: int = 2
+    box_pool_size: int = 7
+    box_head_widths: tuple[int, ...] = (128,)
+    mask_pool_size: int = 14
+    mask_head_widths: tuple[int, ...] = (64, 64)
+    score_threshold: float = 0.05
+    nms_iou: float = 0.5
+    max_detections: int = 100
 
     def __post_init__(self) -> None:
         backbone, problems = self.backbone, []
         if backbone.block not in ("basic", "bottleneck"):
             problems.append(unknown_name("block", backbone.block, ("basic", "bottleneck")))
-        if self.colours not in ("rgb", "bgr"):
-            problems.append(unknown_name("order of colours", self.colours, ("rgb", "bgr")))
+        if self.channel_order not in ("rgb", "bgr"):
+            problems.append(unknown_name("channel order", self.channel_order, ("rgb", "bgr")))
         if len(backbone.depths) != len(backbone.widths) or not backbone.depths:
             problems.append(
-                f"depths has {len(backbone.depths)} stages and widths {len(backbone.widths)}; give one "
-                "number a stage in both."
+                f"depths has {len(backbone.depths)} stages and widths {len(backbone.widths)}; give both one "
+                "number per stage."
             )
         if len(self.anchor_sizes) != backbone.num_levels:
             problems.append(
                 f"anchor_sizes has {len(self.anchor_sizes)} numbers; the pyramid has {backbone.num_levels} "
                 "levels."
             )
-        for name in ("num_classes", "candidates", "proposals", "box_size", "mask_size", "most"):
+        for name in (
+            "num_classes",
+            "rpn_pre_nms_top_n",
+            "rpn_post_nms_top_n",
+            "box_pool_size",
+            "mask_pool_size",
+            "max_detections",
+        ):
             if getattr(self, name) < 1:
                 problems.append(f"{name} is {getattr(self, name)}; it must be at least 1.")
         if problems:
             raise ConfigError(" ".join(problems))
 
     def to_dict(self) -> dict[str, Any]:  # Any: plain YAML values
-        """Return nested dictionaries of plain values, for files."""
+        """Return nested dictionaries of plain values."""
         return _plain(asdict(self))
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> "DetectorConfig":  # Any: as read from a file
-        """Build a config from what `to_dict` returned.
+        """Build a config from the output of `to_dict`.
 
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
@@ -137,48 +141,48 @@ class DetectorConfig:
 
 
 def small() -> DetectorConfig:
-    """0.96 M parameters, for frames of 128 × 256 pixels; trained from nothing within an hour on two cores."""
+    """0.96 M parameters, for frames of 128 × 256 pixels; trains from scratch within an hour on two cores."""
     backbone = BackboneConfig(
         block="basic",
         depths=(1, 1, 1),
         widths=(32, 64, 128),
         stem_width=16,
         stem_kernel=5,
-        pyramid_width=64,
+        fpn_width=64,
     )
-    # Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these sizes 13 anchors an object
-    # overlap it by half; with 16, 32 and 64 there were 5.5.
+    # Half of the objects are 22 to 25 pixels high and 24 to 26 wide. With these sizes 13 anchors per object
+    # have an IoU of 0.5; with 16, 32 and 64 it was 5.5.
     return DetectorConfig(backbone, anchor_sizes=(20.0, 28.0, 60.0))
 
 
 def resnet50() -> DetectorConfig:
-    """44 M parameters: ResNet-50 with feature pyramid, as Detectron2 sets it up by default."""
+    """44 M parameters: ResNet-50 with FPN, in the default configuration of Detectron2."""
     backbone = BackboneConfig(
         block="bottleneck",
         depths=(3, 4, 6, 3),
         widths=(256, 512, 1024, 2048),
         stem_width=64,
         stem_kernel=7,
-        pyramid_width=256,
+        fpn_width=256,
         extra_level=True,
-        frozen_norms=True,
-        stride_first=True,
+        frozen_batch_norm=True,
+        stride_in_1x1=True,
     )
     return DetectorConfig(
         backbone,
         anchor_sizes=(32.0, 64.0, 128.0, 256.0, 512.0),
-        anchor_overlap=0.7,
-        short_side=800,
-        colours="bgr",
+        rpn_foreground_iou=0.7,
+        min_size=800,
+        channel_order="bgr",
         pixel_mean=(103.53, 116.28, 123.675),
         pixel_std=(1.0, 1.0, 1.0),
-        candidates=1000,
-        proposals=1000,
+        rpn_pre_nms_top_n=1000,
+        rpn_post_nms_top_n=1000,
         canonical_size=224.0,
         canonical_level=2,
-        samples=0,
-        box_widths=(1024, 1024),
-        mask_widths=(256, 256, 256, 256),
+        roi_sampling_ratio=0,
+        box_head_widths=(1024, 1024),
+        mask_head_widths=(256, 256, 256, 256),
     )
 
 
@@ -186,7 +190,7 @@ DETECTORS: dict[str, Callable[[], DetectorConfig]] = {"small": small, "resnet50"
 
 
 def detector_config(name: str) -> DetectorConfig:
-    """Return the sizes of a named detector, "small" or "resnet50".
+    """Return the config of a named detector, "small" or "resnet50".
 
     Raises:
         ConfigError: There is no detector of that name.

@@ -1,4 +1,4 @@
-"""A trained network as a `Detector`: one image in, boxes, masks and scores out."""
+"""A trained network as a `Detector`: boxes, masks and scores from one image."""
 
 from copy import deepcopy
 
@@ -8,38 +8,38 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from openvima.detector.backbone import ConvNorm
-from openvima.detector.network import MaskRCNN, Objects
+from openvima.detector.network import Instances, MaskRCNN
 from openvima.errors import ShapeError
 from openvima.policies.detection import Detections
 from openvima.policies.devices import usable_device
 
 
 class FrameDetector:
-    """Finds the objects of frames by a Mask R-CNN.
+    """Detects the objects of frames by a Mask R-CNN.
 
-    Each image is looked at alone, so that what is found in it does not depend on any other.
+    Each image is processed alone, so that its detections do not depend on a batch.
 
     Args:
-        network: The network; it is copied, with its batch normalisation folded into the convolutions.
-        device: Where to compute, such as "cpu" or "cuda".
+        network: The network; it is copied, with batch normalisation fused into the convolutions.
+        device: Such as "cpu" or "cuda".
 
     Raises:
-        PolicyError: The device cannot be used here.
+        PolicyError: The device is not available.
     """
 
     def __init__(self, network: MaskRCNN, *, device: torch.device | str = "cpu") -> None:
         self.device = usable_device(device)
-        # Channels last takes a quarter of the time on a processor.
-        network = folded(network).to(self.device)
+        # Channels last takes a quarter of the time on a CPU.
+        network = fuse_batch_norm(network).to(self.device)
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @torch.inference_mode()
     def detect(self, rgb: np.ndarray, view: str) -> Detections:
-        """Find the objects in an image; which view it is makes no difference.
+        """Detect the objects in an image.
 
         Args:
             rgb: Shape (3, H, W), uint8.
-            view: "front" or "top".
+            view: "front" or "top"; not used.
 
         Raises:
             ShapeError: The image has another shape or dtype.
@@ -48,11 +48,11 @@ class FrameDetector:
             raise ShapeError(f"the image is {rgb.dtype} {rgb.shape}; it must be uint8 of shape (3, H, W).")
         images = torch.from_numpy(np.ascontiguousarray(rgb))[None].to(self.device)
         (found,) = self.network(images)
-        return detections_of(found)
+        return to_detections(found)
 
 
-def detections_of(found: Objects) -> Detections:
-    """Return what a network found as arrays; boxes take in every pixel that they touch for the most part."""
+def to_detections(found: Instances) -> Detections:
+    """Convert instances to arrays; boxes contain the pixels that they cover by at least half."""
     _, height, width = found.masks.shape
     edges = found.boxes.cpu().double().numpy()
     first = np.floor(edges[:, :2] + 0.5)
@@ -64,8 +64,8 @@ def detections_of(found: Objects) -> Detections:
     return Detections(boxes, found.masks.cpu().numpy(), found.scores.cpu().double().numpy())
 
 
-def folded(network: MaskRCNN) -> MaskRCNN:
-    """Return a copy, ready to find objects, without batch normalisation: the convolutions do its work."""
+def fuse_batch_norm(network: MaskRCNN) -> MaskRCNN:
+    """Return a copy for inference with batch normalisation fused into the convolutions."""
     copy = deepcopy(network).eval()
     for module in copy.modules():
         if isinstance(module, ConvNorm) and isinstance(module.norm, nn.BatchNorm2d):

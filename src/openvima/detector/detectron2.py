@@ -1,8 +1,8 @@
-"""Reading weights of Detectron2's Mask R-CNN with ResNet-50 and feature pyramid, such as VIMA's detector.
+"""Reader for Detectron2 checkpoints of Mask R-CNN with ResNet-50 and FPN, such as VIMA's detector.
 
-Only tensors and plain values are read; nothing in the file is executed. Where the file holds Detectron2's
-settings under "cfg", as users load VIMA's, they say how images are prepared and what is kept. What they leave
-open is taken as Detectron2 has it by default: blue first, enlarged to 800 pixels.
+Only tensors and plain values are read; nothing in the file is executed. Detectron2's config under "cfg"
+decides preprocessing and thresholds where the file contains it. Defaults are Detectron2's: BGR, shorter side
+800 pixels.
 """
 
 import re
@@ -19,11 +19,11 @@ from openvima.detector.checkpoint import copy_weights
 from openvima.detector.config import DetectorConfig, resnet50
 from openvima.detector.heads import WEIGHTS as BOX_WEIGHTS
 from openvima.detector.network import MaskRCNN
-from openvima.detector.proposals import WEIGHTS as PROPOSAL_WEIGHTS
+from openvima.detector.rpn import WEIGHTS as PROPOSAL_WEIGHTS
 from openvima.errors import CheckpointError, ConfigError
 
-_KINDS = "roi_heads.box_predictor.cls_score.weight"
-# Module of Detectron2, and ours. Numbers with these names count from other numbers there than here.
+_CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"
+# Patterns of module names in Detectron2, and ours. Detectron2 counts these indices from other numbers.
 _FIRST = {"stage": 2, "block": 0, "layer": 1}
 _BOTTOM_UP = (
     (r"backbone\.bottom_up\.stem\.conv1", "backbone.stem"),
@@ -39,34 +39,34 @@ _BOTTOM_UP = (
 _OTHERS = (
     (r"backbone\.fpn_lateral(?P<stage>\d)", "backbone.lateral.{stage}"),
     (r"backbone\.fpn_output(?P<stage>\d)", "backbone.smooth.{stage}"),
-    (r"proposal_generator\.rpn_head\.conv", "proposals.conv"),
-    (r"proposal_generator\.rpn_head\.objectness_logits", "proposals.scores"),
-    (r"proposal_generator\.rpn_head\.anchor_deltas", "proposals.deltas"),
+    (r"proposal_generator\.rpn_head\.conv", "rpn.conv"),
+    (r"proposal_generator\.rpn_head\.objectness_logits", "rpn.objectness"),
+    (r"proposal_generator\.rpn_head\.anchor_deltas", "rpn.deltas"),
     (r"roi_heads\.box_head\.fc(?P<layer>\d)", "box_head.hidden.{layer}"),
-    (r"roi_heads\.box_predictor\.cls_score", "box_head.kinds"),
+    (r"roi_heads\.box_predictor\.cls_score", "box_head.class_logits"),
     (r"roi_heads\.box_predictor\.bbox_pred", "box_head.deltas"),
     (r"roi_heads\.mask_head\.mask_fcn(?P<layer>\d)", "mask_head.convs.{layer}"),
-    (r"roi_heads\.mask_head\.deconv", "mask_head.finer"),
-    (r"roi_heads\.mask_head\.predictor", "mask_head.masks"),
+    (r"roi_heads\.mask_head\.deconv", "mask_head.deconv"),
+    (r"roi_heads\.mask_head\.predictor", "mask_head.mask_logits"),
 )
-# Settings of Detectron2 by their path, and ours.
+# Settings of Detectron2 by path, and our fields.
 _SETTINGS = {
-    "INPUT.MIN_SIZE_TEST": "short_side",
-    "INPUT.MAX_SIZE_TEST": "long_side",
-    "INPUT.FORMAT": "colours",
+    "INPUT.MIN_SIZE_TEST": "min_size",
+    "INPUT.MAX_SIZE_TEST": "max_size",
+    "INPUT.FORMAT": "channel_order",
     "MODEL.PIXEL_MEAN": "pixel_mean",
     "MODEL.PIXEL_STD": "pixel_std",
     "MODEL.ANCHOR_GENERATOR.SIZES": "anchor_sizes",
-    "MODEL.RPN.PRE_NMS_TOPK_TEST": "candidates",
-    "MODEL.RPN.POST_NMS_TOPK_TEST": "proposals",
-    "MODEL.RPN.NMS_THRESH": "proposal_overlap",
-    "MODEL.ROI_BOX_HEAD.POOLER_SAMPLING_RATIO": "samples",
-    "MODEL.ROI_HEADS.SCORE_THRESH_TEST": "score",
-    "MODEL.ROI_HEADS.NMS_THRESH_TEST": "overlap",
-    "TEST.DETECTIONS_PER_IMAGE": "most",
+    "MODEL.RPN.PRE_NMS_TOPK_TEST": "rpn_pre_nms_top_n",
+    "MODEL.RPN.POST_NMS_TOPK_TEST": "rpn_post_nms_top_n",
+    "MODEL.RPN.NMS_THRESH": "rpn_nms_iou",
+    "MODEL.ROI_BOX_HEAD.POOLER_SAMPLING_RATIO": "roi_sampling_ratio",
+    "MODEL.ROI_HEADS.SCORE_THRESH_TEST": "score_threshold",
+    "MODEL.ROI_HEADS.NMS_THRESH_TEST": "nms_iou",
+    "TEST.DETECTIONS_PER_IMAGE": "max_detections",
 }
 _STRIDE_FIRST = "MODEL.RESNETS.STRIDE_IN_1X1"
-# Settings that are not shapes of weights, and the only value that is computed here.
+# Settings with a single supported value.
 _FIXED: dict[str, Any] = {  # Any: numbers, words and lists of them
     "MODEL.ANCHOR_GENERATOR.ASPECT_RATIOS": [[0.5, 1.0, 2.0]],
     "MODEL.ANCHOR_GENERATOR.OFFSET": 0.0,
@@ -77,22 +77,22 @@ _FIXED: dict[str, Any] = {  # Any: numbers, words and lists of them
     "MODEL.ROI_MASK_HEAD.POOLER_TYPE": "ROIAlignV2",
 }
 _CLASSES_OF_SETTINGS = ("detectron2.config.config", "fvcore.common.config", "yacs.config")
-# Constants that are set by the sizes here, and counters without effect.
-_LEFT_OUT = re.compile(r"pixel_(mean|std)|.*anchor_generator\..*|.*num_batches_tracked")
+# Constants that follow from our config, and counters without effect.
+_IGNORED = re.compile(r"pixel_(mean|std)|.*anchor_generator\..*|.*num_batches_tracked")
 
 
 def load_detectron2(file: str | Path) -> MaskRCNN:
-    """Read a network from a file of Detectron2.
+    """Load a network from a Detectron2 checkpoint.
 
     Args:
-        file: A torch archive (`.pth`) that holds the weights by name, alone or under "model".
+        file: A torch file (`.pth`) with the weights by name, at top level or under "model".
 
     Returns:
-        The network, in float32 and in evaluation mode.
+        The network in float32, in evaluation mode.
 
     Raises:
-        CheckpointError: The file is missing, damaged or something else, it wants code to be executed, or its
-            weights or settings are those of another architecture.
+        CheckpointError: The file is missing, damaged or no checkpoint, it contains code, or its weights or
+            settings belong to another architecture.
     """
     file = Path(file)
     values = _values_in(file)
@@ -100,7 +100,7 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
     try:
         config = detectron2_config(weights, settings if isinstance(settings, Mapping) else None)
     except (ConfigError, TypeError, ValueError) as error:  # settings may be anything
-        raise CheckpointError(f"{file} holds settings that make no sense: {error}") from error
+        raise CheckpointError(f"{file} contains invalid settings: {error}") from error
     network = MaskRCNN(config)
     copy_weights(network, from_detectron2(weights), source=str(file))
     return network.eval()
@@ -110,18 +110,18 @@ def detectron2_config(
     weights: Mapping[str, torch.Tensor],
     settings: Mapping[str, Any] | None = None,  # Any: as stored
 ) -> DetectorConfig:
-    """Return the sizes of a network with these weights: ResNet-50 with as many kinds as they tell apart.
+    """Return the config that matches these weights: ResNet-50 with their number of classes.
 
     Args:
-        weights: Where means and deviations of the pixels are stored among them, they are taken from there.
-        settings: Detectron2's, nested by name; those that are missing are as it has them by default.
+        weights: Detectron2's state dict; `pixel_mean` and `pixel_std` are used if present.
+        settings: Detectron2's nested config; missing values have Detectron2's defaults.
 
     Raises:
-        CheckpointError: They are those of no Mask R-CNN, or of one that computes otherwise.
+        CheckpointError: The weights are not a Mask R-CNN's, or a setting is not supported.
     """
-    if _KINDS not in weights:
-        raise CheckpointError(f"there are no weights {_KINDS}; a Mask R-CNN of Detectron2 has them.")
-    config = replace(resnet50(), num_classes=len(weights[_KINDS]) - 1, **_chosen(settings or {}))
+    if _CLASS_WEIGHTS not in weights:
+        raise CheckpointError(f"there are no weights {_CLASS_WEIGHTS}; a Mask R-CNN of Detectron2 has them.")
+    config = replace(resnet50(), num_classes=len(weights[_CLASS_WEIGHTS]) - 1, **_chosen(settings or {}))
     stored = {
         name: tuple(float(value) for value in weights[name].flatten())
         for name in ("pixel_mean", "pixel_std")
@@ -131,18 +131,18 @@ def detectron2_config(
 
 
 def from_detectron2(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the weights under the names that they have here; names that are not known stay."""
+    """Rename Detectron2's weights to ours; unknown names are kept."""
     return {
-        _own_name(name): tensor.float() for name, tensor in weights.items() if not _LEFT_OUT.fullmatch(name)
+        _own_name(name): tensor.float() for name, tensor in weights.items() if not _IGNORED.fullmatch(name)
     }
 
 
 def _chosen(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
-    """What settings of Detectron2 say, under the names that it has here."""
+    """Translate Detectron2's settings to fields of `DetectorConfig`."""
     for path, expected in _FIXED.items():
         value = _setting(settings, path)
-        if value is not None and _listed(value) != _listed(expected):
-            raise CheckpointError(f"{path} is {value!r}; only {expected!r} is computed here.")
+        if value is not None and _as_list(value) != _as_list(expected):
+            raise CheckpointError(f"{path} is {value!r}; only {expected!r} is supported.")
     chosen = {
         own: value for path, own in _SETTINGS.items() if (value := _setting(settings, path)) is not None
     }
@@ -152,15 +152,15 @@ def _chosen(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
     if "anchor_sizes" in chosen:
         if any(len(sizes) != 1 for sizes in chosen["anchor_sizes"]):
             raise CheckpointError(
-                f"anchors have sizes {chosen['anchor_sizes']}; one of each level is computed."
+                f"anchors have sizes {chosen['anchor_sizes']}; only one per level is supported."
             )
         chosen["anchor_sizes"] = tuple(float(sizes[0]) for sizes in chosen["anchor_sizes"])
-    if "colours" in chosen:
-        chosen["colours"] = str(chosen["colours"]).lower()
-    if "short_side" in chosen:
-        chosen["short_side"] = chosen["short_side"] or None  # 0 leaves images as they are
-    if (stride_first := _setting(settings, _STRIDE_FIRST)) is not None:
-        chosen["backbone"] = replace(resnet50().backbone, stride_first=stride_first)
+    if "channel_order" in chosen:
+        chosen["channel_order"] = str(chosen["channel_order"]).lower()
+    if "min_size" in chosen:
+        chosen["min_size"] = chosen["min_size"] or None  # 0 disables resizing
+    if (stride_in_1x1 := _setting(settings, _STRIDE_FIRST)) is not None:
+        chosen["backbone"] = replace(resnet50().backbone, stride_in_1x1=stride_in_1x1)
     return chosen
 
 
@@ -171,12 +171,12 @@ def _setting(settings: Mapping[str, Any], path: str) -> Any:  # Any: as stored
     return value
 
 
-def _listed(value: Any) -> Any:  # Any: as stored
-    return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
+def _as_list(value: Any) -> Any:  # Any: as stored
+    return [_as_list(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def _own_name(name: str) -> str:
-    for table, conv in ((_BOTTOM_UP, "conv."), (_OTHERS, "")):  # there a norm is part of its convolution
+    for table, conv in ((_BOTTOM_UP, "conv."), (_OTHERS, "")):  # Detectron2 nests norms in convolutions
         for pattern, own in table:
             if match := re.fullmatch(pattern + r"\.(?P<tensor>(norm\.)?\w+)", name):
                 numbers = {
@@ -190,11 +190,11 @@ def _own_name(name: str) -> str:
 
 
 def _class_of_settings(module: str) -> type:
-    """A class that stands in for Detectron2's of that module: torch makes it, and gets a mapping instead."""
+    """A stand-in for Detectron2's config class of a module, which torch unpickles as a plain mapping."""
     return type("CfgNode", (), {"__module__": module, "__new__": lambda cls: OrderedDict()})
 
 
-def _values_in(file: Path) -> Mapping[str, Any]:  # Any: whatever it holds
+def _values_in(file: Path) -> Mapping[str, Any]:  # Any: any content
     if not file.is_file():
         raise CheckpointError(f"there is no file {file}.")
     try:
@@ -202,25 +202,25 @@ def _values_in(file: Path) -> Mapping[str, Any]:  # Any: whatever it holds
             values: Any = torch.load(file, map_location="cpu", weights_only=True)  # Any: as above
     except MemoryError:
         raise
-    except Exception as error:  # a file made to do harm can fail in any way
+    except Exception as error:  # a malicious file can fail in any way
         reason = (str(error).splitlines() or [""])[0]
         raise CheckpointError(
-            f"{file} cannot be read as tensors alone ({type(error).__name__}: {reason}). Nothing in it was "
-            'executed. Give a .pth file of torch; of a training checkpoint, save the entry "model" alone.'
+            f"{file} cannot be read as plain tensors ({type(error).__name__}: {reason}). Nothing in it was "
+            'executed. Give a .pth file of torch; of a training checkpoint, save only the entry "model".'
         ) from error
     if not isinstance(values, Mapping):
-        raise CheckpointError(f"{file} holds a {type(values).__name__}; weights by name are needed.")
+        raise CheckpointError(f"{file} contains a {type(values).__name__} instead of weights by name.")
     return values
 
 
 def _weights_in(values: Mapping[str, Any], file: Path) -> dict[str, torch.Tensor]:  # Any: as above
     values = values.get("model", {name: value for name, value in values.items() if name != "cfg"})
     if not isinstance(values, Mapping) or not values:
-        raise CheckpointError(f"{file} holds no weights by name.")
+        raise CheckpointError(f"{file} contains no weights by name.")
     tensors = {
         str(name): torch.from_numpy(value) if isinstance(value, np.ndarray) else value
         for name, value in values.items()
     }
     if others := [name for name, value in tensors.items() if not isinstance(value, torch.Tensor)]:
-        raise CheckpointError(f"{file} holds more than weights: {', '.join(others[:5])}.")
+        raise CheckpointError(f"{file} contains more than weights: {', '.join(others[:5])}.")
     return tensors

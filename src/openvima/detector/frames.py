@@ -1,4 +1,4 @@
-"""Single images with the objects that they show, out of demonstrations."""
+"""Annotated frames from demonstrations, for training and evaluating a detector."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ _NUM_IDS = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """An image of H × W pixels, and the objects that show at least two pixels in it.
+    """An image of H × W pixels with its objects of at least two visible pixels.
 
     Args:
         rgb: Shape (3, H, W), uint8.
-        boxes: Left, upper, right and lower edge in pixels, shape (N, 4), float32; pixel 0 is from 0 to 1.
-        masks: Which pixels show each object, shape (N, H, W), bool.
+        boxes: Left, upper, right, lower in pixels, shape (N, 4), float32; pixel 0 covers 0 to 1.
+        masks: Shape (N, H, W), bool.
     """
 
     rgb: np.ndarray
@@ -32,52 +32,51 @@ class Frame:
 
 
 def frame_of(rgb: np.ndarray, segm: np.ndarray, ids: Sequence[int] | np.ndarray) -> Frame:
-    """Find the objects of an image by its segmentation.
+    """Annotate an image from its segmentation.
 
     Args:
         rgb: Shape (3, H, W), uint8.
         segm: Object ids, shape (H, W), uint8.
-        ids: Which of them are objects.
+        ids: The ids of objects.
     """
-    shown = np.bincount(segm.ravel(), minlength=_NUM_IDS) >= MIN_PIXELS
-    ids = np.array([object_id for object_id in ids if shown[object_id]], np.int64)
+    visible = np.bincount(segm.ravel(), minlength=_NUM_IDS) >= MIN_PIXELS
+    ids = np.array([object_id for object_id in ids if visible[object_id]], np.int64)
     masks = segm == ids[:, None, None]
     boxes = np.zeros((len(ids), 4), np.float32)
-    for number, mask in enumerate(masks):
+    for index, mask in enumerate(masks):
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        boxes[number] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+        boxes[index] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
     return Frame(rgb, boxes, masks)
 
 
-class FrameSource:
-    """Frames of demonstrations: what the cameras saw, and the images of prompts.
+class FrameSampler:
+    """Samples frames of demonstrations: observations and prompt images.
 
     Args:
         dataset: The demonstrations.
-        episodes: Which of them; None takes all.
-        prompt_share: How often a moment is drawn from the prompt instead of the episode; an image of the
-            prompt looks unlike the table, and is found by the same detector.
+        episodes: Indices of the demonstrations to use; None takes all.
+        prompt_prob: Probability of sampling a prompt image instead of an observation.
     """
 
     def __init__(
-        self, dataset: Dataset, episodes: np.ndarray | None = None, *, prompt_share: float = 0.25
+        self, dataset: Dataset, episodes: np.ndarray | None = None, *, prompt_prob: float = 0.25
     ) -> None:
         self.dataset = dataset
         self.episodes = np.arange(len(dataset)) if episodes is None else episodes
-        self._prompt_share = prompt_share
+        self._prompt_prob = prompt_prob
 
     def __len__(self) -> int:
         return len(self.episodes)
 
-    def draw(self, number: int, rng: np.random.Generator) -> list[Frame]:
-        """Draw one moment of an episode and return its frames, front before top.
+    def sample(self, index: int, rng: np.random.Generator) -> list[Frame]:
+        """Sample one time step or prompt image and return its frames, front before top.
 
         Args:
-            number: Of the episode, from 0.
-            rng: Decides which moment.
+            index: Of the episode, among `episodes`.
+            rng: Selects the time step or prompt image.
         """
-        episode, of_prompt = int(self.episodes[number]), rng.random() < self._prompt_share
-        if of_prompt and (frames := self._prompt_frames(episode, rng)):
+        episode, from_prompt = int(self.episodes[index]), rng.random() < self._prompt_prob
+        if from_prompt and (frames := self._prompt_frames(episode, rng)):
             return frames
         kinds = [f"{kind}_{view}" for view in VIEWS for kind in ("rgb", "segm")]
         values = self.dataset.read(episode, [*kinds, "end_effector"])
@@ -91,39 +90,39 @@ class FrameSource:
         images = values["prompt_images"]
         if not images:
             return []
-        number = int(rng.integers(len(images)))
-        ids = [shown["id"] for shown in images[number]["objects"]]
-        return _both_views(values, number, ids, prefix="prompt_")
+        index = int(rng.integers(len(images)))
+        ids = [record["id"] for record in images[index]["objects"]]
+        return _both_views(values, index, ids, prefix="prompt_")
 
 
-def held_out_frames(source: FrameSource, count: int, *, seed: int) -> Iterator[Frame]:
-    """Yield frames to score a detector on, of as many episodes as possible.
+def held_out_frames(sampler: FrameSampler, count: int, *, seed: int) -> Iterator[Frame]:
+    """Yield frames to evaluate a detector on, from as many episodes as possible.
 
     Args:
-        source: Where they come from.
-        count: How many; rounded up to pairs of views.
-        seed: Decides which.
+        sampler: Source of the frames.
+        count: Number of frames; rounded up to pairs of views.
+        seed: Seed of the sampling.
 
     Raises:
         DatasetError: There is no episode.
     """
-    if not len(source):
+    if not len(sampler):
         raise DatasetError(
-            "there is no demonstration to look at; give more of them, or keep a larger share aside."
+            "there are no demonstrations to evaluate on; add some, or hold out a larger fraction."
         )
     rng = np.random.default_rng(seed)
-    order = rng.permutation(len(source))
-    for place in range((count + 1) // 2):
-        yield from source.draw(int(order[place % len(order)]), rng)
+    order = rng.permutation(len(sampler))
+    for index in range((count + 1) // 2):
+        yield from sampler.sample(int(order[index % len(order)]), rng)
 
 
 def _both_views(
-    values: Mapping[str, Any], number: int, ids: Sequence[int], *, prefix: str
+    values: Mapping[str, Any], index: int, ids: Sequence[int], *, prefix: str
 ) -> list[Frame]:  # Any: columns of several types
     return [
         frame_of(
-            np.ascontiguousarray(channels_first(values[f"{prefix}rgb_{view}"][number])),
-            values[f"{prefix}segm_{view}"][number],
+            np.ascontiguousarray(channels_first(values[f"{prefix}rgb_{view}"][index])),
+            values[f"{prefix}segm_{view}"][index],
             ids,
         )
         for view in VIEWS

@@ -1,61 +1,61 @@
-"""Which object each box is to learn, and which boxes a loss looks at."""
+"""Assignment of ground-truth objects to boxes, and sampling of boxes for a loss."""
 
 import torch
 
-from openvima.detector.boxes import overlaps
+from openvima.detector.boxes import box_iou
 
-BACKGROUND, IGNORED = 0, -1  # labels of boxes that match no object, and of those that nearly do
+FOREGROUND, BACKGROUND, IGNORED = 1, 0, -1  # labels of boxes
 
 
 def match(
-    boxes: torch.Tensor, objects: torch.Tensor, *, low: float, high: float, every_object: bool = False
+    boxes: torch.Tensor, objects: torch.Tensor, *, low: float, high: float, allow_low_quality: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Assign an object to each box.
+    """Assign a ground-truth object to each box.
 
     Args:
-        boxes: Shape (R, 4).
-        objects: Boxes of the objects of the image, shape (N, 4); there may be none.
-        low: Boxes whose best overlap is below show background.
-        high: Boxes whose best overlap is at least that show the object; those between are ignored.
-        every_object: Let the best boxes of each object show it, too, however little they overlap it.
+        boxes: Anchors or proposals, shape (R, 4).
+        objects: Ground-truth boxes, shape (N, 4); there may be none.
+        low: Boxes whose best IoU is below are background.
+        high: Boxes whose best IoU is at least that are foreground; those between are ignored.
+        allow_low_quality: Also label the best boxes of each object as foreground, whatever their IoU.
 
     Returns:
-        Number of the object that a box overlaps most, shape (R,), int64, 0 if there is none; and labels,
-        shape (R,), int64: 1, `BACKGROUND` or `IGNORED`.
+        Index of the object with the largest IoU, shape (R,), int64, 0 without objects; and labels,
+        shape (R,), int64: `FOREGROUND`, `BACKGROUND` or `IGNORED`.
     """
     if not len(objects):
         none = torch.zeros(len(boxes), dtype=torch.int64, device=boxes.device)
         return none, none.clone()
-    shared = overlaps(boxes, objects)
-    best, numbers = shared.max(dim=1)
-    labels = torch.full_like(numbers, IGNORED)
+    iou = box_iou(boxes, objects)
+    best, indices = iou.max(dim=1)
+    labels = torch.full_like(indices, IGNORED)
     labels[best < low] = BACKGROUND
-    labels[best >= high] = 1
-    if every_object:
-        most = shared.max(dim=0).values
-        labels[((shared == most) & (most > 0)).any(dim=1)] = 1
-    return numbers, labels
+    labels[best >= high] = FOREGROUND
+    if allow_low_quality:
+        most = iou.max(dim=0).values
+        labels[((iou == most) & (most > 0)).any(dim=1)] = FOREGROUND
+    return indices, labels
 
 
 def subsample(
-    labels: torch.Tensor, *, count: int, positive_share: float, generator: torch.Generator
+    labels: torch.Tensor, *, count: int, positive_fraction: float, generator: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw boxes for a loss.
+    """Sample boxes for a loss.
 
     Args:
-        labels: Shape (R,), as `match` gives them.
-        count: How many; fewer if there are not as many.
-        positive_share: At most so many of `count` show an object; the rest is background.
-        generator: On the processor, whatever the device of the labels.
+        labels: Shape (R,), as returned by `match`.
+        count: Number of boxes; fewer if there are not as many.
+        positive_fraction: Largest fraction of foreground boxes; the rest is background.
+        generator: On the CPU, whatever the device of the labels.
 
     Returns:
-        Indices of those that show an object, and of those that do not.
+        Indices of foreground boxes and of background boxes.
     """
-    positive, negative = (labels == 1).nonzero()[:, 0], (labels == BACKGROUND).nonzero()[:, 0]
-    num_positive = min(len(positive), int(count * positive_share))
+    positive, negative = ((labels == label).nonzero()[:, 0] for label in (FOREGROUND, BACKGROUND))
+    num_positive = min(len(positive), int(count * positive_fraction))
     num_negative = min(len(negative), count - num_positive)
-    return _drawn(positive, num_positive, generator), _drawn(negative, num_negative, generator)
+    return _sample(positive, num_positive, generator), _sample(negative, num_negative, generator)
 
 
-def _drawn(indices: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
+def _sample(indices: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
     return indices[torch.randperm(len(indices), generator=generator)[:count].to(indices.device)]

@@ -72,7 +72,7 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
     Args:
         env: The environment; it is left as it is.
         ablation: One of `ABLATIONS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
-            `openvima.detector.hooks`.
+            `openvima.detector.plugins`.
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.

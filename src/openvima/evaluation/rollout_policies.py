@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Protocol
 
-from openvima.detector.hooks import plugged_extractor
+from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation.ablations import AblatedInput, ablate

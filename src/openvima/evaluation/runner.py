@@ -10,7 +10,7 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
-from openvima.detector.hooks import extractor_maker
+from openvima.detector.plugins import extractor_maker
 from openvima.errors import ConfigError
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results

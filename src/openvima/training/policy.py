@@ -6,7 +6,7 @@ from pathlib import Path
 from openvima.catalog.packs import load_assets
 from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
 from openvima.data.reader import Dataset
-from openvima.detector.hooks import detected_object_cache, plugged_boxes
+from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops

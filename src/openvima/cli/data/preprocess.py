@@ -39,7 +39,7 @@ def tokens(
     """
     from openvima.data.object_cache.cache import open_object_cache
     from openvima.data.reader import Dataset
-    from openvima.detector.hooks import detected_object_cache, plugged_boxes
+    from openvima.detector.plugins import detected_object_cache, plugged_boxes
     from openvima.errors import ConfigError
 
     if boxes is not None and kind == "frames":

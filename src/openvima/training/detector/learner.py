@@ -10,7 +10,7 @@ import torch
 
 from openvima.detector.checkpoint import load_weights, write_network
 from openvima.detector.frames import Frame
-from openvima.detector.network import MaskRCNN, Objects
+from openvima.detector.network import Instances, MaskRCNN
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.training.learner import Learner
 
@@ -26,7 +26,7 @@ class FrameBatch:
     """
 
     images: torch.Tensor
-    objects: Sequence[Objects]
+    objects: Sequence[Instances]
     generator: torch.Generator
 
     @staticmethod
@@ -34,7 +34,7 @@ class FrameBatch:
         """Put frames into tensors."""
         images = torch.from_numpy(np.stack([frame.rgb for frame in frames]))
         objects = [
-            Objects(
+            Instances(
                 torch.from_numpy(frame.boxes), torch.from_numpy(frame.masks), torch.ones(len(frame.boxes))
             )
             for frame in frames

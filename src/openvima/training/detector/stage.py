@@ -8,11 +8,11 @@ import torch
 
 from openvima.data.batching import BatchOrder
 from openvima.data.reader import Dataset
-from openvima.detector.augment import augmented
+from openvima.detector.augmentation import augment_frame
 from openvima.detector.checkpoint import load_network
 from openvima.detector.config import detector_config
 from openvima.detector.detectron2 import load_detectron2
-from openvima.detector.frames import Frame, FrameSource, held_out_frames
+from openvima.detector.frames import Frame, FrameSampler, held_out_frames
 from openvima.detector.network import MaskRCNN
 from openvima.errors import ConfigError, DatasetError
 from openvima.policies.devices import torch_threads
@@ -61,8 +61,8 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             compile_layers(learner)
 
         def make() -> DetectorStage:
-            source = FrameSource(dataset, training, prompt_share=loader.prompt_prob)
-            kept = FrameSource(dataset, held_out, prompt_share=loader.prompt_prob)
+            source = FrameSampler(dataset, training, prompt_prob=loader.prompt_prob)
+            kept = FrameSampler(dataset, held_out, prompt_prob=loader.prompt_prob)
             frames = list(held_out_frames(kept, loader.validation_frames, seed=config.seed))
             return DetectorStage(learner, config, source, frames, parallel)
 
@@ -87,7 +87,7 @@ class DetectorStage:
         self,
         learner: DetectorLearner,
         config: DetectorTrainingConfig,
-        source: FrameSource,
+        source: FrameSampler,
         held_out: Sequence[Frame],
         parallel: Parallel,
     ) -> None:
@@ -131,8 +131,8 @@ class DetectorStage:
         frames = []
         for row in self._order.rows(step).tolist():
             rng = np.random.default_rng([self._config.seed, step, row])
-            drawn = self._source.draw(row, rng)
-            frames += [augmented(f, rng) for f in drawn] if self._config.loader.augment else drawn
+            drawn = self._source.sample(row, rng)
+            frames += [augment_frame(f, rng) for f in drawn] if self._config.loader.augment else drawn
         return frames
 
 

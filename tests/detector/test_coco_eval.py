@@ -1,4 +1,4 @@
-"""COCO metrics of detectors whose scores are known, and pictures."""
+"""COCO metrics of detectors with known scores, and drawn detections."""
 
 import sys
 
@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from openvima.detector.pictures import draw_detections, save_sheet
+from openvima.detector.visualize import draw_detections, save_grid
 from openvima.errors import ConfigError, MissingExtraError
 from openvima.policies.detection import Detections
 
 coco = pytest.importorskip("pycocotools")
-from openvima.detector.scoring import score_detector  # noqa: E402
+from openvima.detector.coco_eval import evaluate_detector  # noqa: E402
 
 
-class Knowing:
-    """Gives what the frames show, in turn, changed by a function of boxes, masks and scores."""
+class Truthful:
+    """Returns the ground truth of the frames in turn, modified by a function."""
 
     def __init__(self, frames, change=lambda boxes, masks, scores: (boxes, masks, scores)):
         self.frames, self.change = iter(frames), change
@@ -31,51 +31,51 @@ def frames(rectangles):
     return [rectangles(seed) for seed in range(6)]
 
 
-def test_who_knows_everything_scores_one(frames):
-    score = score_detector(Knowing(frames), frames)
+def test_ground_truth_scores_one(frames):
+    score = evaluate_detector(Truthful(frames), frames)
     assert (score.frames, score.objects) == (6, 12)
     for precision in (score.boxes, score.masks):
         assert precision.ap == precision.ap50 == precision.ap75 == precision.recall == pytest.approx(1)
 
 
-def test_who_finds_one_of_two_scores_half(frames):
-    half = Knowing(frames, lambda boxes, masks, scores: (boxes[:1], masks[:1], scores[:1]))
-    score = score_detector(half, frames)
+def test_half_of_the_objects_score_half(frames):
+    half = Truthful(frames, lambda boxes, masks, scores: (boxes[:1], masks[:1], scores[:1]))
+    score = evaluate_detector(half, frames)
     assert score.boxes.recall == pytest.approx(0.5)
     assert score.boxes.ap50 == pytest.approx(0.5, abs=0.01)  # COCO's curve has 101 points
 
 
-def test_boxes_of_two_thirds_count_at_50_and_not_at_75(frames):
+def test_boxes_of_iou_two_thirds_count_at_50_and_not_at_75(frames):
     def shortened(boxes, masks, scores):
         boxes = boxes.copy()
         boxes[:, 3] -= np.round((boxes[:, 3] - boxes[:, 1] + 1) / 3).astype(np.int64)
         return boxes, masks, scores
 
-    score = score_detector(Knowing(frames, shortened), frames)
+    score = evaluate_detector(Truthful(frames, shortened), frames)
     assert score.boxes.ap50 == pytest.approx(1) and score.boxes.ap75 == 0
     assert score.masks.ap == pytest.approx(1)  # masks are as they were
 
 
-def test_who_finds_nothing_scores_nothing(frames):
-    blind = Knowing(frames, lambda boxes, masks, scores: (boxes[:0], masks[:0], scores[:0]))
-    assert score_detector(blind, frames).boxes.ap50 == 0
+def test_no_detections_score_zero(frames):
+    blind = Truthful(frames, lambda boxes, masks, scores: (boxes[:0], masks[:0], scores[:0]))
+    assert evaluate_detector(blind, frames).boxes.ap50 == 0
 
 
-def test_frames_without_objects_cannot_score_anything(rectangles):
+def test_frames_without_objects_are_rejected(rectangles):
     frame = rectangles()
     empty = type(frame)(frame.rgb, frame.boxes[:0], frame.masks[:0])
     with pytest.raises(ConfigError, match="no object"):
-        score_detector(Knowing([empty]), [empty])
+        evaluate_detector(Truthful([empty]), [empty])
 
 
 def test_without_pycocotools_the_extra_is_named(frames, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycocotools", None)
     with pytest.raises(MissingExtraError, match=r"openvima\[detector\]"):
-        score_detector(Knowing(frames), frames)
+        evaluate_detector(Truthful(frames), frames)
 
 
 @pytest.mark.parametrize("background", [0, 255])
-def test_boxes_of_known_objects_are_seen_on_black_and_on_white(rectangles, background):
+def test_ground_truth_boxes_are_visible_on_black_and_on_white(rectangles, background):
     frame = rectangles()
     plain = type(frame)(np.full_like(frame.rgb, background), frame.boxes, frame.masks)
     nothing = Detections(np.zeros((0, 4), np.int64), np.zeros((0, 64, 96), bool), np.zeros(0))
@@ -85,15 +85,15 @@ def test_boxes_of_known_objects_are_seen_on_black_and_on_white(rectangles, backg
             assert 0.3 < (line != background).all(axis=1).mean() < 0.7
 
 
-def test_pictures_show_what_is_sure_enough(rectangles, tmp_path):
+def test_images_show_detections_above_the_score(rectangles, tmp_path):
     frame = rectangles()
     boxes = frame.boxes.astype(np.int64) - [0, 0, 1, 1]
     found = Detections(boxes, frame.masks, np.array([0.9, 0.1]))
-    picture = np.asarray(draw_detections(frame, found))
+    image = np.asarray(draw_detections(frame, found))
     plain = np.asarray(draw_detections(frame, found.select(np.zeros(2, bool))))
-    assert picture.shape == (192, 288, 3)
-    assert not np.array_equal(picture[:, :140], plain[:, :140])
-    assert np.array_equal(picture[:, 150:], plain[:, 150:])
-    save_sheet([draw_detections(frame, found)] * 3, tmp_path / "sheet.png")
+    assert image.shape == (192, 288, 3)
+    assert not np.array_equal(image[:, :140], plain[:, :140])
+    assert np.array_equal(image[:, 150:], plain[:, 150:])
+    save_grid([draw_detections(frame, found)] * 3, tmp_path / "sheet.png")
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.size == (2 * 296 + 8, 2 * 200 + 8)

@@ -1,9 +1,9 @@
-"""Detectors that users name in a word, for evaluations, films and training.
+"""Object extractors by name, for the option `--boxes` of evaluation, demo and training.
 
-detector                       the one that comes with the package
-detector=FOLDER                one that `openvima detector train` made
-MODULE:FUNCTION                a function without arguments that gives an `ObjectExtractor`
-FILE.py:FUNCTION               the same, in a file that lies anywhere
+detector                       the bundled detector
+detector=FOLDER                a detector trained with `openvima detector train`
+MODULE:FUNCTION                a function without arguments that returns an `ObjectExtractor`
+FILE.py:FUNCTION               the same, from a Python file
 """
 
 import hashlib
@@ -31,61 +31,62 @@ from openvima.scene import PromptImage
 DETECTOR = "detector"
 _FORM = (
     "detector, detector=FOLDER of a trained one, or MODULE:FUNCTION or FILE.py:FUNCTION, a function without "
-    "arguments that gives an ObjectExtractor"
+    "arguments that returns an ObjectExtractor"
 )
-_DIGEST_BYTES = 5  # of the names of folders
+_DIGEST_BYTES = 5  # in cache folder names
 
 
-def extractor_maker(hook: str) -> Callable[[], object]:
-    """Find the function that makes the detector.
+def extractor_maker(source: str) -> Callable[[], object]:
+    """Return the function that makes an extractor.
 
     Args:
-        hook: One of the forms above.
+        source: One of the forms above.
 
     Raises:
         ConfigError: There is no such module, file or function.
         CheckpointError: There is no trained detector.
     """
-    folder = _folder_of(hook)
-    return _function_of(hook)[1] if folder is None else partial(load_extractor, folder)
+    folder = _folder_of(source)
+    return _function_of(source)[1] if folder is None else partial(load_extractor, folder)
 
 
-def plugged_extractor(hook: str) -> ObjectExtractor:
-    """Make the detector; an observation in which it finds nothing does not stop the policy.
+def plugged_extractor(source: str) -> ObjectExtractor:
+    """Make an extractor that tolerates observations without detections.
 
     Raises:
-        ConfigError: There is no such function, or it gives something else.
+        ConfigError: There is no such function, or it returns something else.
         CheckpointError: There is no trained detector, or it is damaged.
     """
-    extractor = extractor_maker(hook)()
+    extractor = extractor_maker(source)()
     if not (hasattr(extractor, "in_observation") and hasattr(extractor, "in_prompt_image")):
-        raise ConfigError(f"{hook} gave a {type(extractor).__name__}; it must give an ObjectExtractor.")
+        raise ConfigError(
+            f"{source} returned a {type(extractor).__name__}; it must return an ObjectExtractor."
+        )
     return PluggedExtractor(cast(ObjectExtractor, extractor))  # it has both methods
 
 
-def plugged_boxes(hook: str) -> Boxes:
-    """Return the detector as what the token cache is made with.
+def plugged_boxes(source: str) -> Boxes:
+    """Return an extractor as the source of boxes for the object cache.
 
-    Its name follows from the weights and sizes of a trained detector, wherever it lies, and its least score.
-    Of a function it follows from its own name and the content of its file; what else it reads is not looked
-    at.
+    The cache name of a trained detector is a hash of its weights, config and score threshold. That of a
+    function is a hash of its source file; other files that it reads are not hashed.
 
     Raises:
         ConfigError: There is no such function.
         CheckpointError: There is no trained detector, or it is damaged.
     """
-    folder = _folder_of(hook)
+    folder = _folder_of(source)
     if folder is not None:
         detector = load_detector(folder)
         sizes, least = detector.network.config.to_dict(), DetectedObjects(detector).min_score
         weights = hashlib.blake2b((checkpoint_folder(folder) / WEIGHTS_FILE).read_bytes()).hexdigest()
         name, content = DETECTOR, json.dumps([sizes, least, weights], sort_keys=True).encode()
     else:
-        module, _ = _function_of(hook)
-        source, name = getattr(module, "__file__", None), hook.rpartition(":")[2]
-        content = Path(source).read_bytes() if source else hook.encode()
+        module, _ = _function_of(source)
+        file, name = getattr(module, "__file__", None), source.rpartition(":")[2]
+        content = Path(file).read_bytes() if file else source.encode()
     digest = hashlib.blake2b(content, digest_size=_DIGEST_BYTES).hexdigest()
-    return Boxes(f"{name}-{digest}", partial(plugged_extractor, hook))
+    return Boxes(f"{name}-{digest}", partial(plugged_extractor, source))
 
 
 def detected_object_cache(
@@ -96,20 +97,20 @@ def detected_object_cache(
     workers: int = 1,
     report: Report | None = None,
 ) -> ObjectCache:
-    """Open the tokens of the objects that a detector finds; make what is missing.
+    """Open the object cache of a detector and fill in missing files.
 
-    A detector computes on one thread here, so that the files are the same for any number of workers.
+    The detector computes on one thread, so that the files do not depend on the number of workers.
 
     Args:
         dataset: The demonstrations.
-        boxes: The detector, as from `plugged_boxes`.
+        boxes: The detector, from `plugged_boxes`.
         folder: As in `open_object_cache`.
         workers: As in `open_object_cache`.
         report: As in `open_object_cache`.
 
     Raises:
-        ConfigError: The detector gives something else than it should.
-        DatasetError: The folder cannot be written to.
+        ConfigError: The detector returns something else than objects.
+        DatasetError: The folder is not writable.
     """
 
     def say(done: int, total: int, note: str) -> None:
@@ -122,49 +123,49 @@ def detected_object_cache(
 
 @dataclass(frozen=True, slots=True)
 class PluggedExtractor:
-    """Shows only what some view shows, and one hidden object where a detector finds nothing.
+    """Keeps visible objects only, and returns one masked object where nothing is detected.
 
-    An episode in which nothing is found then fails, and the others go on.
+    An episode without detections then fails without stopping the others.
 
     Args:
-        extractor: The detector.
+        extractor: The wrapped extractor.
     """
 
     extractor: ObjectExtractor
 
     def in_observation(self, observation: Mapping) -> ObjectViews:
-        """Find the objects of an observation, at least a hidden one."""
-        found = _shown(self.extractor.in_observation(observation))
+        """Extract the objects of an observation, at least one masked object."""
+        found = _visible(self.extractor.in_observation(observation))
         return found if len(found) else see_nothing(1)
 
     def in_prompt_image(self, image: PromptImage) -> ObjectViews:
-        """Find the objects that a prompt's image shows; there may be none."""
-        return _shown(self.extractor.in_prompt_image(image))
+        """Extract the objects of a prompt image; there may be none."""
+        return _visible(self.extractor.in_prompt_image(image))
 
 
-def _shown(found: ObjectViews) -> ObjectViews:
+def _visible(found: ObjectViews) -> ObjectViews:
     visible = found.visible()
     return found if visible.all() else found.select(visible)
 
 
-def _folder_of(hook: str) -> Path | None:
-    """The folder of a trained detector; None for other hooks."""
-    name, _, folder = hook.partition("=")
+def _folder_of(source: str) -> Path | None:
+    """The folder of a trained detector; None for other forms."""
+    name, _, folder = source.partition("=")
     return detector_folder(folder or None) if name == DETECTOR else None
 
 
-def _function_of(hook: str) -> tuple[ModuleType, Callable[[], object]]:
-    """The module or file that a hook names, and its function."""
-    where, _, name = hook.rpartition(":")
+def _function_of(source: str) -> tuple[ModuleType, Callable[[], object]]:
+    """Import the module or file, and look up the function."""
+    where, _, name = source.rpartition(":")
     if not where or not name:
-        raise ConfigError(f"boxes is {hook!r}; give {_FORM}.")
+        raise ConfigError(f"boxes is {source!r}; give {_FORM}.")
     try:
         module = _import_file(Path(where)) if where.endswith(".py") else importlib.import_module(where)
     except (ImportError, OSError) as error:
-        raise ConfigError(f"boxes is {hook!r}, but {where} cannot be imported ({error}).") from error
+        raise ConfigError(f"boxes is {source!r}, but {where} cannot be imported ({error}).") from error
     made = getattr(module, name, None)
     if not callable(made):
-        raise ConfigError(f"boxes is {hook!r}, but {where} has no function {name!r}; give {_FORM}.")
+        raise ConfigError(f"boxes is {source!r}, but {where} has no function {name!r}; give {_FORM}.")
     return module, made
 
 
@@ -180,7 +181,7 @@ def _import_file(path: Path) -> ModuleType:
 
 
 def _one_thread() -> AbstractContextManager[None]:
-    """Keep torch to one thread, if it is there; a detector of one's own may need none."""
+    """Limit torch to one thread if it is installed; a custom extractor may not need it."""
     try:
         from openvima.policies.devices import torch_threads
     except ImportError:

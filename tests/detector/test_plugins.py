@@ -1,4 +1,4 @@
-"""Detectors named in a word: how they are found, named and made into tokens."""
+"""Extractors by name: lookup, cache names and object caches."""
 
 import pickle
 import shutil
@@ -12,7 +12,7 @@ import pytest
 from object_rows import rows_of
 from openvima.data import Dataset
 from openvima.data.object_cache.episode import preprocess
-from openvima.detector.hooks import detected_object_cache, plugged_boxes, plugged_extractor
+from openvima.detector.plugins import detected_object_cache, plugged_boxes, plugged_extractor
 from openvima.env import TabletopEnv
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.objects import GROUND_TRUTH, GroundTruth
@@ -44,10 +44,10 @@ def test_where_something_is_found_it_is_left_as_it_is():
         ("no_such_module:make", "cannot be imported"),
         ("no/such/file.py:make", "cannot be imported"),
         ("openvima.perception.objects:make", "has no function 'make'"),
-        ("builtins:dict", "gave a dict"),
+        ("builtins:dict", "returned a dict"),
     ],
 )
-def test_what_makes_no_detector_is_named(hook, message):
+def test_an_invalid_source_is_named(hook, message):
     with pytest.raises(ConfigError, match=message):
         plugged_extractor(hook)
 
@@ -85,7 +85,7 @@ def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tin
     from openvima.detector.network import MaskRCNN
 
     names = []
-    for number, config in enumerate((tiny, tiny, replace(tiny, overlap=0.4))):
+    for number, config in enumerate((tiny, tiny, replace(tiny, nms_iou=0.4))):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(min(number, 1))
             save_network(MaskRCNN(config), tmp_path / str(number))
@@ -97,12 +97,12 @@ def test_the_name_of_a_detector_follows_from_its_weights_and_sizes(tmp_path, tin
     assert all(name.startswith("detector-") for name in names)
 
 
-def test_tokens_of_a_detector_are_those_of_its_extractor_on_one_thread(tmp_path, tiny, data):
+def test_the_object_cache_of_a_detector_equals_its_extractor_on_one_thread(tmp_path, tiny, data):
     torch = pytest.importorskip("torch")
     from openvima.detector.checkpoint import save_network
     from openvima.detector.network import MaskRCNN
 
-    save_network(MaskRCNN(replace(tiny, candidates=4, proposals=3)), tmp_path / "detector")
+    save_network(MaskRCNN(replace(tiny, rpn_pre_nms_top_n=4, rpn_post_nms_top_n=3)), tmp_path / "detector")
     boxes = plugged_boxes(f"detector={tmp_path / 'detector'}")
     assert pickle.loads(pickle.dumps(boxes)) == boxes
     dataset, threads = Dataset(data, tasks=["rotate"]), torch.get_num_threads()

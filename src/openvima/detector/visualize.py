@@ -1,4 +1,4 @@
-"""Pictures of detections to look at: masks in colour, boxes and scores; dashed boxes where objects are."""
+"""Images of detections: coloured masks, boxes and scores; ground-truth boxes are dashed."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -13,19 +13,19 @@ from openvima.policies.detection import Detections
 from openvima.render import channels_last
 
 COLOURS = ((0, 158, 115), (230, 159, 0), (86, 180, 233), (204, 121, 167), (240, 228, 66), (213, 94, 0))
-KNOWN, UNDER_KNOWN = (255, 255, 255), (0, 0, 0)  # one of them can be seen on any background
-PAPER = (214, 214, 214)  # pictures of prompts are white
-ENLARGE, GAP = 3, 8
+DASHES = ((255, 255, 255), (0, 0, 0))  # visible on any background
+SHEET = (214, 214, 214)  # prompt images are white
+SCALE, GAP = 3, 8
 DASH = 6  # pixels
 
 
 def draw_detections(frame: Frame, found: Detections, *, score: float = 0.5) -> Image.Image:
-    """Draw what was found in a frame.
+    """Draw the detections of a frame.
 
     Args:
-        frame: The image and the objects that it shows, whose boxes are dashed.
-        found: What a detector found.
-        score: What is below is left out.
+        frame: The frame; its ground-truth boxes are dashed.
+        found: The detections.
+        score: Least score of the detections that are drawn.
     """
     scores = np.ones(len(found)) if found.scores is None else found.scores
     found = found.select(scores >= score)
@@ -33,43 +33,44 @@ def draw_detections(frame: Frame, found: Detections, *, score: float = 0.5) -> I
     for number, mask in enumerate(found.masks if found.masks is not None else ()):
         rgb[mask] = 0.55 * rgb[mask] + 0.45 * np.array(COLOURS[number % len(COLOURS)])
     height, width = rgb.shape[:2]
-    picture = Image.fromarray(rgb.astype(np.uint8)).resize(
-        (ENLARGE * width, ENLARGE * height), Image.Resampling.NEAREST
+    image = Image.fromarray(rgb.astype(np.uint8)).resize(
+        (SCALE * width, SCALE * height), Image.Resampling.NEAREST
     )
-    draw = ImageDraw.Draw(picture)
-    for edges in frame.boxes * ENLARGE:
-        _dashed(draw, edges.tolist())
+    draw = ImageDraw.Draw(image)
+    for edges in frame.boxes * SCALE:
+        _draw_dashed_box(draw, edges.tolist())
     for number, (left, upper, right, lower) in enumerate(found.boxes.tolist()):
         colour = COLOURS[number % len(COLOURS)]
-        corners = [ENLARGE * left, ENLARGE * upper, ENLARGE * (right + 1) - 1, ENLARGE * (lower + 1) - 1]
+        corners = [SCALE * left, SCALE * upper, SCALE * (right + 1) - 1, SCALE * (lower + 1) - 1]
         draw.rectangle(corners, outline=colour, width=2)
         if found.scores is not None:
             text = f"{found.scores[number]:.2f}"
             draw.text((corners[0] + 2, max(0, corners[1] - 12)), text, fill=colour)
-    return picture
+    return image
 
 
-def save_sheet(pictures: Sequence[Image.Image], path: Path, *, columns: int = 2) -> None:
-    """Write pictures of one size side by side and below each other, on grey, as a PNG file."""
-    width, height = pictures[0].size
-    rows = -(-len(pictures) // columns)
+def save_grid(images: Sequence[Image.Image], path: Path, *, columns: int = 2) -> None:
+    """Write images of one size as a grid to a PNG file."""
+    width, height = images[0].size
+    rows = -(-len(images) // columns)
     size = (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP)
-    sheet = Image.new("RGB", size, PAPER)
-    for number, picture in enumerate(pictures):
+    sheet = Image.new("RGB", size, SHEET)
+    for number, image in enumerate(images):
         row, column = divmod(number, columns)
-        sheet.paste(picture, (GAP + column * (width + GAP), GAP + row * (height + GAP)))
+        sheet.paste(image, (GAP + column * (width + GAP), GAP + row * (height + GAP)))
     content = BytesIO()
     sheet.save(content, "PNG", optimize=True)
     atomic_write_file(path, content.getvalue())
 
 
-def _dashed(draw: ImageDraw.ImageDraw, edges: Sequence[float]) -> None:
+def _draw_dashed_box(draw: ImageDraw.ImageDraw, edges: Sequence[float]) -> None:
     left, upper, right, lower = edges
     right, lower = right - 1, lower - 1
-    draw.rectangle([left, upper, right, lower], outline=UNDER_KNOWN)
+    light, dark = DASHES
+    draw.rectangle([left, upper, right, lower], outline=dark)
     for x in np.arange(left, right, 2 * DASH).tolist():
         for y in (upper, lower):
-            draw.line([x, y, min(x + DASH, right), y], fill=KNOWN)
+            draw.line([x, y, min(x + DASH, right), y], fill=light)
     for y in np.arange(upper, lower, 2 * DASH).tolist():
         for x in (left, right):
-            draw.line([x, y, x, min(y + DASH, lower)], fill=KNOWN)
+            draw.line([x, y, x, min(y + DASH, lower)], fill=light)

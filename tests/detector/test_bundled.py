@@ -1,4 +1,4 @@
-"""The trained detector that comes with the package."""
+"""The bundled detector."""
 
 import numpy as np
 import pytest
@@ -26,9 +26,9 @@ def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
         for image in env.prompt.images.values():
             pairs.append((extractor.in_prompt_image(image), GROUND_TRUTH.in_prompt_image(image)))
         for found, true in pairs:
-            shown = true.masks.any(axis=0)
-            num_true += int(np.count_nonzero(shown))
+            visible = true.masks.any(axis=0)
+            num_true += int(np.count_nonzero(visible))
             num_right += len(match_ids_to_slots(found, true))
             num_found += len(found)
     assert num_right >= 0.95 * num_true
-    assert num_found <= 1.25 * num_true  # objects that are told in parts, and those that are none
+    assert num_found <= 1.25 * num_true  # split objects and false positives

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of what a detector computes: plain Python, one number after the other."""
+"""Naive implementations of the detector's operations, in plain Python."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 Box = tuple[float, float, float, float]
 
 
-def overlap(first: Box, second: Box) -> float:
+def box_iou(first: Box, second: Box) -> float:
     """Intersection over union of two boxes."""
     width = min(first[2], second[2]) - max(first[0], second[0])
     height = min(first[3], second[3]) - max(first[1], second[1])
@@ -17,12 +17,12 @@ def overlap(first: Box, second: Box) -> float:
     return width * height / (sum(sizes) - width * height)
 
 
-def suppress(boxes: list[Box], scores: list[float], limit: float, groups: list[int]) -> list[int]:
-    """Go through the boxes from the best to the worst and keep what overlaps none that was kept."""
+def nms(boxes: list[Box], scores: list[float], limit: float, groups: list[int]) -> list[int]:
+    """Go through the boxes from the best to the worst and keep what overlaps no kept box."""
     kept: list[int] = []
     for number in sorted(range(len(boxes)), key=lambda number: (-scores[number], number)):
         rivals = [other for other in kept if groups[other] == groups[number]]
-        if all(overlap(boxes[other], boxes[number]) <= limit for other in rivals):
+        if all(box_iou(boxes[other], boxes[number]) <= limit for other in rivals):
             kept.append(number)
     return kept
 
@@ -65,12 +65,12 @@ def read_point(image: np.ndarray, x: float, y: float) -> float:
     return float((1 - under) * above + under * below)
 
 
-def roi_align(image: np.ndarray, box: Box, *, size: int, stride: float, samples: int) -> np.ndarray:
+def roi_align(image: np.ndarray, box: Box, *, size: int, stride: float, sampling_ratio: int) -> np.ndarray:
     """Averages of an image (H, W) over the cells of a grid inside a box, shape (size, size)."""
     left, upper, right, lower = (edge / stride - 0.5 for edge in box)
     cell_width, cell_height = (right - left) / size, (lower - upper) / size
-    columns = samples or max(1, math.ceil(cell_width))
-    rows = samples or max(1, math.ceil(cell_height))
+    columns = sampling_ratio or max(1, math.ceil(cell_width))
+    rows = sampling_ratio or max(1, math.ceil(cell_height))
     cells = np.zeros((size, size))
     for row in range(size):
         for column in range(size):
@@ -87,10 +87,10 @@ def roi_align(image: np.ndarray, box: Box, *, size: int, stride: float, samples:
     return cells
 
 
-def paste(shares: np.ndarray, box: Box, *, height: int, width: int) -> np.ndarray:
+def paste(probabilities: np.ndarray, box: Box, *, height: int, width: int) -> np.ndarray:
     """Which pixels of an image have their centre inside a mask known at the centres of cells (S, S)."""
-    size = len(shares)
-    padded = np.pad(shares, 1)  # nothing lies outside
+    size = len(probabilities)
+    padded = np.pad(probabilities, 1)  # nothing lies outside
     inside = np.zeros((height, width), bool)
     for row in range(height):
         for column in range(width):
