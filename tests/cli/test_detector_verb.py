@@ -143,4 +143,4 @@ def test_demo_films_with_the_boxes_of_a_trained_detector(detector, tmp_path, cap
     assert main([*words, "--boxes", f"detector={detector}"]) == 0
     assert film.stat().st_size > 0
     assert main(["demo", "rotate", "--boxes", "detector"]) == 2
-    assert "looks at no boxes" in capsys.readouterr().err
+    assert "uses no boxes" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`openvima demo`: film the oracle or a policy at work on one task."""
+"""`openvima demo`: record a video of the oracle or of a policy on one task."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,7 @@ def main(
     device: str = "cpu",
     boxes: str | None = None,
 ) -> int:
-    """Film one episode: the prompt above, the table and the arm below.
+    """Record one episode: the prompt above, the table and the arm below.
 
     Example: openvima demo rotate --seed 3 --out rotate.mp4
 
@@ -35,9 +35,8 @@ def main(
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
-        boxes: Let the policy see the boxes of a detector instead of the true ones: "detector" for the one
-            that comes with the package, detector=FOLDER for one that `openvima detector train` made, or
-            MODULE:FUNCTION.
+        boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
+            detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -47,9 +46,9 @@ def main(
 
     level = task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
-        raise ConfigError(f"--out is {str(out)!r}; a film is an MP4 file, give a name that ends in .mp4.")
+        raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
     if boxes is not None and policy in ("oracle", "random"):
-        raise ConfigError(f"--boxes is {boxes!r}, but {policy} looks at no boxes; name a trained policy.")
+        raise ConfigError(f"--boxes is {boxes!r}, but {policy} uses no boxes; name a trained policy.")
     from openvima.env import EnvConfig
     from openvima.evaluation.config import Batch
     from openvima.evaluation.recording import record_episode

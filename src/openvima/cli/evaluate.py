@@ -47,12 +47,12 @@ def main(
     """Score policies on tasks and levels, and write results.json and report.html.
 
     The numbers depend on neither the number of workers nor the machine's load. An interrupted evaluation
-    goes on where it stopped.
+    resumes.
 
     Example: openvima evaluate --policy mine=runs/first --ablations all --levels L1,L2 --workers 2
 
     Args:
-        policy: One or more of openvima-small (trained, comes with the package), oracle, random, untrained,
+        policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
             presets, folders of training runs, published files, ids on the Hugging Face Hub and policy servers
             (ws://HOST:PORT, see `openvima serve`), with commas in between; NAME=FOLDER and NAME=ws://… give
             another name.
@@ -60,19 +60,19 @@ def main(
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
-        workers: Processes; by default one, or all processors of the Ray cluster at --address.
+        workers: Processes; by default one, or all CPUs of the Ray cluster at --address.
         out: Folder to write to.
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
-        compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
+        compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
         difficulty: easy, as for all published results, medium or hard.
-        ablations: What to play besides, to show what the score is made of, with commas in between: no_prompt,
-            other_prompt_images, scrambled_words, shuffled_objects, detected_boxes, random, oracle; or all.
+        ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
+            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all.
         boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
             comes with the package, detector=FOLDER for one that `openvima detector train` made, or
             MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectExtractor.
-        in_context: Play each episode also with a demonstration of it as the prompt, "Follow this motion: …";
+        in_context: Also prompt with a demonstration of each episode, "Follow this motion: …";
             by default of twist, follow_motion and follow_order, for policies trained without these tasks.
-        batch: Episodes that are played together; a policy decides for all of them at once.
+        batch: Episodes that are run together, with batched inference.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         videos: Solved episodes to record, and failures, of each trained policy and task.

@@ -1,19 +1,19 @@
-"""Ablations: what a score is made of. Each takes one thing away from a policy; the episode stays.
+"""Input ablations: each removes or replaces one input of a policy on the same episodes.
 
-| ablation | what the policy gets |
+| ablation | input of the policy |
 |---|---|
-| `no_prompt` | the same prompt in all episodes of all tasks: one full stop and no image |
+| `no_prompt` | the same prompt in every episode: one full stop and no image |
 | `other_prompt_images` | its own words, with the images of another episode of the task and level |
-| `scrambled_words` | its own images; each word, number and mark of the text is some word of the vocabulary |
-| `shuffled_objects` | object ids dealt out anew, in the segmentations and in the records of the prompt |
-| `detected_boxes` | boxes that a plugged-in detector finds in the pixels |
-| `in_context` | in place of the task's prompt the motion of the oracle in the same episode |
+| `scrambled_words` | its own images; each word, number and mark replaced by a random word of the vocabulary |
+| `shuffled_objects` | permuted object ids, in segmentations and in the records of the prompt |
+| `detected_boxes` | boxes from a detector |
+| `in_context` | a demonstration of the oracle in the same episode as the prompt |
 
-What is drawn follows from the episode's task, level and seed, so neither the batch nor the number of workers
-changes it. Starts, goals and time limits are those of the plain score.
+Random choices follow from the episode's task, level and seed, not from the batch or the number of workers.
+Starts, goals and step limits stay the same.
 
-A prompt goes on listing the objects of an image in the same order under `shuffled_objects`: a policy that
-does not look at ids, nor orders by them, acts exactly as without the ablation.
+`shuffled_objects` keeps the order in which a prompt lists the objects of an image: a policy that ignores ids
+and their order acts exactly as without the ablation.
 """
 
 import re
@@ -49,30 +49,30 @@ _PIECE = re.compile(r"\{\w+\}|[A-Za-z]+(?:-[A-Za-z]+)*|\d+|\S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AblatedInput:
-    """What a policy gets to see of one episode.
+    """Inputs of a policy in one episode.
 
     Args:
-        prompt: What it is told.
-        id_map: For each object id the one that it is shown under, shape (256,), uint8; None: its own.
+        prompt: The prompt.
+        id_map: Maps each object id to that in observations, shape (256,), uint8; None is the identity.
     """
 
     prompt: RenderedPrompt
     id_map: np.ndarray | None = None
 
     def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
-        """Return an observation as the policy sees it."""
+        """Return an observation with mapped ids."""
         if self.id_map is None:
             return observation
         return {**observation, "segm": _renumbered(observation["segm"], self.id_map)}
 
 
 def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
-    """Return what a policy gets to see of the episode that an environment has begun.
+    """Return the inputs of a policy in the current episode of an environment.
 
     Args:
-        env: The environment; it is left as it is.
-        ablation: One of `ABLATIONS`, `IN_CONTEXT`, or empty for none. Boxes are the policy's matter: see
-            `openvima.detector.plugins`.
+        env: The environment, which stays unchanged.
+        ablation: One of `ABLATIONS`, `IN_CONTEXT`, or empty for none. Detected boxes are handled
+            by the policy, see `openvima.detector.plugins`.
 
     Raises:
         SamplingError: No other episode has images for the same placeholders.
@@ -93,7 +93,7 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
 
 
 def _with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> RenderedPrompt:
-    """Draw seeds until an episode has images of the same names and kinds."""
+    """Sample seeds until an episode has images of the same names and kinds."""
     episode = env.episode
     prompt = episode.problem.prompt
     for _ in range(_MAX_TRIES):
@@ -126,7 +126,7 @@ def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
 
 
 def _scrambled(text: str, rng: np.random.Generator) -> str:
-    """Put a word of the vocabulary in the place of each word, number and mark; placeholders stay."""
+    """Replace each word, number and mark by a random word of the vocabulary; placeholders stay."""
     pieces = _PIECE.findall(text)
     drawn = rng.choice(_words(), len(pieces)).tolist()
     return " ".join(piece if piece[0] == "{" else word for piece, word in zip(pieces, drawn, strict=True))
@@ -138,7 +138,7 @@ def _words() -> tuple[str, ...]:
 
 
 def _shuffled(env: TabletopEnv, rng: np.random.Generator) -> AblatedInput:
-    """Deal the ids out anew among the objects on the table, and among those in the prompt's scenes."""
+    """Permute the ids of the objects on the table, and of those in the scenes of the prompt."""
     prompt = env.prompt
     id_map = _permutation({placement.id for placement in env.episode.problem.scene.placements}, rng)
     scenes = [image for image in prompt.images.values() if image.kind == "scene"]

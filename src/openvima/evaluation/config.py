@@ -1,7 +1,7 @@
-"""The protocol of an evaluation: which policies play which tasks at which levels on which seeds.
+"""Configuration of an evaluation: policies, tasks, levels and seeds, divided into batches.
 
-Episodes are grouped into batches before anything runs, in a way that depends on the protocol alone. Workers
-take whole batches, so their number changes neither the batches nor the results.
+The division into batches depends on the configuration alone. Workers take whole batches, so their number
+does not change the results.
 """
 
 import hashlib
@@ -22,17 +22,17 @@ from openvima.policies.bundled import PACKAGED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
-REFERENCE_POLICIES = (RANDOM, ORACLE)  # what a score is compared with, too: the least and the most there is
+REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound
 DEFAULT_EPISODES = 200  # as in the published tables
 PRECISIONS = ("float64", "float32", "bfloat16")
 Engine = Literal["processes", "ray"]
 DEFAULT_DEVICE = "cpu"
-DEFAULT_BATCH = 16  # more hardly saves time: a small network then takes less than the simulation
+DEFAULT_BATCH = 16  # larger ones hardly save time: the simulation dominates
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationConfig:
-    """What to evaluate, and how.
+    """Configuration of an evaluation.
 
     Args:
         policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
@@ -44,19 +44,18 @@ class EvaluationConfig:
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
         workers: Processes; the results do not depend on their number. None means one, or as many as the Ray
-            cluster at `address` has processors.
+            cluster at `address` has CPUs.
         out: Folder to write to.
         env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
-        batch: Episodes that are played together, so that a policy decides for all of them at once.
+        batch: Episodes that are run together, with batched inference.
         force: Overwrite results of another evaluation in `out`.
-        device: Where networks compute, such as "cpu" or "cuda". Only on a processor, where they compute in
-            float64, does the division into batches not change what they decide.
-        precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a processor, float32
+        device: Where networks compute, such as "cpu" or "cuda". Only in float64 on a CPU are decisions
+            independent of the division into batches.
+        precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a CPU, float32
             elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
-        ablations: What to play besides, to show what a score is made of: names of
-            `openvima.evaluation.ablations.ABLATIONS`, of which each policy that reads prompts plays all;
-            "random" and "oracle", which then are played too; or ("all",). "in_context", which prompts with a
-            demonstration of the episode, is asked for by its name.
+        ablations: Input ablations to evaluate besides, for each policy that reads prompts: names of
+            `openvima.evaluation.ablations.ABLATIONS`; "random" and "oracle", which are added as policies; or
+            ("all",). "in_context", which prompts with a demonstration of the episode, is not part of "all".
         boxes: For the ablation "detected_boxes": "detector" for the one that comes with the package,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.

@@ -1,4 +1,4 @@
-"""Playing a batch of episodes: all environments step together, the policy decides for all of them at once."""
+"""Rollouts of a batch of episodes: environments step together, with batched inference."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ NO_ORACLE_ACTION = "the oracle has no action"
 
 
 class _EpisodeSlot:
-    """One environment of a batch, with what is known of its episode."""
+    """One environment of a batch and the state of its episode."""
 
     def __init__(self, env: TabletopEnv, seed: int) -> None:
         self.env = env
@@ -89,8 +89,8 @@ def play(
     Args:
         envs: Environments of one task and level.
         seeds: Seed of the episode of each.
-        player: Who decides.
-        after_step: Called with an environment after each of its steps, for filming.
+        player: Decides the actions.
+        after_step: Called with an environment after each of its steps, for recording.
 
     Returns:
         How each episode ended, in the order of `seeds`.

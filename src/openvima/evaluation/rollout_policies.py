@@ -1,4 +1,4 @@
-"""Who decides in an episode: the oracle, which asks the environment, or a policy, which sees observations."""
+"""Rollout policies: the oracle, which reads the environment, and policies, which read observations."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ Decision = Mapping[str, Any] | Action | OracleError | None
 
 
 class RolloutPolicy(Protocol):
-    """Decides for several environments at once."""
+    """Decides actions for a batch of environments."""
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start a batch of episodes; every environment has been reset."""
@@ -45,7 +45,7 @@ class OracleRolloutPolicy:
         self._envs: Sequence[TabletopEnv] = ()
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Take the environments whose scenes to look at."""
+        """Keep the environments, whose scenes the oracle reads."""
         self._envs = envs
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
@@ -54,16 +54,16 @@ class OracleRolloutPolicy:
         return [None if observation is None else _oracle(env) for env, observation in pairs]
 
     def near_ties(self) -> Sequence[bool]:
-        """Say nothing: the oracle does not weigh scores."""
+        """Return nothing: the oracle has no scores."""
         return ()
 
 
 class PromptedRolloutPolicy:
-    """A policy, which sees prompts and observations only.
+    """A policy, which reads prompts and observations only.
 
     Args:
         policy: Follows the `Policy` protocol of `openvima.policies`.
-        ablation: What is taken from it, one of `openvima.evaluation.ablations`; empty for nothing.
+        ablation: Input ablation; empty for none.
     """
 
     def __init__(self, policy: Any, ablation: str = "") -> None:  # Any: third parties need no base class
@@ -72,7 +72,7 @@ class PromptedRolloutPolicy:
         self._inputs: list[AblatedInput] = []
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Tell the policy the prompts."""
+        """Reset the policy with the prompts."""
         self._inputs = [ablate(env, self._ablation) for env in envs]
         self._policy.reset([seen.prompt for seen in self._inputs])
 
@@ -82,15 +82,15 @@ class PromptedRolloutPolicy:
         return self._policy.act([None if image is None else seen.observation(image) for seen, image in pairs])
 
     def near_ties(self) -> Sequence[bool]:
-        """Say what the policy says, if it knows, as `NetworkPolicy` does."""
+        """Return those of the policy, if it reports any, as `NetworkPolicy` does."""
         return getattr(self._policy, "near_ties", ())
 
 
 def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
-    """Make the player of a batch of episodes.
+    """Load the policy of a batch of episodes.
 
     Args:
-        batch: What will be played.
+        batch: The episodes.
         fingerprint: Text that stands for the policy's weights; a policy that was loaded before is used again
             only if it is the same.
 
