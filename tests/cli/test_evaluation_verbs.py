@@ -95,3 +95,8 @@ def test_wrong_input_is_one_line_and_status_2(words, message, tmp_path, capsys):
 def test_a_report_of_nothing_is_status_2(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 2
     assert "openvima evaluate" in capsys.readouterr().err
+
+
+def test_recording_without_a_report_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--policy", "oracle", "--record-video", "rotate/3", "--no-report"]) == 2
+    assert "--record-video needs the report" in capsys.readouterr().err

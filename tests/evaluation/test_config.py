@@ -80,7 +80,6 @@ def test_all_problems_of_the_settings_are_named_together():
         ({"precision": "float16"}, "allowed are float64, float32, bfloat16"),
         ({"engine": "threads"}, "allowed are processes and ray"),
         ({"address": "10.0.0.1:6379"}, "only 'ray' takes one"),
-        ({"film": ("rotate/3",), "report": False}, "no report is asked for"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, message):
