@@ -279,8 +279,8 @@ def anonymous_megabytes() -> float:
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon")), 0.0)
 
 
-def measure_tokens(folders: Sequence[Path], num_rounds: int) -> Numbers:
-    """Make the token caches of data folders, and read their episodes in random order, the folders mixed."""
+def measure_object_cache(folders: Sequence[Path], num_rounds: int) -> Numbers:
+    """Make the object caches of data folders, and read their episodes in random order, the folders mixed."""
     datasets = [Dataset(folder) for folder in folders]
     making, caches = timed(lambda: [open_object_cache(dataset) for dataset in datasets])
     episodes = [(cache, number) for cache in caches for number in range(len(cache))]
@@ -401,7 +401,7 @@ def main() -> None:
         results = measure_all(tasks, num_episodes, options.rounds, folder)
         means = summary(results)
         means["memory"] = measure_memory(Dataset(folder / tasks[0]), 400 if options.quick else 4000)
-        means["tokens"] = measure_tokens([folder / task for task in tasks], options.rounds)
+        means["object_cache"] = measure_object_cache([folder / task for task in tasks], options.rounds)
     for key, value in means.items():
         print(f"{key}: {value}")
     if options.json:

@@ -20,7 +20,7 @@ def examples_of(demos: Iterable[Demonstration], processor: Processor):
 
 
 def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSource:
-    """The same as if they had come out of a token cache."""
+    """The same as if they had been read from an object cache."""
     episodes = [preprocess(demo, processor.input_kind) for demo in demos]
     counts = np.array([len(episode.images) for episode in episodes])
     lengths = np.array([[episode.num_steps, len(episode.objects)] for episode in episodes])

@@ -23,7 +23,7 @@ INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
 BROKEN_NAME = "broken.json"  # episodes that an import left out
 FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
-CACHE_FOLDER = "tokens"  # made of the shards, safe to delete
+CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
 LICENCE = "MIT"
 
 INDEX_SCHEMA = pa.schema(

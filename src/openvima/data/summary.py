@@ -68,7 +68,7 @@ class Overview:
         tasks: One entry a task, by name.
         histograms: Of levels, steps, tools and, with details, of objects, textures and prompt images.
         num_failed: Episodes in `failed/`; None if there is no such folder.
-        token_caches: Name of each token cache to its size in bytes.
+        object_caches: Name of each object cache to its size in bytes.
     """
 
     folder: Path
@@ -76,11 +76,11 @@ class Overview:
     tasks: tuple[TaskOverview, ...]
     histograms: tuple[Histogram, ...]
     num_failed: int | None
-    token_caches: dict[str, int]
+    object_caches: dict[str, int]
 
     @property
     def file_bytes(self) -> int:
-        """Size of shards, index and manifest, without failed episodes and token caches."""
+        """Size of shards, index and manifest, without failed episodes and object caches."""
         names = [*self.manifest["shards"], INDEX_NAME, MANIFEST_NAME]
         return sum((self.folder / name).stat().st_size for name in names)
 
@@ -96,7 +96,7 @@ class Overview:
             "tasks": tasks,
             "histograms": {histogram.title: histogram.counts for histogram in self.histograms},
             "failed_episodes": self.num_failed,
-            "token_caches": self.token_caches,
+            "object_caches": self.object_caches,
         }
         return {**self.manifest, "overview": overview}
 
@@ -148,7 +148,7 @@ def look_at(folder: Path, *, details: bool = False, report: Report | None = None
         tuple(_task_overview(dataset, task_of, task) for task in dataset.manifest["tasks"]),
         tuple(histograms),
         _num_failed(folder),
-        _token_caches(folder),
+        _object_caches(folder),
     )
 
 
@@ -246,7 +246,7 @@ def _num_failed(folder: Path) -> int | None:
     return sum(len(Shard(path)) for path in failed.glob("*.arrow"))
 
 
-def _token_caches(folder: Path) -> dict[str, int]:
+def _object_caches(folder: Path) -> dict[str, int]:
     return {
         cache.name: sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())
         for cache in sorted((folder / CACHE_FOLDER).glob("*"))

@@ -19,7 +19,7 @@ from openvima.errors import ConfigError
 
 Sharding = Literal["ddp", "fsdp"]
 ENTRANCES = ("keys_values",)  # methods besides `forward` by which layers are called
-# How long processes wait for the first one, which makes the token cache and plays trials.
+# How long processes wait for the first one, which makes the object cache and plays trials.
 PATIENCE = datetime.timedelta(days=1)
 
 

@@ -1,4 +1,4 @@
-"""The demonstrations of a run, out of the token cache: those to learn from, and those kept for validation."""
+"""The demonstrations of a run, from the object cache: those to learn from, and those kept for validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ class ExampleSource(Sequence[Example]):
     """Some demonstrations of a cache, by number.
 
     Args:
-        cache: The tokens of all.
+        cache: All demonstrations.
         rows: Which of them, shape (N,), int64.
         bases: Images of all demonstrations before each one, shape (all,), int64.
         lengths: Steps of each one and objects in view in all of them, shape (N, 2), int64.
@@ -111,7 +111,7 @@ def split_examples(
     Whether one is kept follows from its task and seed, so that it stays there when data are added.
 
     Args:
-        cache: The tokens of all.
+        cache: All demonstrations.
         validation_share: Share to keep.
         validation_episodes: At most so many are used; which ones follows from task and seed, too.
 

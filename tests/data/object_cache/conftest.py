@@ -1,4 +1,4 @@
-"""Demonstrations to make tokens of."""
+"""Demonstrations to preprocess."""
 
 import shutil
 from pathlib import Path
@@ -11,7 +11,7 @@ from openvima.data import GenerateConfig, generate
 @pytest.fixture(scope="package")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five demonstrations of each of two tasks, in shards of two."""
-    out = tmp_path_factory.mktemp("tokens") / "demos"
+    out = tmp_path_factory.mktemp("object_cache") / "demos"
     return generate(
         GenerateConfig(out=out, tasks=("rotate", "rearrange_then_restore"), episodes=5, shard_size=2)
     )
@@ -19,6 +19,6 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(demos: Path, tmp_path: Path) -> Path:
-    """A copy without tokens, to be changed."""
-    shutil.copytree(demos, tmp_path / "demos", ignore=shutil.ignore_patterns("tokens"))
+    """A copy without an object cache, to be changed."""
+    shutil.copytree(demos, tmp_path / "demos", ignore=shutil.ignore_patterns("object_cache"))
     return tmp_path / "demos"

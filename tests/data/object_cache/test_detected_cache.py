@@ -1,4 +1,4 @@
-"""Tokens of objects that a detector finds: what they say, where they lie, and that they are made once."""
+"""The object cache of a detector: its records, its folder, and that it is written once."""
 
 import pickle
 from dataclasses import replace
@@ -26,13 +26,16 @@ CLUMSY = Boxes("clumsy-1", Clumsy)
 def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -> None:
     num_lost = 0
     for demo in Dataset(demos):
-        tokens = preprocess(demo, "objects", Clumsy())
-        assert tokens.prompt.text == demo.prompt.text
-        for t, table in enumerate(tokens.objects.split(tokens.objects_per_step)):
+        episode = preprocess(demo, "objects", Clumsy())
+        assert episode.prompt.text == demo.prompt.text
+        for t, table in enumerate(episode.objects.split(episode.objects_per_step)):
             found, true = Clumsy().in_observation(demo.observation(t)), observe(demo.observation(t))
             assert table.ids.tolist() == list(range(len(found)))
             shares = object_iou(found, true)
-            for slots, asked in ((tokens.pick_ids, demo.pick_ids[t]), (tokens.place_ids, demo.place_ids[t])):
+            for slots, asked in (
+                (episode.pick_ids, demo.pick_ids[t]),
+                (episode.place_ids, demo.place_ids[t]),
+            ):
                 slot, there = (
                     slots[t],
                     true.ids.tolist().index(asked) if asked in true.ids else -1,
@@ -84,7 +87,7 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     assert rows_of(caches[1][0].objects).tolist() != rows_of(caches[2][0].objects).tolist()
     again = pickle.loads(pickle.dumps(caches[2]))
     assert rows_of(again[3].objects).tolist() == rows_of(caches[2][3].objects).tolist()
-    with pytest.raises(DatasetError, match=r"lacks tokens of 6 shards.*--boxes DETECTOR"):
+    with pytest.raises(DatasetError, match=r"lacks 6 shards.*--boxes DETECTOR"):
         ObjectCache(dataset, boxes="clumsy-3")
 
 
@@ -110,23 +113,23 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 
     with pytest.raises(WorkerError, match="enough"):
         open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
-    folder = copy / "tokens" / "objects-v3-clumsy-1"
+    folder = copy / "object_cache" / "objects-v3-clumsy-1"
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
     assert 1 <= len(before) <= 5
     cache = open_object_cache(dataset, boxes=CLUMSY)
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
-    for demo, tokens in zip(dataset, cache, strict=True):
+    for demo, episode in zip(dataset, cache, strict=True):
         expected = preprocess(demo, "objects", Clumsy())
-        assert rows_of(tokens.objects).tolist() == rows_of(expected.objects).tolist()
+        assert rows_of(episode.objects).tolist() == rows_of(expected.objects).tolist()
 
 
-def test_tokens_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
+def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     cache = open_object_cache(dataset, boxes=CLUMSY)
     path = cache.folder / "rotate-train-00000.arrow"
     whole = path.read_bytes()
     write_cache_file(path, cache[:2], "objects", cache._files[path.name].source, "clumsy-2")
-    with pytest.raises(DatasetError, match="lacks tokens of 1 shards"):
+    with pytest.raises(DatasetError, match="lacks 1 shards"):
         ObjectCache(dataset, boxes="clumsy-1")
     open_object_cache(dataset, boxes=CLUMSY)
     assert path.read_bytes() == whole
@@ -141,7 +144,7 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
     cache = open_object_cache(Dataset(copy), boxes=CLUMSY)
     assert not verify(copy).problems
     path = cache.folder / "rotate-train-00000.arrow"
-    rows = [row for row, tokens in enumerate(cache) if tokens.task == "rotate"][:2]
+    rows = [row for row, episode in enumerate(cache) if episode.task == "rotate"][:2]
     changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
     write_cache_file(path, changed, "objects", cache._files[path.name].source, "clumsy-1")
     (problem,) = verify(copy).problems
@@ -150,9 +153,9 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["data", "tokens", str(copy), "--boxes", HOOK]
+    words = ["data", "preprocess", str(copy), "--boxes", HOOK]
     assert main(words) == 0
-    (folder,) = (copy / "tokens").iterdir()
+    (folder,) = (copy / "object_cache").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
     assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v3-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2

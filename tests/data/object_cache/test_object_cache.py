@@ -1,4 +1,4 @@
-"""The token cache: the same tokens as cutting anew, made once, and never trusted when damaged or old."""
+"""The object cache: equal to preprocessing anew, written once, never trusted when damaged or old."""
 
 import os
 import pickle
@@ -36,10 +36,10 @@ def test_the_cache_holds_what_cutting_anew_would_give(copy: Path, kind) -> None:
     dataset = Dataset(copy)
     cache = open_object_cache(dataset, kind)
     assert len(cache) == len(dataset) == 10
-    for demo, tokens in zip(dataset, cache, strict=True):
-        assert_equal(tokens, preprocess(demo, kind))
-        assert tokens.num_steps == demo.num_steps
-    assert np.array_equal(cache.lengths(), [[tokens.num_steps, len(tokens.objects)] for tokens in cache])
+    for demo, episode in zip(dataset, cache, strict=True):
+        assert_equal(episode, preprocess(demo, kind))
+        assert episode.num_steps == demo.num_steps
+    assert np.array_equal(cache.lengths(), [[episode.num_steps, len(episode.objects)] for episode in cache])
 
 
 def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_opening_again_makes_nothing_and_extending_makes_what_is_new(copy: Path)
     open_object_cache(Dataset(copy), report=lambda done, total, note: calls.append(total))
     assert calls == []
     generate(GenerateConfig(out=copy, tasks=TASKS, episodes=7, shard_size=2))
-    with pytest.raises(DatasetError, match=r"lacks tokens of 4 shards, first .* makes them"):
+    with pytest.raises(DatasetError, match=r"lacks 4 shards, first .* writes them"):
         ObjectCache(Dataset(copy))
     extended = open_object_cache(Dataset(copy), report=lambda done, total, note: calls.append(total))
     assert calls[-1] == 6  # the two short shards of before, and two new ones
@@ -66,21 +66,21 @@ def test_opening_again_makes_nothing_and_extending_makes_what_is_new(copy: Path)
     assert_equal(extended[-1], preprocess(Dataset(copy)[-1], "objects"))
 
 
-def test_a_dataset_of_some_tasks_has_their_tokens_only(copy: Path) -> None:
+def test_a_dataset_of_some_tasks_has_their_files_only(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     cache = open_object_cache(dataset)
     assert {path.name.split("-")[0] for path in cache.folder.iterdir()} == {"rotate"}
-    assert [tokens.seed for tokens in cache] == [demo.seed for demo in dataset]
-    with pytest.raises(DatasetError, match="lacks tokens of 3 shards"):
+    assert [episode.seed for episode in cache] == [demo.seed for demo in dataset]
+    with pytest.raises(DatasetError, match="lacks 3 shards"):
         ObjectCache(Dataset(copy))
 
 
-def test_old_tokens_are_noticed(copy: Path) -> None:
+def test_outdated_files_are_noticed(copy: Path) -> None:
     open_object_cache(Dataset(copy))
     for path in copy.glob("*.arrow"):
         path.unlink()
     generate(GenerateConfig(out=copy, tasks=TASKS, episodes=5, shard_size=2, start_seed=50, force=True))
-    with pytest.raises(DatasetError, match="lacks tokens of 6 shards"):
+    with pytest.raises(DatasetError, match="lacks 6 shards"):
         ObjectCache(Dataset(copy))
     assert open_object_cache(Dataset(copy))[0].seed == Dataset(copy)[0].seed
 
@@ -93,13 +93,13 @@ def test_a_truncated_file_is_made_anew(copy: Path, size: int) -> None:
     path.write_bytes(whole[:size])
     with pytest.raises(ShardError, match="is no readable file"):
         CacheFile(path)
-    with pytest.raises(DatasetError, match="lacks tokens of 1 shards"):
+    with pytest.raises(DatasetError, match="lacks 1 shards"):
         ObjectCache(Dataset(copy))
     open_object_cache(Dataset(copy))
     assert path.read_bytes() == whole
 
 
-def test_a_shard_of_demonstrations_is_no_file_of_tokens(copy: Path) -> None:
+def test_a_shard_of_demonstrations_is_no_cache_file(copy: Path) -> None:
     with pytest.raises(ShardError, match="is no readable file"):
         CacheFile(next(copy.glob("*.arrow")))
     with pytest.raises(ShardError, match="is no readable file"):
@@ -108,7 +108,7 @@ def test_a_shard_of_demonstrations_is_no_file_of_tokens(copy: Path) -> None:
 
 def test_a_folder_that_cannot_be_made_is_named(copy: Path) -> None:
     (copy / "blocked").write_text("a file")
-    with pytest.raises(DatasetError, match=r"cannot keep tokens in .*blocked"):
+    with pytest.raises(DatasetError, match=r"cannot write the object cache to .*blocked"):
         open_object_cache(Dataset(copy), folder=copy / "blocked")
     with pytest.raises(DatasetError, match="Did you mean 'frames'"):
         open_object_cache(Dataset(copy), "frame")  # type: ignore[arg-type]
@@ -119,10 +119,10 @@ def test_a_cache_can_be_sent_to_another_process(demos: Path) -> None:
     _ = cache[0]
     again = pickle.loads(pickle.dumps(cache))
     assert_equal(again[3], cache[3])
-    assert [tokens.seed for tokens in again[1:3]] == [cache[1].seed, cache[2].seed]
+    assert [episode.seed for episode in again[1:3]] == [cache[1].seed, cache[2].seed]
 
 
-def test_tokens_are_read_with_pyarrow_alone(demos: Path) -> None:
+def test_a_file_is_read_with_pyarrow_alone(demos: Path) -> None:
     cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
     table = pa.ipc.open_file(pa.memory_map(str(cache.folder / "rotate-train-00000.arrow"))).read_all()
     row = table.slice(1, 1).to_pylist()[0]
@@ -141,19 +141,19 @@ def test_a_prompt_is_split_into_texts_and_images() -> None:
     assert split_prompt("only words") == ("only words",)
 
 
-def test_tokens_are_not_made_of_damaged_demonstrations(copy: Path) -> None:
+def test_no_cache_is_made_of_damaged_demonstrations(copy: Path) -> None:
     shard = copy / "rotate-train-00001.arrow"
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
     with pytest.raises(ShardError, match=r"rotate-train-00001\.arrow: record .*\(its checksum is wrong\)"):
         open_object_cache(Dataset(copy))
-    with pytest.raises(DatasetError, match="lacks tokens"):
+    with pytest.raises(DatasetError, match="lacks"):
         ObjectCache(Dataset(copy))
 
 
-def test_makers_of_the_same_tokens_leave_each_other_alone(copy: Path) -> None:
-    folder = copy / "tokens" / "objects-v1"
+def test_makers_of_the_same_cache_leave_each_other_alone(copy: Path) -> None:
+    folder = copy / "object_cache" / "objects-v1"
     folder.mkdir(parents=True)
     writing = folder / f".rotate-train-00000.arrow.{os.getppid()}.tmp"
     writing.touch()

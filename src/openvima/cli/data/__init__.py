@@ -3,7 +3,7 @@
 from openvima.cli.data.importing import import_published
 from openvima.cli.data.info import info
 from openvima.cli.data.lerobot import export_lerobot
-from openvima.cli.data.preprocess import tokens
+from openvima.cli.data.preprocess import preprocess
 from openvima.cli.data.subsets import merge, sample, split
 from openvima.cli.data.verify import verify
 
@@ -15,6 +15,6 @@ COMMANDS = {
     "sample": sample,
     "split": split,
     "import": import_published,
-    "tokens": tokens,
+    "preprocess": preprocess,
     "export-lerobot": export_lerobot,
 }

@@ -100,8 +100,8 @@ def _summary(overview: "Overview") -> Iterator[str]:
     yield f"finished; content {manifest['content_hash']}, licence {manifest['licence']}"
     if overview.num_failed is not None:
         yield f"failed/ keeps {overview.num_failed:,} episodes that the oracle did not solve"
-    for name, size in overview.token_caches.items():
-        yield f"token cache {name}: {size / 1e6:,.1f} MB"
+    for name, size in overview.object_caches.items():
+        yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
     yield from _task_table(overview)
     for histogram in overview.histograms:

@@ -1,4 +1,4 @@
-"""`openvima data tokens`: cut objects out of demonstrations, once for all trainings."""
+"""`openvima data preprocess`: extract the objects of demonstrations once for all trainings."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ import tyro
 from openvima.cli.progress import progress_bar
 
 
-def tokens(
+def preprocess(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
     kind: Literal["objects", "frames"] = "objects",
@@ -17,21 +17,21 @@ def tokens(
     out: Path | None = None,
     workers: int = 1,
 ) -> int:
-    """Make the token cache of a folder of demonstrations, or what it still lacks.
+    """Write the object cache of a folder of demonstrations, or the shards that it lacks.
 
-    It holds what policies see: the crops of all objects with their boxes, or whole frames at half the size.
-    `openvima train` makes it when it is missing; made beforehand, several processes can share the work. It
-    may be deleted at any time. An interrupted command goes on where it stopped, shard by shard.
+    The cache holds the inputs of policies: crops and boxes of all objects, or whole frames at half the size.
+    `openvima train` writes it when it is missing; beforehand, several processes can share the work. It may be
+    deleted at any time. An interrupted command resumes after the last whole shard.
 
-    Example: openvima data tokens demos --workers 2
+    Example: openvima data preprocess demos --workers 2
 
     Args:
         folder: Folder of demonstrations.
-        kind: objects for all presets that see objects, frames for gato, flamingo and gpt.
-        boxes: Detector that finds the objects instead, for `openvima train --loader.boxes`: "detector" for
-            the bundled one, detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION
-            or FILE.py:FUNCTION, which makes an ObjectExtractor.
-        out: Folder to keep it in; by default "tokens" in the folder of demonstrations.
+        kind: objects for presets with object tokens, frames for gato, flamingo and gpt.
+        boxes: Detector that extracts the objects, for `openvima train --boxes`: "detector" for the bundled
+            one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
+            FILE.py:FUNCTION, which returns an ObjectExtractor. Default: the segmentation.
+        out: Folder of the cache; default: "object_cache" in the folder of demonstrations.
         workers: Number of processes.
 
     Returns:
@@ -45,13 +45,13 @@ def tokens(
     if boxes is not None and kind == "frames":
         raise ConfigError(f"boxes is {boxes!r}, but whole frames have none; leave --boxes or --kind out.")
     dataset = Dataset(folder)
-    with progress_bar("tokens") as report:
+    with progress_bar("object cache") as report:
         if boxes is None:
             cache = open_object_cache(dataset, kind, folder=out, workers=workers, report=report)
         else:
             cache = detected_object_cache(
                 dataset, plugged_boxes(boxes), folder=out, workers=workers, report=report
             )
-    print(f"tokens of {len(cache):,} demonstrations are ready.", file=sys.stderr)
+    print(f"the object cache of {len(cache):,} demonstrations is ready.", file=sys.stderr)
     print(cache.folder)
     return 0

@@ -1,1 +1,1 @@
-"""The token cache: demonstrations as the crops and boxes that policies see, cut out once."""
+"""The object cache: crops and boxes of demonstrations, extracted once for all trainings."""

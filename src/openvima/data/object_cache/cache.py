@@ -1,4 +1,4 @@
-"""The token cache of a data set: a derived folder, made when it is first needed and safe to delete."""
+"""The object cache of a data set: a derived folder, written when first needed and safe to delete."""
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
@@ -27,12 +27,11 @@ Report = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Boxes:
-    """Where boxes come from, if not from the segmentation.
+    """A source of boxes other than the segmentation.
 
     Args:
-        name: Stands for all that decides what is found; it becomes part of the name of a folder. Whatever
-            bears the same name is taken to find the same.
-        make: Makes what finds the objects. It is sent to other processes, where it is called once.
+        name: Identifies the extractor and all that its boxes depend on; part of the folder's name.
+        make: Makes the extractor. It is sent to other processes, where it is called once.
     """
 
     name: str
@@ -40,15 +39,15 @@ class Boxes:
 
 
 class ObjectCache(Sequence[PreprocessedEpisode]):
-    """The episodes of a data set as tokens, each read when it is asked for.
+    """The preprocessed episodes of a data set, in its order, each read on access.
 
-    The order is that of the data set. Objects can be sent to other processes: they open files anew.
+    A cache can be sent to other processes, which reopen its files.
 
     Args:
         dataset: The demonstrations, perhaps of some tasks only.
         kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
-        folder: Where the files are; None means `tokens/` in the folder of the demonstrations.
-        boxes: Name of what found the objects, as in `Boxes`; empty for the segmentation.
+        folder: Folder of the cache; None means `object_cache/` in the folder of the demonstrations.
+        boxes: Name of the extractor, as in `Boxes`; empty for the segmentation.
 
     Raises:
         DatasetError: There is no such kind, or files are missing or older than the demonstrations;
@@ -70,8 +69,8 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         if missing:
             option = "--boxes DETECTOR" if boxes else f"--kind {kind}"
             raise DatasetError(
-                f"{self.folder} lacks tokens of {len(missing)} shards, first {missing[0]}; "
-                f"`openvima data tokens {shlex.quote(str(dataset.path))} {option}` makes them."
+                f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; "
+                f"`openvima data preprocess {shlex.quote(str(dataset.path))} {option}` writes them."
             )
         self._files = {name: file for name, file in found.items() if file is not None}
 
@@ -95,11 +94,11 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
 
     def lengths(self) -> np.ndarray:
-        """Return the steps of each episode and the objects in view in all of them, shape (N, 2), int64."""
+        """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
         return self._gathered(CacheFile.lengths, 2)
 
     def widths(self) -> np.ndarray:
-        """Return how many objects the fullest prompt image and the fullest view show, shape (N, 2)."""
+        """Return the most objects in a prompt image and in an observation, shape (N, 2)."""
         return self._gathered(CacheFile.widths, 2)
 
     def image_counts(self) -> np.ndarray:
@@ -122,7 +121,7 @@ class Source:
     """One shard of demonstrations.
 
     Args:
-        name: Of the shard, and of its file of tokens.
+        name: Of the shard, and of its file in the cache.
         content_hash: Of its episodes together.
         index: Its part of the index.
     """
@@ -151,13 +150,13 @@ def open_object_cache(
     workers: int = 1,
     report: Report | None = None,
 ) -> ObjectCache:
-    """Open the token cache of a data set; make what is missing, or older than the demonstrations.
+    """Open the object cache of a data set; write what is missing, or older than the demonstrations.
 
     Args:
         dataset: The demonstrations, perhaps of some tasks only.
         kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
-        folder: Where to keep them; None means `tokens/` in the folder of the demonstrations.
-        boxes: What finds the objects; None takes the segmentation. Each detector has a folder of its own.
+        folder: Folder of the cache; None means `object_cache/` in the folder of the demonstrations.
+        boxes: Extractor of the objects; None takes the segmentation. Each has a folder of its own.
         workers: Number of processes.
         report: Called with episodes done, episodes in all, and a note.
 
@@ -184,7 +183,7 @@ def open_object_cache(
             target.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DatasetError(
-                f"cannot keep tokens in {target}: {error.strerror}. Name another folder."
+                f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
             ) from None
         remove_stale(target)
         total = sum(item.source.index.num_rows for item in work)
@@ -219,7 +218,7 @@ def sources(dataset: Dataset) -> list[Source]:
 
 def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, boxes: str) -> Path:
     if kind not in KINDS:
-        raise DatasetError(unknown_name("kind of tokens", kind, KINDS))
+        raise DatasetError(unknown_name("kind of object cache", kind, KINDS))
     if boxes and kind == "frames":
         raise DatasetError(f"boxes are those of {boxes}, but whole frames have none; leave them out.")
     parts = (kind, f"v{CACHE_VERSION}", *((boxes,) if boxes else ()))
@@ -227,7 +226,7 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, boxes:
 
 
 def _made(folder: Path, source: Source, kind: InputKind, boxes: str) -> CacheFile | None:
-    """Open the tokens of a shard; None if they are missing, damaged, or of another version or content."""
+    """Open the file of a shard; None if it is missing, damaged, or of another version or content."""
     try:
         file = CacheFile(folder / source.name)
     except ShardError:

@@ -59,7 +59,7 @@ def write_page(overview: Overview, out: Path, *, num_samples: int = 3, report: R
         histograms=[(histogram.title.capitalize(), bar_chart(histogram)) for histogram in histograms],
         episodes=_episodes(overview, num_samples, report or (lambda done, total, note: None)),
         settings=json.dumps(manifest["config"], indent=2, ensure_ascii=False),
-        caches={name: _size(size) for name, size in overview.token_caches.items()},
+        caches={name: _size(size) for name, size in overview.object_caches.items()},
     )
     return atomic_write_file(out, page)
 
