@@ -67,7 +67,7 @@ def main(
         difficulty: easy, as for all published results, medium or hard.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all.
-        boxes: Detector for detected_boxes, which is then played in any case: "detector" for the one that
+        boxes: Detector of detected_boxes, which it implies: "detector" for the one that
             comes with the package, detector=FOLDER for one that `openvima detector train` made, or
             MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectExtractor.
         in_context: Also prompt with a demonstration of each episode, "Follow this motion: …";
@@ -191,7 +191,7 @@ def _cell(rate: float, interval: tuple[float, float]) -> str:
 
 
 def _with_boxes(ablations: tuple[str, ...], boxes: str | None) -> tuple[str, ...]:
-    """Add the ablation that uses the boxes, if some are given and it is not asked for yet."""
+    """Add the ablation that uses the boxes, if any are given."""
     from openvima.evaluation.ablations import DETECTED_BOXES
 
     asked = boxes is None or {"all", DETECTED_BOXES} & set(ablations)

@@ -45,7 +45,7 @@ def main(
     _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
     require_torch("training")
     require_extra()
-    packaged_folder(SMALL)  # a lack of it is told before any work
+    packaged_folder(SMALL)  # fails before any work if missing
     workers = workers or min(8, os.cpu_count() or 1)
     out.mkdir(parents=True, exist_ok=True)
     _first_look(out / "first_look.png", seed)
@@ -68,7 +68,7 @@ def _check(**counts: int | None) -> None:
 
 
 def _first_look(path: Path, seed: int) -> None:
-    """Show within seconds that the installation works: one episode solved by the oracle, as a picture."""
+    """Render one episode of the oracle, to check the installation within seconds."""
     from openvima.env import TabletopEnv
     from openvima.evaluation.recording import save_episode_image
 

@@ -36,12 +36,12 @@ def main(
         host: Interface to listen on. Any but the loopback interface needs a token.
         token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,
             which, unlike an option, other users of this machine do not see. Clients read it from there, too.
-        name: Name that clients are told; by default that of the folder or file.
+        name: Name in the metadata; by default that of the folder or file.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         threads: Threads that a network computes with on the cpu. More than one are faster for large networks,
             and may change the last bits of what it gives.
         max_connections: Clients at the same time; `openvima evaluate` has one for each worker.
-        max_episodes: Episodes that a client plays at once.
+        max_episodes: Largest batch of episodes.
         max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
         idle_s: Seconds after which a client is dropped that sends nothing.
 

@@ -1,4 +1,4 @@
-"""Two policies on the same seeds: by how much one is better, and whether that may be chance."""
+"""Paired comparison of policies on the same seeds: differences, intervals and tests."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +46,7 @@ class Difference:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes that both policies played."""
+        """Number of episodes of both policies."""
         return sum(pair.episodes for pair in self.pairs)
 
     @property
@@ -93,7 +93,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two policies on the episodes that both played.
+    """Two policies on their common episodes.
 
     Args:
         a: Name of the first policy, with its ablation if any, as in "mine:no_prompt".
@@ -101,7 +101,7 @@ class Comparison:
         tasks: Differences on single tasks, in the order level, task.
         levels: Mean over the tasks of each level.
         overall: Mean over all tasks of all levels; the same as `levels[0]` where there is but one.
-        unpaired: Episodes that only one of the two played; they are left out.
+        unpaired: Episodes of only one of the two; they are left out.
     """
 
     a: str
@@ -161,7 +161,7 @@ def default_pairs(results: Results) -> list[tuple[str, str]]:
 
 
 def can_be_compared(results: Results, a: str, b: str) -> bool:
-    """Whether two policies, or a policy under an ablation, played any episode in common."""
+    """Whether two policies, or a policy with an ablation, have any episode in common."""
     rows_a, rows_b = _rows(results, a), _rows(results, b)
     return any(_pair(rows_a[cell], rows_b[cell]) for cell in rows_a.keys() & rows_b.keys())
 

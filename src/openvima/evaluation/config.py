@@ -122,7 +122,7 @@ class EvaluationConfig:
 
     @property
     def sources(self) -> tuple[PolicySource, ...]:
-        """The policies that are played, those that the ablations add last.
+        """The policies, those that the ablations add last.
 
         Raises:
             ConfigError: As for `policy_sources`.
@@ -134,9 +134,9 @@ class EvaluationConfig:
         return policy_sources((*self.policies, *added)) if added else given
 
     def ablations_of(self, source: PolicySource) -> tuple[str, ...]:
-        """Return the ablations under which a policy is played, besides the plain score.
+        """Return the input ablations of a policy.
 
-        Oracle and random policy read no prompts, and a policy server finds its objects by itself.
+        Oracle and random policy read no prompts, and a policy server extracts objects itself.
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
@@ -146,7 +146,7 @@ class EvaluationConfig:
         return tuple(name for name in names if name != DETECTED_BOXES or usable)
 
     def record(self) -> dict[str, object]:
-        """Settings that the results depend on, as plain JSON values; not who plays, nor where to."""
+        """Settings that the results depend on, as plain JSON values."""
         return {
             "policies": [source.name for source in self.sources],
             "tasks": list(self.tasks),
@@ -165,7 +165,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Episodes of one policy, task and level with consecutive seeds, played together.
+    """Episodes of one policy, task and level with consecutive seeds, run as one batch.
 
     Args:
         policy: Name of the policy in the results.
@@ -176,9 +176,9 @@ class Batch:
         episodes: How many.
         env_config: As in `EvaluationConfig`.
         device: As in `EvaluationConfig`.
-        ablation: What is taken from the policy; empty for nothing.
+        ablation: Input ablation; empty for none.
         precision: As in `EvaluationConfig`; empty for the policy's own.
-        boxes: What makes the detector; empty for boxes of the segmentation.
+        boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
     """
 
     policy: str
@@ -224,7 +224,7 @@ class Batch:
 
 
 def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
-    """Pairs of task and level to play, by level and then by task.
+    """Pairs of task and level, by level and then by task.
 
     A task is left out at levels that do not hold it, as `sweep_without_exceeding` at L3.
 

@@ -1,7 +1,7 @@
-"""Evaluation in context: the prompt is a demonstration of the very episode that is then played.
+"""In-context evaluation: the prompt is a demonstration of the same episode.
 
-A task that was never trained can still be shown. The oracle plays the episode, and what was seen on the way
-becomes the prompt "Follow this motion: frame … frame". The policy begins where the oracle began.
+The oracle's observations become the prompt "Follow this motion: frame … frame". The policy starts from the
+same initial state.
 
 Source: MIDAS (Li et al. 2023), which holds out the three tasks below.
 """
@@ -26,7 +26,7 @@ def held_out_tasks(levels: Collection[str]) -> tuple[str, ...]:
 def demonstrated(env: TabletopEnv) -> RenderedPrompt:
     """Return the motion of the oracle in the episode that an environment has begun, as a prompt.
 
-    Where the oracle fails, or finds no action any more, its motion is shown up to there.
+    If the oracle fails or has no action, the demonstration ends there.
 
     Args:
         env: The environment; it is left as it is.

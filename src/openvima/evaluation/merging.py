@@ -1,4 +1,4 @@
-"""Several evaluations as one, for a common report and for comparisons."""
+"""Merging several evaluations, for a common report and for comparisons."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ class Merged:
     """Several evaluations joined.
 
     Args:
-        results: All rows. Different policies of the same name bear that of their evaluation too, as
+        results: All rows. Different policies of the same name are told apart by their evaluation, as
             "mine@first".
         names: For each evaluation the new names of its policies.
-        notes: What a reader should know about the differences between the evaluations.
+        notes: Warnings about differences between the evaluations.
     """
 
     results: Results
@@ -37,7 +37,7 @@ def merge(evaluations: Mapping[str, Results]) -> Merged:
         evaluations: Name of each evaluation, such as that of its folder, to its results.
 
     Returns:
-        The joined results, and what became of names.
+        The joined results, with the new names.
 
     Raises:
         ConfigError: A seed does not stand for the same episode in all of them.

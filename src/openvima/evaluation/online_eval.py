@@ -1,4 +1,4 @@
-"""Trials in the simulator while a policy is being trained."""
+"""Online evaluation of checkpoints during training."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +9,12 @@ from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies.base import load_policy
 
 ONLINE_EVAL_LEVEL = "L1"
-_DOMAIN = "user"  # evaluation episodes stay unseen until the policy is finished
+_DOMAIN = "user"  # evaluation episodes are kept for finished policies
 
 
 @dataclass(frozen=True, slots=True)
 class OnlineEval:
-    """Plays the same few episodes of some tasks with every checkpoint that it is given.
+    """Evaluates checkpoints on the same episodes of some tasks.
 
     Args:
         tasks: Names of the tasks.

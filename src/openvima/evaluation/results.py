@@ -1,4 +1,4 @@
-"""What an evaluation found: outcomes of single episodes, counted by policy, task and level."""
+"""Results of an evaluation: outcomes of episodes, counted by policy, task and level."""
 
 import json
 import re
@@ -26,9 +26,9 @@ class EpisodeOutcome:
         steps: Actions taken.
         reason: Empty on success, else one sentence.
         kind: Empty on success, else the reason without names and numbers, for counting.
-        resamples: Unlucky draws that were thrown away before a start was found.
+        resamples: Rejected starts before a valid one was sampled.
         oracle_max_steps: Steps within which the oracle must be done; None: as the row says.
-        near_ties: Decisions in which two classes scored so alike that rounding may choose between them.
+        near_ties: Decisions between two classes whose scores differ by no more than rounding.
     """
 
     seed: int
@@ -51,8 +51,7 @@ class Row:
         level: "train", "L1", "L2", "L3" or "L4".
         oracle_max_steps: Steps within which the oracle must be done; the policy has two more.
         outcomes: One entry an episode, seeds ascending.
-        ablation: What was taken from the policy, see `openvima.evaluation.ablations`; empty for the plain
-            score.
+        ablation: Input ablation, see `openvima.evaluation.ablations`; empty for none.
     """
 
     policy: str
@@ -64,7 +63,7 @@ class Row:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes played."""
+        """Number of episodes."""
         return len(self.outcomes)
 
     @property
@@ -74,7 +73,7 @@ class Row:
 
     @property
     def rate(self) -> float:
-        """Share of solved episodes."""
+        """Success rate."""
         return self.successes / self.episodes
 
     @property
@@ -97,17 +96,17 @@ class Row:
 
     @property
     def resamples(self) -> int:
-        """Number of unlucky draws that were thrown away, over all episodes."""
+        """Number of rejected starts, over all episodes."""
         return sum(outcome.resamples for outcome in self.outcomes)
 
     @property
     def near_ties(self) -> list[int]:
-        """Seeds of episodes whose outcome rounding may have decided."""
+        """Seeds of episodes with near ties."""
         return [outcome.seed for outcome in self.outcomes if outcome.near_ties]
 
     @property
     def failures(self) -> dict[str, int]:
-        """How often each kind of failure came about, most frequent first."""
+        """Counts of each kind of failure, most frequent first."""
         kinds = Counter(outcome.kind for outcome in self.outcomes if not outcome.success)
         return dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
 
@@ -130,7 +129,7 @@ class Results:
 
     Args:
         rows: In the order policy, level, task.
-        config: What was asked for, as plain values.
+        config: The configuration, as plain values.
         versions: Versions of the packages that results depend on.
         policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …},
             for remote ones {"metadata": …}.

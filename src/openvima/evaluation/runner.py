@@ -1,4 +1,4 @@
-"""Running an evaluation: batches of episodes over worker processes, each kept as it finishes."""
+"""Running an evaluation: batches of episodes in worker processes, each stored as it finishes."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ _PARTS = "parts"
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A batch to play, and what its outcomes depend on besides."""
+    """A batch, and a fingerprint of what else its outcomes depend on."""
 
     batch: Batch
     fingerprint: str
@@ -44,7 +44,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
 
     Args:
         config: What to evaluate.
-        report: Called with episodes done, episodes in all and a note on what was played last.
+        report: Called with episodes done, episodes in all and a note on the last batch.
 
     Returns:
         `results.json` in `config.out`. `openvima.report` adds videos and a page.
@@ -55,7 +55,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         WorkerError: A worker process died; what was finished is kept.
     """
     if config.boxes is not None:
-        extractor_maker(config.boxes)  # a mistake there is named before anything is played
+        extractor_maker(config.boxes)  # fails before any episode
     batches = plan(config)
     policies = {source.name: source.record() for source in config.sources}
     found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
@@ -94,7 +94,7 @@ def _play_all(
     found: Mapping[str, str],
     report: Report | None,
 ) -> dict[Batch, tuple[EpisodeOutcome, ...]]:
-    """Play what has not been played yet."""
+    """Run the batches that are not finished yet."""
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
     prints = {name: json.dumps([what, dict(found)], sort_keys=True) for name, what in policies.items()}
@@ -116,7 +116,7 @@ def _play_all(
 
 
 def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tuple[EpisodeOutcome, ...]]]:
-    """Play batches with the engine that was asked for; yields them as they finish."""
+    """Run batches on the configured engine and yield them as they finish."""
     if config.engine == "processes":
         yield from imap_unordered(play_batch, jobs, config.workers or 1)
         return
@@ -129,7 +129,7 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tu
 
 
 def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, ...]:
-    """Play one batch; runs in a worker process, maybe of another machine."""
+    """Run one batch in a worker process, possibly on another machine."""
     from openvima.evaluation.rollout import play
 
     batch = job.batch

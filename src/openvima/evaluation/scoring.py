@@ -1,4 +1,4 @@
-"""Scoring policies of your own: objects with `reset` and `act`, played in this process."""
+"""Evaluating policy objects with `reset` and `act` in this process."""
 
 from collections.abc import Mapping
 
@@ -19,15 +19,15 @@ def score(
     seed: int = 0,
     ablations: tuple[str, ...] = (),
 ) -> Results:
-    """Play the episodes of `openvima evaluate` with policies that exist as objects only.
+    """Evaluate policy objects on the episodes of `openvima evaluate`.
 
     Args:
-        policies: Anything that fulfils the `Policy` protocol, by the name that it bears in the results.
+        policies: Objects that implement the `Policy` protocol, by their names in the results.
         tasks: Names of tasks, or ("all",) for every task that the level holds.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
-        ablations: What to play besides; as in `EvaluationConfig`, except for "detected_boxes".
+        ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes".
 
     Returns:
         Success rates and the outcome of every episode.
@@ -35,7 +35,7 @@ def score(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: There is nothing to play.
+        ConfigError: There is no episode.
         PolicyError: A policy left out an episode that is not over.
 
     Example:

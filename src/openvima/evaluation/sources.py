@@ -1,4 +1,4 @@
-"""The policies of an evaluation: under which name, from where, and what stands for their weights."""
+"""Policies of an evaluation: names, sources and hashes of weights."""
 
 import hashlib
 import re
@@ -23,7 +23,7 @@ _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 @dataclass(frozen=True, slots=True)
 class PolicySource:
-    """A policy under the name that it bears in the results.
+    """A policy and its name in the results.
 
     Args:
         name: Name in the results.
@@ -64,7 +64,7 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
 
     Raises:
-        ConfigError: Two policies bear the same name, or a name could not be part of a file's.
+        ConfigError: Two policies have the same name, or a name is not fit for file names.
     """
     sources = []
     for given in policies:

@@ -1,4 +1,4 @@
-"""Section of the report on what a score is made of: the same policy with something taken from it."""
+"""Section of the report on input ablations."""
 
 from collections.abc import Mapping
 
@@ -16,11 +16,11 @@ from openvima.report.text import (
     series_colours,
 )
 
-_BOUNDS = ("oracle", "random")  # kinds of policies between which a score lies
+_BOUNDS = ("oracle", "random")  # kinds of policies that bound a score
 
 
 def ablation_section(results: Results) -> str:
-    """Scores under ablations beside the plain ones; nothing where no ablations were played."""
+    """Scores with and without input ablations; empty if there are none."""
     policies = [policy for policy in results.policy_names() if _ablations(results, policy)]
     if not policies:
         return ""
@@ -92,7 +92,7 @@ def _policy(results: Results, means: Mapping[tuple[str, str, str], LevelMean], p
 
 
 def _against_plain(results: Results, policy: str, ablations: list[str]) -> dict[str, Comparison]:
-    """Each ablation against the plain score, where both were played on some of the same episodes."""
+    """Each ablation against the unablated score, on their common episodes."""
     names = {ablation: f"{policy}{ABLATION_SEPARATOR}{ablation}" for ablation in ablations}
     pairs = {c: (name, policy) for c, name in names.items() if can_be_compared(results, name, policy)}
     return dict(zip(pairs, compare_pairs(results, list(pairs.values())), strict=True))

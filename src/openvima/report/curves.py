@@ -17,7 +17,7 @@ _KINDS = (  # part of a metric's name, and whether it is a fraction
 )
 _HELD_OUT = "validation_"
 _HELD_OUT_LABEL = "held out"
-_MOST_CURVES = 4  # more of them in one chart cannot be told apart
+_MOST_CURVES = 4  # in one chart
 _MOST_RUNS = 6  # as many as the page has colours
 
 
@@ -26,7 +26,7 @@ class Chart:
     """Curves that share one pair of axes.
 
     Args:
-        title: What they show.
+        title: Title of the chart.
         curves: Name of each curve to its (step, value) points.
         percent: Whether values are fractions.
     """
@@ -49,7 +49,7 @@ def find_metrics(run: Path) -> Path:
 
 
 def read_run_charts(runs: Sequence[Path]) -> list[Chart]:
-    """Read what the report shows of several training runs.
+    """Read the charts of several training runs.
 
     Args:
         runs: Run folders or their `metrics.jsonl`.
@@ -83,14 +83,14 @@ def run_labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read_charts(metrics: Path) -> list[Chart]:
-    """Read what the report shows of a training run: losses and accuracies over the steps of each stage.
+    """Read the charts of a training run: losses and accuracies over the steps of each stage.
 
     Args:
         metrics: A file with one JSON object a line: its "step", perhaps the "name" of its stage, and numbers.
-            Those with "loss" or "accuracy" in their names are shown; "validation_" in front means held out.
+            Those with "loss" or "accuracy" in their names are charted; "validation_" means held out.
 
     Returns:
-        The charts; none where there is nothing to show.
+        The charts.
 
     Raises:
         DatasetError: The file is not of that form.

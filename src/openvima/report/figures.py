@@ -36,7 +36,7 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
 
     Args:
         results: The evaluation.
-        level: The level to show.
+        level: The level.
         colours: Name of each policy to the CSS variable of its colour, such as "--series-1".
 
     Returns:
@@ -73,9 +73,9 @@ def curve_chart(
 
     Args:
         curves: Name of each curve to its (step, value) points.
-        title: What the chart shows; stands above it.
+        title: Title of the chart.
         name: Put before the names of its elements; no other chart of the page may have it.
-        percent: Whether values are fractions to be shown as per cent, on an axis from 0 to 100.
+        percent: Whether values are fractions, drawn on an axis from 0 to 100 %.
 
     Returns:
         An `<svg>` element.

@@ -6,7 +6,7 @@ DOT = '<span class="dot"></span>'  # in the colour of its policy
 
 
 def section(name: str, title: str, lead: str, body: str) -> str:
-    """A part of the page under a heading, with a sentence on what it shows."""
+    """A section of the page with heading and lead."""
     return f'<section id="{name}"><h2>{prose(title)}</h2><p>{prose(lead)}</p>{body}</section>'
 
 
@@ -16,5 +16,5 @@ def policy_head(policy: str, colour: str) -> str:
 
 
 def folded(summary: str, body: str) -> str:
-    """Something to unfold on request."""
+    """A collapsed section."""
     return f'<details class="card fold"><summary>{prose(summary)}</summary>{body}</details>'

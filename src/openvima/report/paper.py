@@ -63,7 +63,7 @@ class Table:
 
     Args:
         label: Short name for references, of letters and hyphens.
-        caption: What it shows.
+        caption: The caption.
         columns: Heads, the first that of the names.
         lines: Rows.
     """

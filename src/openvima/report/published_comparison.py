@@ -1,4 +1,4 @@
-"""Section of the report with the papers' numbers beside one's own."""
+"""Section of the report with published results."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from openvima.report.text import prose, series_colours
 
 
 def published_section(results: Results) -> str:
-    """Level means beside those of the papers; nothing where no level of the papers was played."""
+    """Level means beside those of the papers; empty if no published level was evaluated."""
     levels = [level for level in results.levels() if published_tasks(level)]
     if not levels:
         return ""

@@ -19,7 +19,7 @@ from openvima.report.text import (
 )
 
 _MOST_TASKS = 4  # that are named for a cause of failure
-_MOST_CAUSES = 8  # that are shown of a policy
+_MOST_CAUSES = 8  # listed for a policy
 
 
 def rate_table(results: Results) -> str:

@@ -38,7 +38,7 @@ def save_task_gallery(
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
         tasks: Names of tasks; by default all.
         env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
-        seed: First seed to try for each task; the first episode that the oracle solves is shown.
+        seed: First seed to try for each task; the gallery contains the first episode that the oracle solves.
         report: Called with tasks done, tasks in all, and the task's name.
 
     Returns:

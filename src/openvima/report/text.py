@@ -44,7 +44,7 @@ def ablation_name(ablation: str) -> str:
 
 
 def ablation_description(ablation: str) -> str:
-    """One sentence on what an ablation takes from the policy."""
+    """One sentence on an input ablation."""
     return _ABLATION_DESCRIPTIONS.get(ablation, "See the documentation of the evaluation.")
 
 
@@ -68,7 +68,7 @@ def series_colours(results: Results) -> dict[str, str]:
 
 
 def percent(fraction: float, decimals: int = 0) -> str:
-    """Write a rate in per cent.
+    """Format a rate as a percentage.
 
     Example:
         >>> percent(0.8666), percent(0.8666, 1)
@@ -78,7 +78,7 @@ def percent(fraction: float, decimals: int = 0) -> str:
 
 
 def exact(fraction: float) -> str:
-    """Whole per cent where the rate is, as with 50 or 100 episodes, else one decimal."""
+    """Format a rate as a percentage without decimals if it has none, else with one."""
     return percent(fraction, 0 if round(1000 * fraction) % 10 == 0 else 1)
 
 
@@ -116,7 +116,7 @@ def probability(p_value: float) -> str:
 
 
 def span(interval: tuple[float, float]) -> str:
-    """Write an interval in whole per cent, without the sign."""
+    """Format an interval in whole percent, without the sign."""
     return f"{round(100 * interval[0])}–{round(100 * interval[1])}"
 
 
@@ -156,5 +156,5 @@ def findings(results: Results) -> str:
 
 
 def prose(text: str) -> str:
-    """Escape text for HTML, and keep numbers with their per cent sign."""
+    """Escape text for HTML, with no line break before percent signs."""
     return html.escape(text, quote=True).replace(" %", "&nbsp;%")

@@ -1,4 +1,4 @@
-"""How sure rates and differences are: intervals and tests, from counts alone."""
+"""Confidence intervals and tests of rates and differences, from counts."""
 
 from openvima.evaluation.statistics.multiple import holm
 from openvima.evaluation.statistics.paired import PairCounts, mcnemar, mean_difference

@@ -1,10 +1,10 @@
-"""Many comparisons at once: p-values that take into account how many were tried."""
+"""Multiple comparisons: adjusted p-values."""
 
 from collections.abc import Sequence
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p-values so that the chance of even one false alarm among all is no more than they say.
+    """Adjust p-values to control the family-wise error rate.
 
     Args:
         p_values: Of the single tests, in any order; the tests may depend on each other.

@@ -1,4 +1,4 @@
-"""Two policies on the same episodes: the difference of their success rates, and whether it is chance."""
+"""Paired comparison of two policies: difference of success rates, and McNemar's test."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def mean_difference(counts: Sequence[PairCounts], confidence: float = 0.95) -> t
 
     Args:
         counts: Outcomes on each task.
-        confidence: Share of such intervals that hold the true difference, between 0 and 1.
+        confidence: Nominal coverage, between 0 and 1.
 
     Returns:
         The mean of a minus b, and its interval, as fractions.

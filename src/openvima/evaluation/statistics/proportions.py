@@ -1,4 +1,4 @@
-"""How sure a success rate is: intervals for single rates and for means of several."""
+"""Confidence intervals for success rates and for means of several."""
 
 import math
 from collections.abc import Sequence
@@ -8,14 +8,14 @@ from openvima.evaluation.statistics.score import Interval, lower_end, mean_and_v
 
 
 def wilson_interval(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
-    """Interval in which the true success rate lies, from counts.
+    """Confidence interval of a success rate.
 
-    Unlike the usual ± interval it stays inside [0, 1] and is of use at 0 and at 100 % success.
+    Unlike the normal approximation it stays inside [0, 1] and is valid at 0 and 100 % success.
 
     Args:
-        successes: Episodes that were solved.
-        episodes: Episodes that were played, at least one.
-        confidence: Share of such intervals that hold the true rate, between 0 and 1.
+        successes: Solved episodes.
+        episodes: All episodes, at least one.
+        confidence: Nominal coverage, between 0 and 1.
 
     Returns:
         Lower and upper end, as fractions.
