@@ -213,9 +213,9 @@ def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
     wait_until_gone(workers)
 
 
-def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+def test_a_script_without_a_guard_gets_a_hint(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + "main()")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "WorkerError: the worker of sub-environment" in errors
-    assert 'under `if __name__ == "__main__":`' in errors
+    assert 'need `if __name__ == "__main__":`' in errors

@@ -7,7 +7,7 @@ Source: the object list of VIMA-Bench; a few oddities are kept because published
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from openvima.catalog.geometry import Vector3
 from openvima.errors import UnknownObjectError, unknown_name
@@ -20,7 +20,6 @@ FULL_SYMMETRY = 0.0
 
 # Bowl and frame: poses that the benchmark reads back are those of a centre of mass beside the link frame.
 _SHIFTED_COM = (-0.01, 0.0, 0.02)
-_ORIGIN = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +34,7 @@ class ObjectSpec:
         size_min: Smallest nominal size (x, y, z) in metres. Sampling and spacing use it; the mesh may be
             smaller or larger.
         size_max: Largest nominal size; each axis is sampled uniformly in between.
+        inertia_diag: Principal moments at the smallest size, kg m².
         symmetry_rad: Angle of rotational symmetry as the benchmark stores it: 2π none, 0 any angle, None
             unset. Stored and true values differ for block (true: π/2), cross (π/2) and triangle (2π); no
             task tests the rotation of these.
@@ -43,7 +43,6 @@ class ObjectSpec:
         friction: Coulomb friction against the table.
         rolling_friction: Coefficient of rolling resistance, metres.
         com_offset: Centre of mass in the link frame, metres.
-        inertia_diag: Principal moments at the smallest size, kg m².
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
         aliases: Other names for paraphrased instructions; not valid names.
         novel_names: Further names that no task uses yet.
@@ -54,13 +53,13 @@ class ObjectSpec:
     kind: ObjectKind
     size_min: Vector3
     size_max: Vector3
-    symmetry_rad: float | None
-    profile: Profile | None
-    mass_kg: float
-    friction: float
-    rolling_friction: float
-    com_offset: Vector3
     inertia_diag: Vector3
+    symmetry_rad: float | None = None
+    profile: Profile | None = None
+    mass_kg: float = 0.1
+    friction: float = 1.0
+    rolling_friction: float = 1e-4
+    com_offset: Vector3 = (0.0, 0.0, 0.0)
     kit_scale: float | None = None
     aliases: tuple[str, ...] = ()
     novel_names: tuple[str, ...] = ()
@@ -73,32 +72,10 @@ def _fixed_size(
     *,
     id: str = "",  # the field's name
     size_max: Vector3 | None = None,
-    symmetry_rad: float | None = None,
-    profile: Profile | None = None,
-    mass_kg: float = 0.1,
-    friction: float = 1.0,
-    rolling_friction: float = 1e-4,
-    com_offset: Vector3 = _ORIGIN,
-    inertia_diag: Vector3,
-    aliases: tuple[str, ...] = (),
-    novel_names: tuple[str, ...] = (),
+    **properties: Any,  # fields of several types
 ) -> ObjectSpec:
-    return ObjectSpec(
-        name=name,
-        id=id or name.upper().replace(" ", "_").replace("-", "_"),
-        kind=kind,
-        size_min=size,
-        size_max=size_max or size,
-        symmetry_rad=symmetry_rad,
-        profile=profile,
-        mass_kg=mass_kg,
-        friction=friction,
-        rolling_friction=rolling_friction,
-        com_offset=com_offset,
-        inertia_diag=inertia_diag,
-        aliases=aliases,
-        novel_names=novel_names,
-    )
+    id = id or name.upper().replace(" ", "_").replace("-", "_")
+    return ObjectSpec(name=name, id=id, kind=kind, size_min=size, size_max=size_max or size, **properties)
 
 
 def _kit(
@@ -118,13 +95,9 @@ def _kit(
         kind="kit",
         size_min=_kit_size(smallest_scale or scale),
         size_max=_kit_size(scale),
+        inertia_diag=inertia_diag,
         symmetry_rad=symmetry_rad,
         profile=profile,
-        mass_kg=0.1,
-        friction=1.0,
-        rolling_friction=1e-4,
-        com_offset=_ORIGIN,
-        inertia_diag=inertia_diag,
         kit_scale=scale,
         aliases=aliases,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View
-from openvima.render.indexed import KernelBuffers, indexed, magnified, matrix_3x4
+from openvima.render.indexed import IndexedMesh, KernelBuffers, indexed, magnified, matrix_3x4
 from openvima.render.kernels import draw_triangles
 from openvima.scene import (
     BACKGROUND_ID,
@@ -166,37 +166,17 @@ class Rasteriser:
         height: bool = False,
         enlarge: int = 1,
     ) -> dict[View, Image]:
-        prepared = [
-            (indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id))
-            for body in bodies
-        ]
+        prepared = [_prepared(body) for body in bodies]
         images: dict[View, Image] = {}
         for view in views:
-            background = _background(CAMERAS[view].enlarged(enlarge), table)
-            rgb, segm = background.rgb.copy(), background.segm.copy()
-            heights = background.height.copy() if height else _NO_HEIGHTS
-            depth = self._depth.setdefault(segm.shape, np.empty(segm.shape))
-            np.copyto(depth, background.depth)
-            for mesh, pose, texture, object_id in prepared:
-                screen, selected = self._buffers.arrays(mesh)
-                draw_triangles(
-                    mesh.vertices,
-                    mesh.corners,
-                    mesh.normals,
-                    mesh.uvs,
-                    mesh.is_flat,
-                    pose,
-                    background.camera,
-                    texture,
-                    object_id,
-                    screen,
-                    selected,
-                    depth,
-                    rgb,
-                    segm,
-                    heights,
-                )
-            images[view] = Image(rgb, segm, heights if height else None)
+            empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
+            depth = self._depth.setdefault(empty.segm.shape, np.empty(empty.segm.shape))
+            np.copyto(depth, empty.depth)
+            heights = empty.height.copy() if height else _NO_HEIGHTS
+            canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), heights, depth)
+            for body in prepared:
+                _draw_body(body, canvas, self._buffers)
+            images[view] = Image(canvas.rgb, canvas.segm, heights if height else None)
         return images
 
 
@@ -204,8 +184,8 @@ _NO_HEIGHTS = np.empty((0, 0), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Background:
-    """An image without bodies, its depths, and the camera matrix."""
+class _Canvas:
+    """Camera matrix, and the images of one view that bodies are drawn into."""
 
     camera: np.ndarray
     rgb: np.ndarray
@@ -214,10 +194,37 @@ class _Background:
     depth: np.ndarray
 
 
+_Prepared = tuple[IndexedMesh, np.ndarray, np.ndarray, int]  # mesh, pose, texture, id
+
+
+def _prepared(body: Drawable) -> _Prepared:
+    return indexed(body.mesh), matrix_3x4(body.pose), _texture_array(body.texture), _checked_id(body.id)
+
+
+def _draw_body(body: _Prepared, canvas: _Canvas, buffers: KernelBuffers) -> None:
+    mesh, pose, texture, object_id = body
+    draw_triangles(
+        mesh.vertices,
+        mesh.corners,
+        mesh.normals,
+        mesh.uvs,
+        mesh.is_flat,
+        pose,
+        canvas.camera,
+        texture,
+        object_id,
+        *buffers.arrays(mesh),
+        canvas.depth,
+        canvas.rgb,
+        canvas.segm,
+        canvas.height,
+    )
+
+
 @lru_cache(maxsize=16)
-def _background(camera: Camera, table: bool) -> _Background:
+def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
     shape = (camera.height, camera.width)
-    background = _Background(
+    canvas = _Canvas(
         camera.matrix(),
         np.full((3, *shape), 255, dtype=np.uint8),
         np.full(shape, BACKGROUND_ID, dtype=np.uint8),
@@ -228,26 +235,8 @@ def _background(camera: Camera, table: bool) -> _Background:
         floor = Drawable(_rectangle(200.0, 200.0), Pose((0.0, 0.0, FLOOR_Z)), FLOOR_ID, FLOOR_RGB)
         sheet = Drawable(_rectangle(*SHEET_SIZE), Pose((0.5, 0.0, 0.0)), SHEET_ID, SHEET_RGB)
         for body in (floor, sheet):
-            mesh = indexed(body.mesh)
-            screen, selected = KernelBuffers().arrays(mesh)
-            draw_triangles(
-                mesh.vertices,
-                mesh.corners,
-                mesh.normals,
-                mesh.uvs,
-                mesh.is_flat,
-                matrix_3x4(body.pose),
-                background.camera,
-                _texture_array(body.texture),
-                body.id,
-                screen,
-                selected,
-                background.depth,
-                background.rgb,
-                background.segm,
-                background.height,
-            )
-    return background
+            _draw_body(_prepared(body), canvas, KernelBuffers())
+    return canvas
 
 
 def _rectangle(length_x: float, length_y: float) -> TriangleMesh:
