@@ -148,7 +148,7 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
     changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
     write_cache_file(path, changed, "objects", cache._files[path.name].source, "clumsy-1")
     (problem,) = verify(copy).problems
-    assert "not those of the demonstration" in problem.cause
+    assert "it differs from the demonstration" in problem.cause
     assert problem.file.endswith("objects-v3-clumsy-1/rotate-train-00000.arrow")
 
 
