@@ -1,4 +1,4 @@
-"""What a data set shows, by task and role, and whether that is from the training partition."""
+"""Appearance statistics by task and role, and the leakage check."""
 
 import json
 from copy import deepcopy
@@ -10,8 +10,8 @@ import pytest
 from openvima.catalog import TEXTURE_SETS
 from openvima.cli.main import main
 from openvima.data import Dataset, GenerateConfig, generate
-from openvima.data.appearance_stats import ROLES, looks_of, looks_record, looks_text, seeds_of
-from openvima.data.leakage import beyond_training, training_looks
+from openvima.data.appearance_stats import ROLES, appearance_record, appearance_text, appearances_of, seeds_of
+from openvima.data.leakage import leaks, training_appearances
 from openvima.data.manifest import MANIFEST_NAME
 from openvima.errors import LevelError
 
@@ -25,7 +25,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def record(demos: Path) -> dict[str, Any]:
-    return looks_record(Dataset(demos))
+    return appearance_record(Dataset(demos))
 
 
 def test_every_object_and_every_prompt_image_is_in_the_table(demos: Path, record: dict[str, Any]) -> None:
@@ -33,32 +33,34 @@ def test_every_object_and_every_prompt_image_is_in_the_table(demos: Path, record
     shown = dict.fromkeys(TASKS, 0)
     for demo in dataset:
         roles = record["tasks"][demo.task]["roles"]
-        on_table = frozenset().union(*(looks_of(roles[role]) for role in roles if role != "prompted"))
+        on_table = frozenset().union(*(appearances_of(roles[role]) for role in roles if role != "prompted"))
         assert {(part.object, part.texture) for part in demo.objects} <= on_table
         shown[demo.task] += len(demo.objects)
         for image in demo.prompt.images.values():
-            assert {(part.object, part.texture) for part in image.objects} <= looks_of(roles["prompted"])
+            assert {(part.object, part.texture) for part in image.objects} <= appearances_of(
+                roles["prompted"]
+            )
     for task, number in shown.items():
         roles = record["tasks"][task]["roles"]
-        assert sum(roles[role]["shown"] for role in roles if role != "prompted") == number
+        assert sum(roles[role]["count"] for role in roles if role != "prompted") == number
         assert set(roles) <= set(ROLES)
 
 
 def test_what_the_oracle_picks_is_dragged_or_a_distractor(demos: Path, record: dict[str, Any]) -> None:
     for demo in Dataset(demos):
         roles = record["tasks"][demo.task]["roles"]
-        look = {part.object_id: (part.object, part.texture) for part in demo.objects}
+        appearance = {part.object_id: (part.object, part.texture) for part in demo.objects}
         for pick, place in zip(demo.pick_ids, demo.place_ids, strict=True):
-            distractors = looks_of(roles["distractor"]) if demo.task == "rearrange" else set()
-            assert look[pick] in looks_of(roles["dragged"]) | distractors
-            assert place == -1 or look[place] in looks_of(roles["base"])
+            distractors = appearances_of(roles["distractor"]) if demo.task == "rearrange" else set()
+            assert appearance[pick] in appearances_of(roles["dragged"]) | distractors
+            assert place == -1 or appearance[place] in appearances_of(roles["base"])
 
 
 def test_the_table_names_its_data_and_survives_a_file(demos: Path, record: dict[str, Any]) -> None:
     manifest = json.loads((demos / MANIFEST_NAME).read_text())
     assert record["manifest"]["content_hash"] == manifest["content_hash"]
     assert record["manifest"]["index"] == manifest["index"]
-    assert json.loads(looks_text(record)) == record
+    assert json.loads(appearance_text(record)) == record
     for task, entry in record["tasks"].items():
         rows = [row for row in Dataset(demos).index.to_pylist() if row["task"] == task]
         assert seeds_of(entry) == sorted(row["seed"] for row in rows)
@@ -66,11 +68,11 @@ def test_the_table_names_its_data_and_survives_a_file(demos: Path, record: dict[
 
 
 def test_demonstrations_for_training_keep_to_their_partition(record: dict[str, Any]) -> None:
-    assert beyond_training(record) == []
+    assert leaks(record) == []
 
 
 @pytest.mark.parametrize(
-    ("role", "look"),
+    ("role", "appearance"),
     [
         ("dragged", ("letter R", "red")),  # a novel object
         ("dragged", ("letter A", "brick")),  # a novel texture
@@ -81,46 +83,50 @@ def test_demonstrations_for_training_keep_to_their_partition(record: dict[str, A
         ("prompted", ("letter A", "gray")),
     ],
 )
-def test_what_goes_beyond_it_is_named(record: dict[str, Any], role: str, look: tuple[str, str]) -> None:
+def test_appearances_outside_the_partition_are_named(
+    record: dict[str, Any], role: str, appearance: tuple[str, str]
+) -> None:
     changed = deepcopy(record)
     roles = changed["tasks"]["visual_manipulation"]["roles"]
-    roles.setdefault(role, {"looks": []})["looks"].append({"objects": [look[0]], "textures": [look[1]]})
-    assert beyond_training(changed) == [f"visual_manipulation shows {look[0]!r} in {look[1]!r} as {role}."]
+    roles.setdefault(role, {"appearances": []})["appearances"].append(
+        {"objects": [appearance[0]], "textures": [appearance[1]]}
+    )
+    assert leaks(changed) == [f"visual_manipulation shows {appearance[0]!r} in {appearance[1]!r} as {role}."]
 
 
 def test_other_tasks_and_levels_are_named(record: dict[str, Any]) -> None:
     changed = deepcopy(record)
     changed["tasks"]["follow_motion"] = changed["tasks"]["rearrange"]
     changed["tasks"]["rearrange"] = {**changed["tasks"]["rearrange"], "levels": ["L1", "train"]}
-    problems = beyond_training(changed)
+    problems = leaks(changed)
     assert "follow_motion is none of the training tasks." in problems
     assert "rearrange has episodes of level L1." in problems
     with pytest.raises(LevelError):
-        training_looks("follow_motion")
+        training_appearances("follow_motion")
 
 
 def test_only_distractors_of_rearrangements_have_all_textures() -> None:
     everything = set(TEXTURE_SETS["T"])
     for task in ("rearrange", "twist", "visual_manipulation"):
-        for role, looks in training_looks(task).items():
-            has_all = {texture for _, texture in looks} >= everything
+        for role, appearances in training_appearances(task).items():
+            has_all = {texture for _, texture in appearances} >= everything
             assert has_all == (task == "rearrange" and role == "distractor")
 
 
-def test_the_command_writes_the_table_and_says_what_does_not_belong(
+def test_the_command_writes_the_statistics_and_names_leaks(
     demos: Path, record: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "training_data.json"
-    assert main(["data", "info", str(demos), "--looks", str(file)]) == 0
+    assert main(["data", "info", str(demos), "--appearance", str(file)]) == 0
     assert json.loads(file.read_text()) == record
-    assert "nothing is beyond the training partition" in capsys.readouterr().err
+    assert "everything is inside the training partition" in capsys.readouterr().err
     novel = generate(GenerateConfig(out=tmp_path / "novel", tasks=("rotate",), level="L3", episodes=2))
-    assert main(["data", "info", str(novel), "--looks", str(file)]) == 0
+    assert main(["data", "info", str(novel), "--appearance", str(file)]) == 0
     assert "rotate shows 'letter R'" in capsys.readouterr().err
 
 
 def test_a_folder_that_is_not_finished_has_no_table(demos: Path, tmp_path: Path) -> None:
     for shard in demos.glob("*.arrow"):
         (tmp_path / shard.name).write_bytes(shard.read_bytes())
-    assert main(["data", "info", str(tmp_path), "--looks", str(tmp_path / "looks.json")]) == 2
-    assert not (tmp_path / "looks.json").exists()
+    assert main(["data", "info", str(tmp_path), "--appearance", str(tmp_path / "appearance.json")]) == 2
+    assert not (tmp_path / "appearance.json").exists()

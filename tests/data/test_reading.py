@@ -180,7 +180,7 @@ def test_colours_are_joined_and_parted_pixel_by_pixel() -> None:
 def test_memory_that_is_used_again_changes_nothing(made_up: MadeUp) -> None:
     scratch = ImageBuffers()
     for demo in (made_up(1, num_steps=4, num_images=3), made_up(2, num_steps=0, num_images=0), made_up(3)):
-        assert encode(demo, scratch=scratch).equals(encode(demo))
+        assert encode(demo, buffers=scratch).equals(encode(demo))
 
 
 def test_the_schema_says_how_images_are_shaped() -> None:

@@ -14,13 +14,13 @@ from openvima.cli.main import main
 from openvima.data import Dataset, Demonstration, ShardWriter
 from openvima.data.encoding import ShardInfo, Skipped
 from openvima.data.manifest import finish_folder
-from openvima.data.subsets import MergeConfig, Parts, SubsetConfig, merge, parse_parts, sample, split
-from openvima.data.subsets.choosing import chosen_parts, chosen_sample
+from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, parse_splits, sample, split
+from openvima.data.subsets.choosing import assign_splits, select_sample
 from openvima.errors import ConfigError, DatasetError, ShardError
 
 MadeUp = Callable[..., Demonstration]
 WriteFolder = Callable[..., Path]
-HALVES = Parts({"a": 0.5, "b": 0.5})
+HALVES = Splits({"a": 0.5, "b": 0.5})
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_smaller_samples_are_part_of_larger_ones() -> None:
     index = index_of(2000)
-    chosen = [chosen_sample(index, share, 0) for share in (0.001, 0.01, 0.1, 1.0)]
+    chosen = [select_sample(index, fraction, 0) for fraction in (0.001, 0.01, 0.1, 1.0)]
     assert [mask.sum() for mask in chosen] == [4, 40, 400, 4000]
     for smaller, larger in itertools.pairwise(chosen):
         assert not (smaller & ~larger).any()
@@ -85,20 +85,20 @@ def test_smaller_samples_are_part_of_larger_ones() -> None:
 
 def test_each_task_keeps_its_proportion_and_at_least_one_episode() -> None:
     index = pa.concat_tables([index_of(1000, ("rotate",)), index_of(30, ("stack",)), index_of(3, ("twist",))])
-    chosen = index.filter(pa.array(chosen_sample(index, 0.1, 0))).column("task").to_pylist()
+    chosen = index.filter(pa.array(select_sample(index, 0.1, 0))).column("task").to_pylist()
     assert {task: chosen.count(task) for task in set(chosen)} == {"rotate": 100, "stack": 3, "twist": 1}
 
 
 def test_choices_do_not_depend_on_the_order_of_episodes_but_on_the_seed() -> None:
     index = index_of(300)
     shuffled = index.take(np.random.default_rng(0).permutation(len(index)))
-    assert names(index, chosen_sample(index, 0.1, 0)) == names(shuffled, chosen_sample(shuffled, 0.1, 0))
-    assert names(index, chosen_sample(index, 0.1, 0)) != names(index, chosen_sample(index, 0.1, 1))
+    assert names(index, select_sample(index, 0.1, 0)) == names(shuffled, select_sample(shuffled, 0.1, 0))
+    assert names(index, select_sample(index, 0.1, 0)) != names(index, select_sample(index, 0.1, 1))
 
 
 def test_the_episodes_of_a_sample_are_these() -> None:
     index = index_of(1000, ("rotate",))
-    chosen = index.filter(pa.array(chosen_sample(index, 0.003, 0))).column("seed").to_pylist()
+    chosen = index.filter(pa.array(select_sample(index, 0.003, 0))).column("seed").to_pylist()
     assert chosen == [
         90,
         654,
@@ -108,31 +108,31 @@ def test_the_episodes_of_a_sample_are_these() -> None:
 
 def test_parts_are_disjoint_complete_and_nearly_of_their_shares() -> None:
     index = index_of(5000)
-    chosen = chosen_parts(index, Parts({"training": 0.9, "validation": 0.07, "test": 0.03}), 0)
+    chosen = assign_splits(index, Splits({"training": 0.9, "validation": 0.07, "test": 0.03}), 0)
     assert (sum(mask.astype(int) for mask in chosen.values()) == 1).all()
-    shares = [mask.mean() for mask in chosen.values()]
-    assert np.allclose(shares, (0.9, 0.07, 0.03), atol=0.01)
+    fractions = [mask.mean() for mask in chosen.values()]
+    assert np.allclose(fractions, (0.9, 0.07, 0.03), atol=0.01)
 
 
 def test_an_episode_stays_in_its_part_when_data_are_added() -> None:
     small, large = index_of(100), index_of(1000)
-    before, after = (chosen_parts(index, HALVES, 0) for index in (small, large))
+    before, after = (assign_splits(index, HALVES, 0) for index in (small, large))
     for part in before:
         assert names(small, before[part]) <= names(large, after[part])
 
 
 def test_small_samples_lie_in_all_parts() -> None:
     index = index_of(5000)
-    sampled = chosen_sample(index, 0.1, 0)
-    assert abs(chosen_parts(index, HALVES, 0)["a"][sampled].mean() - 0.5) < 0.1
+    sampled = select_sample(index, 0.1, 0)
+    assert abs(assign_splits(index, HALVES, 0)["a"][sampled].mean() - 0.5) < 0.1
 
 
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
         ("training=0.9,validation=0.2", "add up to 1.1"),
-        ("training", "give names and shares"),
-        ("training=much", "give names and shares"),
+        ("training", "give names and fractions"),
+        ("training=much", "give names and fractions"),
         ("a=0.5,a=0.5", "named twice"),
         ("../a=0.5,b=0.5", "needs a name of letters"),
         ("a=1.0", "between 0 and 1"),
@@ -141,7 +141,7 @@ def test_small_samples_lie_in_all_parts() -> None:
 )
 def test_parts_that_make_no_sense_are_refused(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
-        parse_parts(text)
+        parse_splits(text)
 
 
 def test_a_sample_holds_the_records_unchanged(tmp_path: Path, write_folder: WriteFolder) -> None:
@@ -163,7 +163,7 @@ def test_a_manifest_names_the_source_by_its_content_alone(tmp_path: Path, write_
     folder = sample(SubsetConfig(source, tmp_path / "half"), 0.5)
     manifest, original = Dataset(folder).manifest, Dataset(source).manifest
     assert manifest["command"] == "openvima data sample"
-    assert manifest["config"]["share"] == 0.5
+    assert manifest["config"]["fraction"] == 0.5
     assert manifest["config"]["source"]["content_hash"] == original["content_hash"]
     assert manifest["config"]["source"]["config"] == original["config"]
     assert str(tmp_path) not in json.dumps(manifest)
@@ -183,10 +183,10 @@ def test_a_split_gives_each_episode_to_one_part(tmp_path: Path, write_folder: Wr
     assert sorted(episodes(folder / "a") + episodes(folder / "b")) == episodes(source)
 
 
-def test_a_part_without_episodes_is_refused(tmp_path: Path, write_folder: WriteFolder) -> None:
+def test_a_split_without_episodes_is_refused(tmp_path: Path, write_folder: WriteFolder) -> None:
     source = write_folder(tmp_path / "demos", range(2))
-    with pytest.raises(DatasetError, match="fall into part tiny"):
-        split(SubsetConfig(source, tmp_path / "parts"), Parts({"tiny": 0.0001, "rest": 0.9999}))
+    with pytest.raises(DatasetError, match="fall into split tiny"):
+        split(SubsetConfig(source, tmp_path / "parts"), Splits({"tiny": 0.0001, "rest": 0.9999}))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demos"]
 
 
@@ -318,18 +318,19 @@ def test_the_command_line_samples_splits_and_merges(
     source = write_folder(tmp_path / "demos")
     parts = tmp_path / "parts"
     assert (
-        main(["data", "sample", str(source), str(tmp_path / "s"), "--share", "0.5", "--tasks", "rotate"]) == 0
+        main(["data", "sample", str(source), str(tmp_path / "s"), "--fraction", ".5", "--tasks", "rotate"])
+        == 0
     )
-    assert main(["data", "split", str(source), str(parts), "--parts", "a=0.5,b=0.5"]) == 0
+    assert main(["data", "split", str(source), str(parts), "--splits", "a=0.5,b=0.5"]) == 0
     assert main(["data", "merge", str(parts / "a"), str(parts / "b"), str(tmp_path / "m")]) == 0
     shown = [str(tmp_path / "s"), str(parts / "a"), str(parts / "b"), str(tmp_path / "m")]
     assert capsys.readouterr().out.split() == shown
     assert episodes(tmp_path / "m") == episodes(source)
     assert main(["data", "merge", str(source)]) == 2
     assert "at least two folders" in capsys.readouterr().err
-    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--share", "1.5"]) == 2
-    assert "share is 1.5" in capsys.readouterr().err
-    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--share", "1", "--tasks", ","]) == 2
+    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--fraction", "1.5"]) == 2
+    assert "fraction is 1.5" in capsys.readouterr().err
+    assert main(["data", "sample", str(source), str(tmp_path / "t"), "--fraction", "1", "--tasks", ","]) == 2
     assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; ")
     assert main(["data", "merge", str(source), str(tmp_path / "t"), "--tasks", ","]) == 2
     assert capsys.readouterr().err.startswith("openvima: DatasetError: no task is named; the sources have ")

@@ -16,7 +16,7 @@ from openvima.data.manifest import finish_folder
 from openvima.data.page import write_page
 from openvima.data.page.charts import bar_chart
 from openvima.data.page.episodes import episode_card
-from openvima.data.summary import Histogram, Overview, Unfinished, look_at
+from openvima.data.summary import Histogram, Summary, Unfinished, summarise_folder
 from openvima.errors import ConfigError, DatasetError
 from openvima.scene import Action
 
@@ -29,15 +29,15 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return generate(GenerateConfig(out=tmp_path_factory.mktemp("demos"), tasks=tasks, episodes=3))
 
 
-def histogram(overview: Overview, title: str) -> dict[str, int]:
-    (found,) = [histogram.counts for histogram in overview.histograms if histogram.title == title]
+def histogram(summary: Summary, title: str) -> dict[str, int]:
+    (found,) = [histogram.counts for histogram in summary.histograms if histogram.title == title]
     return found
 
 
-def finished(folder: Path, *, details: bool = False) -> Overview:
-    overview = look_at(folder, details=details)
-    assert isinstance(overview, Overview)
-    return overview
+def finished(folder: Path, *, details: bool = False) -> Summary:
+    summary = summarise_folder(folder, details=details)
+    assert isinstance(summary, Summary)
+    return summary
 
 
 class Page(HTMLParser):
@@ -67,32 +67,32 @@ class Page(HTMLParser):
 
 
 def test_counts_are_those_of_the_episodes(demos: Path) -> None:
-    overview, dataset = finished(demos, details=True), Dataset(demos)
-    assert [task.task for task in overview.tasks] == ["rearrange", "rotate", "sweep_without_exceeding"]
-    assert [task.episodes for task in overview.tasks] == [3, 3, 3]
+    summary, dataset = finished(demos, details=True), Dataset(demos)
+    assert [task.task for task in summary.tasks] == ["rearrange", "rotate", "sweep_without_exceeding"]
+    assert [task.episodes for task in summary.tasks] == [3, 3, 3]
     steps = [demo.num_steps for demo in dataset]
-    assert histogram(overview, "steps in an episode") == {str(n): steps.count(n) for n in sorted(set(steps))}
-    assert histogram(overview, "end effector") == {"spatula": 3, "suction": 6}
-    assert histogram(overview, "level") == {"train": 9}
+    assert histogram(summary, "steps in an episode") == {str(n): steps.count(n) for n in sorted(set(steps))}
+    assert histogram(summary, "end effector") == {"spatula": 3, "suction": 6}
+    assert histogram(summary, "level") == {"train": 9}
     num_objects = [len(demo.objects) for demo in dataset]
     counts = {str(n): num_objects.count(n) for n in sorted(set(num_objects))}
-    assert histogram(overview, "objects on the table") == counts
+    assert histogram(summary, "objects on the table") == counts
     num_images = [len(demo.prompt.images) for demo in dataset]
-    assert sum(histogram(overview, "images in the prompt").values()) == 9
-    assert histogram(overview, "images in the prompt")[str(num_images[0])] == num_images.count(num_images[0])
+    assert sum(histogram(summary, "images in the prompt").values()) == 9
+    assert histogram(summary, "images in the prompt")[str(num_images[0])] == num_images.count(num_images[0])
     textures = [placed.texture for demo in dataset for placed in demo.objects]
-    shown = histogram(overview, "objects on the table, by texture")
+    shown = histogram(summary, "objects on the table, by texture")
     assert shown == {texture: textures.count(texture) for texture in shown}
     assert list(shown.values()) == sorted(shown.values(), reverse=True)
     assert sum(shown.values()) == len(textures)
 
 
 def test_sizes_add_up(demos: Path) -> None:
-    overview = finished(demos)
-    assert overview.file_bytes == sum(path.stat().st_size for path in demos.iterdir())
-    records = sum(task.bytes for task in overview.tasks)
-    assert 0.7 * overview.file_bytes < records < overview.file_bytes
-    assert all(0.5 < task.image_share < 0.95 for task in overview.tasks)
+    summary = finished(demos)
+    assert summary.file_bytes == sum(path.stat().st_size for path in demos.iterdir())
+    records = sum(task.bytes for task in summary.tasks)
+    assert 0.7 * summary.file_bytes < records < summary.file_bytes
+    assert all(0.5 < task.image_fraction < 0.95 for task in summary.tasks)
 
 
 def test_objects_are_counted_only_on_demand(demos: Path) -> None:
@@ -100,20 +100,20 @@ def test_objects_are_counted_only_on_demand(demos: Path) -> None:
     assert titles == ["level", "steps in an episode", "end effector"]
 
 
-def test_failed_episodes_and_object_caches_are_listed(
+def test_failed_episodes_and_token_caches_are_told(
     demos: Path, tmp_path: Path, made_up: MadeUp, info: ShardInfo
 ) -> None:
     folder = tmp_path / "demos"
     (folder / "failed").mkdir(parents=True)
-    (folder / "object_cache" / "objects-v1").mkdir(parents=True)
-    (folder / "object_cache" / "objects-v1" / "a.arrow").write_bytes(bytes(1000))
+    (folder / "tokens" / "objects-v1").mkdir(parents=True)
+    (folder / "tokens" / "objects-v1" / "a.arrow").write_bytes(bytes(1000))
     for path in (folder / "stack-train-00000.arrow", folder / "failed" / "stack-train-00000.arrow"):
         with ShardWriter(path, info) as writer:
             writer.write(made_up(num_steps=0, num_images=0))
     shards = [folder / "stack-train-00000.arrow"]
     finish_folder(folder, shards, command="openvima generate", config={}, versions=info.versions)
-    overview = finished(folder)
-    assert (overview.num_failed, overview.object_caches) == (1, {"objects-v1": 1000})
+    summary = finished(folder)
+    assert (summary.num_failed, summary.object_caches) == (1, {"objects-v1": 1000})
     assert finished(demos).num_failed is None
 
 
@@ -123,28 +123,28 @@ def test_an_unfinished_folder_is_described(
     with ShardWriter(tmp_path / "stack-train-00000.arrow", info) as writer:
         writer.write(made_up(num_steps=0, num_images=0))
     (tmp_path / "stack-train-00001.arrow").write_bytes(b"ARROW1")
-    found = look_at(tmp_path)
+    found = summarise_folder(tmp_path)
     assert found == Unfinished(tmp_path, 1, {"stack": 1}, ("stack-train-00001.arrow",))
     assert main(["data", "info", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "not finished; 1 episodes in 1 whole shards" in shown
     assert "stack-train-00001.arrow cannot be read" in shown
     assert main(["data", "info", str(tmp_path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["overview"]["finished"] is False
+    assert json.loads(capsys.readouterr().out)["summary"]["finished"] is False
     assert main(["data", "info", str(tmp_path), "--html", str(tmp_path / "a.html")]) == 2
     assert "not finished" in capsys.readouterr().err
 
 
 def test_an_empty_folder_holds_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="holds no data set"):
-        look_at(tmp_path)
+        summarise_folder(tmp_path)
 
 
 def test_the_terminal_shows_the_whole(demos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["data", "info", str(demos), "--details"]) == 0
     shown = capsys.readouterr().out
     assert f"{demos}: 9 episodes" in shown
-    assert "made by openvima generate, assets procedural, compat no" in shown
+    assert "written by openvima generate, assets procedural, compat no" in shown
     assert re.search(r"rotate +3 +\d+ +\d+\.\d +\d+% +\d+ +\d+\.\d% +\d+\n", shown)
     assert re.search(r"spatula  █+ 3 \(33\.3%\)", shown)
     assert "more …" in shown
@@ -155,8 +155,8 @@ def test_machines_read_the_manifest_and_the_overview(demos: Path, capsys: pytest
     record = json.loads(capsys.readouterr().out)
     manifest = json.loads((demos / "dataset.json").read_text())
     assert {name: record[name] for name in manifest} == manifest
-    assert record["overview"]["finished"] is True
-    assert record["overview"]["tasks"]["rotate"]["episodes"] == 3
+    assert record["summary"]["finished"] is True
+    assert record["summary"]["tasks"]["rotate"]["episodes"] == 3
 
 
 def test_the_page_needs_nothing_else_and_names_nothing_twice(demos: Path, tmp_path: Path) -> None:
@@ -174,8 +174,8 @@ def test_the_page_needs_nothing_else_and_names_nothing_twice(demos: Path, tmp_pa
 
 
 def test_equal_data_give_equal_pages(demos: Path, tmp_path: Path) -> None:
-    overview = finished(demos)
-    pages = [write_page(overview, tmp_path / name, num_samples=1).read_bytes() for name in ("a", "b")]
+    summary = finished(demos)
+    pages = [write_page(summary, tmp_path / name, num_samples=1).read_bytes() for name in ("a", "b")]
     assert pages[0] == pages[1]
     assert str(demos).encode() not in pages[0]
 

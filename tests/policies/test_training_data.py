@@ -1,4 +1,4 @@
-"""What the policy in the package has seen: the table beside its weights, the partitions and the generator."""
+"""Training data of the bundled checkpoint: appearance statistics, partitions and generator."""
 
 import json
 from copy import deepcopy
@@ -9,8 +9,8 @@ import pytest
 
 import openvima
 from openvima.catalog import OBJECT_SETS, TEXTURE_SETS, pool, tasks_at
-from openvima.data.appearance_stats import looks_of, seeds_of
-from openvima.data.leakage import beyond_training
+from openvima.data.appearance_stats import appearances_of, seeds_of
+from openvima.data.leakage import leaks
 from openvima.scene import ObjectImage, Placement, SceneImage
 from openvima.tasks import sample_episode
 from openvima.tasks.seeding import make_rng
@@ -21,23 +21,25 @@ TASKS = tasks_at("train")
 NOVEL_SHAPES = {*OBJECT_SETS["D_novel"], *OBJECT_SETS["B_novel"]}
 
 
-def looks(task: str, role: str) -> frozenset[tuple[str, str]]:
+def appearances(task: str, role: str) -> frozenset[tuple[str, str]]:
     roles = RECORD["tasks"][task]["roles"]
-    return looks_of(roles[role]) if role in roles else frozenset()
+    return appearances_of(roles[role]) if role in roles else frozenset()
 
 
 def seen(task: str) -> frozenset[tuple[str, str]]:
     """On the table or in prompts."""
-    return frozenset().union(*(looks(task, role) for role in RECORD["tasks"][task]["roles"]))
+    return frozenset().union(*(appearances(task, role) for role in RECORD["tasks"][task]["roles"]))
 
 
 def placements_of(image: ObjectImage | SceneImage) -> tuple[Placement, ...]:
     return image.scene.placements if isinstance(image, SceneImage) else (image.placement,)
 
 
-def with_look(task: str, role: str, *look: str) -> dict[str, Any]:
+def with_appearance(task: str, role: str, *appearance: str) -> dict[str, Any]:
     changed = deepcopy(RECORD)
-    changed["tasks"][task]["roles"][role]["looks"].append({"objects": [look[0]], "textures": [look[1]]})
+    changed["tasks"][task]["roles"][role]["appearances"].append(
+        {"objects": [appearance[0]], "textures": [appearance[1]]}
+    )
     return changed
 
 
@@ -54,7 +56,7 @@ def test_it_learnt_the_training_tasks_at_the_training_level_and_nothing_else() -
 
 
 def test_all_that_it_saw_is_from_the_training_partition() -> None:
-    assert beyond_training(RECORD) == []
+    assert leaks(RECORD) == []
 
 
 def test_a_novel_look_among_its_data_would_be_noticed() -> None:
@@ -69,17 +71,17 @@ def test_a_novel_look_among_its_data_would_be_noticed() -> None:
         ("twist", "prompted", "letter A", "brick"),
     ):
         problem = f"{task} shows {name!r} in {texture!r} as {role}."
-        assert beyond_training(with_look(task, role, name, texture)) == [problem]
+        assert leaks(with_appearance(task, role, name, texture)) == [problem]
     levels = deepcopy(RECORD)
     levels["tasks"]["rotate"]["levels"].append("L3")
-    assert beyond_training(levels) == ["rotate has episodes of level L3."]
+    assert leaks(levels) == ["rotate has episodes of level L3."]
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_what_l2_combines_was_neither_dragged_nor_a_base(task: str) -> None:
     swapped = pool(task, "L2")
-    assert not {texture for _, texture in looks(task, "dragged")} & set(swapped.dragged_textures)
-    assert not {texture for _, texture in looks(task, "base")} & set(swapped.base_textures)
+    assert not {texture for _, texture in appearances(task, "dragged")} & set(swapped.dragged_textures)
+    assert not {texture for _, texture in appearances(task, "base")} & set(swapped.base_textures)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -94,7 +96,7 @@ def test_novel_textures_are_only_on_distractors_of_rearrangements_as_the_benchma
         (task, role)
         for task in TASKS
         for role in RECORD["tasks"][task]["roles"]
-        if {texture for _, texture in looks(task, role)} - known
+        if {texture for _, texture in appearances(task, role)} - known
     }
     assert places == {("rearrange", "distractor"), ("rearrange_then_restore", "distractor")}
     assert len(set(TEXTURE_SETS["T"]) - known) == 10
@@ -113,7 +115,7 @@ def test_the_table_speaks_of_what_the_generator_makes(task: str) -> None:
             (fixed, ("base", "other_fixed")),
             (shown, ("prompted",)),
         ):
-            known = frozenset().union(*(looks(task, role) for role in roles))
+            known = frozenset().union(*(appearances(task, role) for role in roles))
             assert {(part.object, part.texture) for part in parts} <= known
 
 

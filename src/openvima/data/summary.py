@@ -1,4 +1,4 @@
-"""What a folder of demonstrations holds, in numbers: from manifest and index alone, or with more detail."""
+"""Summary of a folder of demonstrations: counts, sizes and histograms."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -15,14 +15,14 @@ from openvima.data.schema import COLUMNS, IMAGES
 from openvima.data.shard import Shard
 from openvima.errors import ShardError
 
-_NUM_MEASURED = 3  # episodes of each task whose images are told from the rest
+_NUM_MEASURED = 3  # episodes of each task to measure the size of images on
 
 Report = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """How often each value occurs.
+    """Counts of values.
 
     Args:
         title: What is counted, such as "steps in an episode".
@@ -34,17 +34,17 @@ class Histogram:
 
 
 @dataclass(frozen=True, slots=True)
-class TaskOverview:
-    """What there is of one task.
+class TaskSummary:
+    """Summary of one task.
 
     Args:
         task: Its name.
         episodes: Number of episodes.
         steps: Number of steps.
         bytes: Size of their records.
-        image_share: Share of the images in these bytes, measured on a few episodes; 0 where none are stored.
+        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored.
         seeds_tried: Seeds that were tried for them.
-        success_rate: Share of these seeds that gave an episode.
+        success_rate: Fraction of these seeds that gave an episode.
         redraws: Unlucky draws that the sampler threw away.
     """
 
@@ -52,15 +52,15 @@ class TaskOverview:
     episodes: int
     steps: int
     bytes: int
-    image_share: float
+    image_fraction: float
     seeds_tried: int
     success_rate: float
     redraws: int
 
 
 @dataclass(frozen=True, slots=True)
-class Overview:
-    """What a finished folder holds.
+class Summary:
+    """Summary of a finished folder.
 
     Args:
         folder: The folder.
@@ -73,7 +73,7 @@ class Overview:
 
     folder: Path
     manifest: dict[str, Any]  # Any: JSON
-    tasks: tuple[TaskOverview, ...]
+    tasks: tuple[TaskSummary, ...]
     histograms: tuple[Histogram, ...]
     num_failed: int | None
     object_caches: dict[str, int]
@@ -85,12 +85,12 @@ class Overview:
         return sum((self.folder / name).stat().st_size for name in names)
 
     def to_record(self) -> dict[str, Any]:  # Any: JSON
-        """Return everything as plain values: the entries of the manifest, and an entry "overview"."""
+        """Return everything as plain values: the entries of the manifest, and an entry "summary"."""
         tasks = {
             task.task: {name: getattr(task, name) for name in task.__slots__ if name != "task"}
             for task in self.tasks
         }
-        overview = {
+        summary = {
             "finished": True,
             "file_bytes": self.file_bytes,
             "tasks": tasks,
@@ -98,12 +98,12 @@ class Overview:
             "failed_episodes": self.num_failed,
             "object_caches": self.object_caches,
         }
-        return {**self.manifest, "overview": overview}
+        return {**self.manifest, "summary": summary}
 
 
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """What a folder holds whose writing was interrupted.
+    """Summary of a folder whose writing was interrupted.
 
     Args:
         folder: The folder.
@@ -120,14 +120,16 @@ class Unfinished:
     def to_record(self) -> dict[str, Any]:  # Any: JSON
         """Return everything as plain values."""
         counts = {"shards": self.shards, "episodes": self.episodes, "damaged": list(self.damaged)}
-        return {"overview": {"finished": False, **counts}}
+        return {"summary": {"finished": False, **counts}}
 
 
-def look_at(folder: Path, *, details: bool = False, report: Report | None = None) -> Overview | Unfinished:
-    """Find out what a folder holds.
+def summarise_folder(
+    folder: Path, *, details: bool = False, report: Report | None = None
+) -> Summary | Unfinished:
+    """Summarise a folder.
 
     Args:
-        folder: A data set, or what an interrupted command has left of one.
+        folder: A data set, finished or not.
         details: Also count objects, textures and prompt images, for which every shard is read.
         report: Called with shards read, shards in all, and a note.
 
@@ -142,10 +144,10 @@ def look_at(folder: Path, *, details: bool = False, report: Report | None = None
     histograms = [*_index_histograms(dataset.index)]
     if details:
         histograms += _shard_histograms(dataset, report or (lambda done, total, note: None))
-    return Overview(
+    return Summary(
         folder,
         dataset.manifest,
-        tuple(_task_overview(dataset, task_of, task) for task in dataset.manifest["tasks"]),
+        tuple(_task_summary(dataset, task_of, task) for task in dataset.manifest["tasks"]),
         tuple(histograms),
         _num_failed(folder),
         _object_caches(folder),
@@ -166,17 +168,19 @@ def _unfinished(folder: Path) -> Unfinished:
     return Unfinished(folder, len(paths) - len(damaged), dict(sorted(episodes.items())), tuple(damaged))
 
 
-def _task_overview(dataset: Dataset, task_of: np.ndarray, task: str) -> TaskOverview:
+def _task_summary(dataset: Dataset, task_of: np.ndarray, task: str) -> TaskSummary:
     rows = np.flatnonzero(task_of == task)
     num_bytes = int(dataset.index.column("num_bytes").to_numpy()[rows].sum())
     entry = dataset.manifest["tasks"][task]
     measured = rows[np.linspace(0, len(rows) - 1, min(_NUM_MEASURED, len(rows))).astype(int)]
     counts = {name: entry[name] for name in ("episodes", "steps", "seeds_tried", "success_rate", "redraws")}
-    return TaskOverview(task, bytes=num_bytes, image_share=_image_share(dataset, measured.tolist()), **counts)
+    return TaskSummary(
+        task, bytes=num_bytes, image_fraction=_image_fraction(dataset, measured.tolist()), **counts
+    )
 
 
-def _image_share(dataset: Dataset, episodes: Iterable[int]) -> float:
-    """Share of the images in the bytes of some records."""
+def _image_fraction(dataset: Dataset, episodes: Iterable[int]) -> float:
+    """Return the fraction of images in the bytes of some records."""
     without = [name for name in COLUMNS.names if name not in IMAGES]
     total = rest = 0
     for episode_index in episodes:

@@ -134,9 +134,9 @@ def test_an_import_can_be_extended_but_not_cut(source: Path, imported: Path, tmp
 
 
 def test_a_part_is_imported_alone(source: Path, tmp_path: Path) -> None:
-    import_published(config(source, tmp_path, part="train"))
+    import_published(config(source, tmp_path, split="train"))
     keys = [demo.outcome.reason for demo in Dataset(tmp_path)]
-    train = [demo.outcome.reason for demo in PublishedData(source, part="train").demonstrations()]
+    train = [demo.outcome.reason for demo in PublishedData(source, split="train").demonstrations()]
     assert keys == train
 
 

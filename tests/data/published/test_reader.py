@@ -11,7 +11,7 @@ import pytest
 
 from openvima.data import Demonstration
 from openvima.data.published import Broken, EpisodeKey, PublishedData
-from openvima.data.published.names import part_of
+from openvima.data.published.names import split_of
 from openvima.data.published.picks import picked_ids
 from openvima.data.records import rollout_oracle
 from openvima.data.schema import UNKNOWN_ID
@@ -120,7 +120,7 @@ def test_what_is_not_there_is_said(path: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no episode rearrange/000001"):
         PublishedData(path).read("rearrange", "000001")
     with pytest.raises(ConfigError, match="'test'"):
-        PublishedData(path, part="test")
+        PublishedData(path, split="test")
     with pytest.raises(DatasetError, match="no file or folder"):
         PublishedData(tmp_path / "missing.zip")
     with pytest.raises(DatasetError, match="holds no episodes"):
@@ -149,20 +149,20 @@ def test_objects_can_be_sent_to_other_processes(path: Path) -> None:
 
 def test_parts_are_disjoint_complete_and_always_the_same() -> None:
     keys = [("rotate", f"{number:06d}") for number in range(13_000)]
-    validation = [key for key in keys if part_of(*key) == "validation"]
+    validation = [key for key in keys if split_of(*key) == "validation"]
     assert 900 < len(validation) < 1100
     assert [int(key[1]) for key in validation[:4]] == [4, 27, 40, 47]
 
 
 def test_a_part_can_be_read_alone(path: Path) -> None:
     whole = PublishedData(path).keys
-    parts = {}
-    for part in ("train", "validation"):
-        keys = {key for key in whole if part_of(*key) == part}
-        parts[part] = keys
+    splits = {}
+    for split in ("train", "validation"):
+        keys = {key for key in whole if split_of(*key) == split}
+        splits[split] = keys
         if keys:
-            assert set(PublishedData(path, part=part).keys) == keys
-    assert parts["train"]
+            assert set(PublishedData(path, split=split).keys) == keys
+    assert splits["train"]
 
 
 def changed(**changes: object) -> Files:

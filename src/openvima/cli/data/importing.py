@@ -16,7 +16,7 @@ def import_published(
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
     *,
     tasks: str = "all",
-    part: Literal["all", "train", "validation"] = "all",
+    split: Literal["all", "train", "validation"] = "all",
     episodes: int | None = None,
     compression: Literal["lz4", "zstd"] = "zstd",
     workers: int = 1,
@@ -33,7 +33,7 @@ def import_published(
         source: The zip archive, or a folder with unpacked episodes.
         out: Folder to write to.
         tasks: Old or new names of tasks with commas between them, or "all".
-        part: All episodes, or one of two parts: train (twelve thirteenths) or validation.
+        split: All episodes, or one of two splits: train (twelve thirteenths) or validation.
         episodes: At most so many episodes of each task, the first ones; by default all.
         compression: Codec of the files; lz4 takes twice the space and is read faster.
         workers: Number of processes.
@@ -50,7 +50,7 @@ def import_published(
         source=source,
         out=out,
         tasks=parse_list(tasks),
-        part=part,
+        split=split,
         episodes=episodes,
         compression=compression,
         workers=workers,

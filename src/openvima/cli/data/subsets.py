@@ -1,4 +1,4 @@
-"""`openvima data sample`, `split` and `merge`: data sets made of others."""
+"""`openvima data sample`, `split` and `merge`: data sets derived from others."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,29 +15,29 @@ def sample(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
     *,
-    share: float,
+    fraction: float,
     tasks: str = "all",
     seed: int = 0,
     compression: Compression | None = None,
     workers: int = 1,
     force: bool = False,
 ) -> int:
-    """Write a share of the demonstrations of each task.
+    """Sample a fraction of the demonstrations of each task.
 
-    Smaller shares of the same seed are part of larger ones: the 1 % is part of the 10 %. Nothing in a
+    Smaller fractions of the same seed are split of larger ones: the 1 % is split of the 10 %. Nothing in a
     demonstration is changed.
 
-    Example: openvima data sample demos demos-1-percent --share 0.01
+    Example: openvima data sample demos demos-1-percent --fraction 0.01
 
     Args:
-        folder: The data set to take from.
+        folder: The source.
         out: Folder to write to.
-        share: Above 0, at most 1; at least one episode of each task is taken.
-        tasks: Names of tasks with commas between them, or "all".
-        seed: Another one gives another choice.
-        compression: Codec of the new files; by default that of the data set.
+        fraction: Above 0, at most 1; at least one episode of each task is taken.
+        tasks: Comma-separated names of tasks, or "all".
+        seed: Seed of the sample.
+        compression: Codec of the new files; by default that of the source.
         workers: Number of processes.
-        force: Replace the data set that is in the folder.
+        force: Replace a data set in the folder.
 
     Returns:
         Exit status.
@@ -47,7 +47,7 @@ def sample(
 
     config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
     with progress_bar("demonstrations") as report:
-        print(write_sample(config, share, report=report))
+        print(write_sample(config, fraction, report=report))
     return 0
 
 
@@ -55,41 +55,41 @@ def split(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
     *,
-    parts: str,
+    splits: str,
     tasks: str = "all",
     seed: int = 0,
     compression: Compression | None = None,
     workers: int = 1,
     force: bool = False,
 ) -> int:
-    """Divide demonstrations into parts, such as for training and validation.
+    """Divide demonstrations into splits, such as for training and validation.
 
-    Each episode goes to exactly one part, and stays there when episodes are added; sizes therefore come close
-    to the shares without meeting them.
+    Each episode is assigned to one split by a hash and stays there when episodes are added. Sizes therefore
+    match the fractions approximately.
 
-    Example: openvima data split demos divided --parts training=0.923,validation=0.077
+    Example: openvima data split demos divided --splits training=0.923,validation=0.077
 
     Args:
-        folder: The data set to divide.
-        out: Folder to write to; it will hold a data set for each part.
-        parts: Names and shares, with commas between them; the shares add up to 1.
-        tasks: Names of tasks with commas between them, or "all".
-        seed: Another one gives another division.
-        compression: Codec of the new files; by default that of the data set.
+        folder: The source.
+        out: Folder to write to, with one data set per split.
+        splits: Comma-separated NAME=FRACTION pairs; the fractions add up to 1.
+        tasks: Comma-separated names of tasks, or "all".
+        seed: Seed of the assignment.
+        compression: Codec of the new files; by default that of the source.
         workers: Number of processes.
-        force: Replace the data sets that are in the folder.
+        force: Replace data sets in the folder.
 
     Returns:
         Exit status.
     """
-    from openvima.data.subsets import SubsetConfig, parse_parts
+    from openvima.data.subsets import SubsetConfig, parse_splits
     from openvima.data.subsets import split as write_split
 
     config = SubsetConfig(folder, out, parse_tasks(tasks), seed, compression, workers, force)
-    shares = parse_parts(parts)
+    fractions = parse_splits(splits)
     with progress_bar("demonstrations") as report:
-        written = write_split(config, shares, report=report)
-    for name in shares.shares:
+        written = write_split(config, fractions, report=report)
+    for name in fractions.fractions:
         print(written / name)
     return 0
 
@@ -103,19 +103,19 @@ def merge(
     workers: int = 1,
     force: bool = False,
 ) -> int:
-    """Put data sets together, of whatever tasks, levels, settings and versions.
+    """Merge data sets, whatever their tasks, levels, settings and versions.
 
     Files are copied byte for byte unless another compression is asked for or episodes are skipped.
 
     Example: openvima data merge rotations stacks all-demos
 
     Args:
-        folders: The data sets to put together, and last the folder to write to.
-        tasks: Names of tasks with commas between them, or "all".
-        duplicates: What to do with episodes that several data sets hold: refuse, or skip all but one.
-        compression: Codec of the new files; by default those of the data sets.
+        folders: The sources, and last the folder to write to.
+        tasks: Comma-separated names of tasks, or "all".
+        duplicates: Refuse episodes that several sources contain, or skip all but one.
+        compression: Codec of the new files; by default those of the sources.
         workers: Number of processes.
-        force: Replace the data set that is in the folder.
+        force: Replace a data set in the folder.
 
     Returns:
         Exit status.

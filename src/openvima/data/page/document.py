@@ -11,7 +11,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.data.page.charts import bar_chart
 from openvima.data.page.episodes import episode_card
 from openvima.data.reader import Dataset
-from openvima.data.summary import Overview, TaskOverview
+from openvima.data.summary import Summary, TaskSummary
 from openvima.errors import AssetError, ConfigError, ShardError
 from openvima.html import render_page, require_extra
 
@@ -20,7 +20,7 @@ MAX_SAMPLES = 50  # of each task; a page with more is too large for a browser
 Report = Callable[[int, int, str], None]
 
 
-def write_page(overview: Overview, out: Path, *, num_samples: int = 3, report: Report | None = None) -> Path:
+def write_page(overview: Summary, out: Path, *, num_samples: int = 3, report: Report | None = None) -> Path:
     """Write the page of a data set; equal data give equal bytes.
 
     Args:
@@ -64,19 +64,19 @@ def write_page(overview: Overview, out: Path, *, num_samples: int = 3, report: R
     return atomic_write_file(out, page)
 
 
-def _cells(task: TaskOverview) -> tuple[str, ...]:
+def _cells(task: TaskSummary) -> tuple[str, ...]:
     return (
         f"{task.episodes:,}",
         f"{task.steps:,}",
         f"{task.bytes / max(1, task.episodes) / 1e3:.1f}",
-        f"{task.image_share:.0%}",
+        f"{task.image_fraction:.0%}",
         f"{task.seeds_tried:,}",
         f"{task.success_rate:.1%}",
         f"{task.redraws:,}",
     )
 
 
-def _episodes(overview: Overview, num_samples: int, report: Report) -> dict[str, list[str]]:
+def _episodes(overview: Summary, num_samples: int, report: Report) -> dict[str, list[str]]:
     """Cards of some episodes of each task."""
     if not num_samples:
         return {}

@@ -41,7 +41,7 @@ class ImportConfig:
         source: The published zip archive, or a folder with unpacked episodes.
         out: The folder to write.
         tasks: Old or new names of tasks; ("all",) means all that are there.
-        part: "all", or one of two parts: "train" (twelve thirteenths of each task) or "validation".
+        split: "all", or one of two splits: "train" (twelve thirteenths of each task) or "validation".
         episodes: At most so many of each task, the first ones; None means all.
         shard_size: Episodes in a file.
         compression: Codec of the files, "lz4" or "zstd".
@@ -52,7 +52,7 @@ class ImportConfig:
     source: Path
     out: Path
     tasks: tuple[str, ...] = ("all",)
-    part: str = "all"
+    split: str = "all"
     episodes: int | None = None
     shard_size: int = SHARD_SIZE
     compression: str = "zstd"
@@ -111,7 +111,7 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
     """
     tasks = None if config.tasks == ("all",) else config.tasks
-    data = PublishedData(config.source, tasks=tasks, part=config.part)
+    data = PublishedData(config.source, tasks=tasks, split=config.split)
     blocks = plan(config, data)
     _probe(blocks)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -251,7 +251,7 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
     info = blocks[0].info  # but for task and number, the same of all
     settings = {
         "tasks": sorted({block.info.task for block in blocks}),
-        "part": config.part,
+        "split": config.split,
         "level": info.level,
         "domain": info.domain,
         "episodes": config.episodes,

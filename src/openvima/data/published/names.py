@@ -7,7 +7,7 @@ from openvima.catalog import OBJECTS
 from openvima.errors import MemberError, unknown_name
 from openvima.tasks import list_tasks
 
-Part = Literal["train", "validation"]
+Split = Literal["train", "validation"]
 
 # Folder names of the published files and of older ones, and what the tasks are called today.
 OLD_TASK_NAMES = {
@@ -17,7 +17,7 @@ OLD_TASK_NAMES = {
     "sweep": "sweep_without_exceeding",
 }
 # The authors advise 600,000 episodes for training and 50,000 for validation, but list neither.
-_PARTS = 13
+_NUM_FOLDS = 13
 
 
 def todays_task(folder_name: str) -> str | None:
@@ -38,7 +38,7 @@ def checked_object(name: object) -> str:
     return name
 
 
-def part_of(task: str, episode_id: str) -> Part:
+def split_of(task: str, episode_id: str) -> Split:
     """Tell whether an episode is for training or for validation, 12 to 1 and always the same.
 
     Args:
@@ -46,4 +46,4 @@ def part_of(task: str, episode_id: str) -> Part:
         episode_id: Name of the episode's folder, such as "000123".
     """
     digest = hashlib.sha256(f"{task}/{int(episode_id):06d}".encode()).digest()
-    return "validation" if int.from_bytes(digest[:8], "big") % _PARTS == 0 else "train"
+    return "validation" if int.from_bytes(digest[:8], "big") % _NUM_FOLDS == 0 else "train"

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple, Protocol
 
 from openvima.data.published.episode import demonstration_of
 from openvima.data.published.folders import EpisodeFolders
-from openvima.data.published.names import part_of, todays_task
+from openvima.data.published.names import split_of, todays_task
 from openvima.data.published.zip_archive import ZipArchive
 from openvima.data.records import Demonstration
 from openvima.errors import ConfigError, DatasetError, MemberError, unknown_name
 from openvima.tasks import task_spec
 
-PARTS = ("all", "train", "validation")
+SPLITS = ("all", "train", "validation")
 
 
 class EpisodeKey(NamedTuple):
@@ -84,12 +84,12 @@ class PublishedData(Sequence[Demonstration]):
     Args:
         path: The zip archive, or a folder with unpacked episodes `…/TASK/ID/`.
         tasks: Keep the episodes of these tasks only; None keeps all.
-        part: "all", or one of two parts: "train" (twelve thirteenths, by a hash of task and id) or
+        split: "all", or one of two splits: "train" (twelve thirteenths, by a hash of task and id) or
             "validation".
 
     Raises:
         DatasetError: There are no episodes, the archive is damaged, or it lacks a task.
-        ConfigError: There is no such part.
+        ConfigError: There is no such split.
 
     Example:
         >>> data = PublishedData("vima.zip")
@@ -99,17 +99,17 @@ class PublishedData(Sequence[Demonstration]):
         'Stack objects in this order {frame_0} {frame_1} {frame_2}.'
     """
 
-    def __init__(self, path: str | Path, *, tasks: Sequence[str] | None = None, part: str = "all") -> None:
-        if part not in PARTS:
-            raise ConfigError(unknown_name("part", part, PARTS))
+    def __init__(self, path: str | Path, *, tasks: Sequence[str] | None = None, split: str = "all") -> None:
+        if split not in SPLITS:
+            raise ConfigError(unknown_name("split", split, SPLITS))
         self.path = Path(path)
         self.tasks = None if tasks is None else tuple(tasks)
-        self.part = part
+        self.split = split
         self._source = open_source(self.path)
         places, self.broken_folders = _sorted_places(self._source)
         if self.tasks is not None:
             places = _of_tasks(places, self.tasks, self.path)
-        self.places = tuple(place for place in places if part in ("all", part_of(*place.key)))
+        self.places = tuple(place for place in places if split in ("all", split_of(*place.key)))
         if not self.places:
             raise DatasetError(
                 f"{self.path} holds no episodes; give vima.zip, or the folder it was unpacked to."
@@ -171,7 +171,7 @@ class PublishedData(Sequence[Demonstration]):
                 on_broken(found)
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
-        return _reopened, (self.path, self.tasks, self.part)
+        return _reopened, (self.path, self.tasks, self.split)
 
     def _read(self, place: EpisodePlace) -> Demonstration:
         found = read_place(self._source, place)
@@ -203,8 +203,8 @@ def read_place(source: Source, place: EpisodePlace) -> Demonstration | Broken:
         return Broken(place.folder, str(error))
 
 
-def _reopened(path: Path, tasks: tuple[str, ...] | None, part: str) -> PublishedData:
-    return PublishedData(path, tasks=tasks, part=part)
+def _reopened(path: Path, tasks: tuple[str, ...] | None, split: str) -> PublishedData:
+    return PublishedData(path, tasks=tasks, split=split)
 
 
 def _sorted_places(source: Source) -> tuple[list[EpisodePlace], tuple[Broken, ...]]:

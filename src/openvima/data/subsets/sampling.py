@@ -1,4 +1,4 @@
-"""Data sets that are parts of another: a share of it, or a division of all of it."""
+"""Subsets of a data set: a sample, or splits of the whole."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from openvima.atomic_io import atomic_folder
 from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset, of_tasks
-from openvima.data.subsets.choosing import Parts, chosen_parts, chosen_sample
+from openvima.data.subsets.choosing import Splits, assign_splits, select_sample
 from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
@@ -50,16 +50,15 @@ class SubsetConfig:
         }
 
 
-def sample(config: SubsetConfig, share: float, *, report: Report | None = None) -> Path:
-    """Write a share of a data set, the same of each task.
+def sample(config: SubsetConfig, fraction: float, *, report: Report | None = None) -> Path:
+    """Sample a data set, with the same fraction of each task.
 
-    A smaller share of the same data and seed is part of a larger one: the 1 % is part of the 10 %. Records
-    are copied, not made anew, so their content hashes stay; so do the notes on seeds tried in vain just
-    before them.
+    Samples of the same data and seed are nested: the 1 % sample is a subset of the 10 % sample. Records are
+    copied with their content hashes and their lists of skipped seeds.
 
     Args:
         config: What to read and write.
-        share: Above 0, at most 1; of each task round(share × episodes), but at least one.
+        fraction: Above 0, at most 1; of each task round(fraction × episodes), but at least one.
         report: Called with episodes written, episodes in all, and a note.
 
     Returns:
@@ -68,51 +67,51 @@ def sample(config: SubsetConfig, share: float, *, report: Report | None = None) 
     Raises:
         DatasetError: The source is no finished data set, or the folder cannot be used.
         ShardError: The source is damaged.
-        ConfigError: The share is out of range.
+        ConfigError: The fraction is out of range.
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
-    chosen = chosen_sample(dataset.index, share, config.seed) & of_tasks(
+    chosen = select_sample(dataset.index, fraction, config.seed) & of_tasks(
         dataset.index, config.tasks, dataset.path
     )
-    settings = {**config.settings(dataset), "share": share}
+    settings = {**config.settings(dataset), "fraction": fraction}
     with atomic_folder(config.out) as folder:
         _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
     return config.out
 
 
-def split(config: SubsetConfig, parts: Parts, *, report: Report | None = None) -> Path:
-    """Divide a data set: each episode goes to exactly one part.
+def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None) -> Path:
+    """Split a data set: each episode goes to exactly one split.
 
     Which one follows from the episode and the seed alone, so it stays there when episodes are added. The
-    sizes of the parts therefore come close to the shares without meeting them.
+    sizes of the splits therefore come close to the fractions without meeting them.
 
     Args:
         config: What to read and write.
-        parts: Names and shares.
+        splits: Names and fractions.
         report: Called with episodes written, episodes in all, and a note.
 
     Returns:
-        The folder; it holds one data set a part, named as the part.
+        The folder, with one data set per split.
 
     Raises:
-        DatasetError: The source is no finished data set, a part would be empty, or the folder cannot be used.
+        DatasetError: The source is not finished, a split would be empty, or the folder cannot be used.
         ShardError: The source is damaged.
     """
     check_out(config.out, [config.source], force=config.force)
     dataset = Dataset(config.source)
     wanted = of_tasks(dataset.index, config.tasks, dataset.path)
-    chosen = {name: mask & wanted for name, mask in chosen_parts(dataset.index, parts, config.seed).items()}
+    chosen = {name: mask & wanted for name, mask in assign_splits(dataset.index, splits, config.seed).items()}
     empty = [name for name, mask in chosen.items() if not mask.any()]
     if empty:
         raise DatasetError(
-            f"of {wanted.sum()} episodes none would fall into part {', '.join(empty)}. "
-            "Give it a larger share, or another --seed."
+            f"of {wanted.sum()} episodes none would fall into split {', '.join(empty)}. "
+            "Give it a larger fraction, or another --seed."
         )
-    settings = {**config.settings(dataset), "parts": dict(parts.shares)}
+    settings = {**config.settings(dataset), "splits": dict(splits.fractions)}
     with atomic_folder(config.out) as folder:
         subsets = [
-            _Subset(folder / name, mask, "openvima data split", {**settings, "part": name})
+            _Subset(folder / name, mask, "openvima data split", {**settings, "split": name})
             for name, mask in chosen.items()
         ]
         _write(subsets, dataset, config, report)
