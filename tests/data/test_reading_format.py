@@ -53,4 +53,4 @@ def test_the_content_hash_follows_from_the_file(tmp_path: Path, demos: Demonstra
 def test_the_page_names_every_column_and_the_version() -> None:
     named = set(re.findall(r"`([a-z0-9_]+)`", PAGE))
     assert {*COLUMNS.names, *INDEX_SCHEMA.names} <= named
-    assert f"describes: {SCHEMA_VERSION} |" in PAGE
+    assert f"version of this format: {SCHEMA_VERSION} |" in PAGE
