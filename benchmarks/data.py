@@ -9,7 +9,7 @@ frames of the cameras as files and all else in pickles, losslessly and as it was
 segmentation and prompt images as files too.
 Reading: a training step is what a policy sees before an action, colours and segmentation of both views; once
 an episode its prompt images belong to it. Files lie in the system's cache.
-All times are processor time, so that other work on the machine counts little; only closing a file and writing
+All times are CPU time, so that other work on the machine counts little; only closing a file and writing
 index and manifest, which wait for the disk once a shard, are given as they pass.
 Memory: what the process holds besides mapped files, while it reads the same episodes over and over.
 """
@@ -82,7 +82,7 @@ def info_of(env: TabletopEnv, codec: str = "lz4", *, images: bool = True) -> Sha
 
 
 def timed(work: Callable[..., Any], *arguments: object) -> tuple[float, Any]:
-    """Return the seconds of processor time that a call takes, in all threads, and its result."""
+    """Return the seconds of CPU time that a call takes, in all threads, and its result."""
     start = time.process_time()
     result = work(*arguments)
     return time.process_time() - start, result

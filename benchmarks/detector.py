@@ -7,7 +7,7 @@ a moment: by the network alone, and as for a policy, with boxes paired between t
 What the mask head costs depends on how many objects are found, so a trained detector is needed for that: that
 of the package, or another. Without one the weights are random, and as many objects are let through as the
 frames show. A training step holds augmentation, losses, gradients and the optimizer, not the reading of
-shards. Times are processor times of this process; ways take turns, and medians are reported.
+shards. Times are CPU times of this process; ways take turns, and medians are reported.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Processor time of one call."""
+    """CPU time of one call."""
     start = time.process_time()
     work()
     return time.process_time() - start

@@ -113,9 +113,9 @@ def observation_problems(env: TabletopEnv, observation: dict[str, Any]) -> list[
     problems = [] if env.observation_space.contains(observation) else ["the observation is not in its space"]
     allowed = {0, 1, 255, *(placement.id for placement in env.scene.placements)}
     for view, segm in observation["segm"].items():
-        strangers = set(np.unique(segm).tolist()) - allowed
-        if strangers:
-            problems.append(f"the {view} view shows ids {sorted(strangers)} that no object has")
+        unknown_ids = set(np.unique(segm).tolist()) - allowed
+        if unknown_ids:
+            problems.append(f"the {view} view shows ids {sorted(unknown_ids)} that no object has")
     return problems
 
 

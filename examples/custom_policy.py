@@ -42,22 +42,22 @@ class NearestColour:
 
     def _read(self, prompt):
         images = [part for part in prompt.sequence() if not isinstance(part, str)]
-        looks = [colours(observe_prompt_image(image), image.rgb, image.segm)[0] for image in images]
+        seen = [colours(observe_prompt_image(image), image.rgb, image.segm)[0] for image in images]
         angle = re.search(r"\d+ degrees", prompt.text)
-        return np.stack(looks), 0 if angle is None else int(angle[0].split()[0])
+        return np.stack(seen), 0 if angle is None else int(angle[0].split()[0])
 
-    def _decide(self, looks, angle_deg, seen):
+    def _decide(self, wanted, angle_deg, seen):
         objects = observe(seen)  # with crops, boxes and points on the table
-        alike = looks @ colours(objects, seen["rgb"], seen["segm"]).T  # images × objects
+        alike = wanted @ colours(objects, seen["rgb"], seen["segm"]).T  # images × objects
         pick = objects.grasp_points()[alike[0].argmax()]
-        place = pick if len(looks) == 1 else objects.positions()[alike[-1].argmax()]
+        place = pick if len(wanted) == 1 else objects.positions()[alike[-1].argmax()]
         return Action.planar(tuple(pick), tuple(place), -np.deg2rad(angle_deg)).to_arrays()
 
 
 if __name__ == "__main__":
     policies = {"nearest-colour": NearestColour(), "random": RandomPolicy(seed=0)}
     results = score(policies, tasks=("visual_manipulation", "rotate"), levels=("L1", "L3"), episodes=20)
-    print("Solved episodes in per cent, with 95 % intervals")
+    print("Solved episodes in %, with 95 % intervals")
     for row in results.rows:
         low, high = (100 * end for end in row.interval)
         print(f"{row.policy:15} {row.task:20} {row.level} {100 * row.rate:4.0f} ({low:.0f}–{high:.0f})")

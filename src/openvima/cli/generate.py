@@ -44,7 +44,7 @@ def main(
         tasks: Names of tasks with commas between them, or "all".
         episodes: Successful episodes of each task.
         level: Which objects and textures may occur: train, L1, L2, L3 or L4.
-        workers: Number of processes; by default one, or all processors of the Ray cluster at --address.
+        workers: Number of processes; by default one, or all CPUs of the Ray cluster at --address.
         seed: First seed.
         shard_size: Episodes in a file; by default files grow with their number, from 4 episodes to 1000.
         shard_range: Write only these of the shards that --list-shards numbers, as a:b without b itself;

@@ -53,7 +53,7 @@ def list_(*, as_json: Json = False) -> int:
     _print_table(sizes)
     for name, policy in here.items():
         parameters = _millions(trained[name].whole.total)
-        print(f"\n{name}, a trained policy that comes with the package, {parameters} M parameters")
+        print(f"\n{name}, bundled checkpoint, {parameters} M parameters")
         _print_facts(policy)
     return 0
 
@@ -66,7 +66,7 @@ def show(
     Example: openvima policies show vima-200m
 
     Args:
-        policy: Name of a preset or of a trained policy of the package, a run folder or checkpoint folder, a
+        policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a
             published file, or an id on the Hugging Face Hub.
         as_json: Print JSON.
 
@@ -115,7 +115,7 @@ def convert(
 
     Args:
         source: Published file, such as 200M.ckpt, a run folder, of which the best checkpoint is taken, a
-            checkpoint folder, or a trained policy of the package.
+            checkpoint folder, or a bundled checkpoint.
         out: Folder to write to; every `--policy` takes it.
         tokenizer: Folder of the tokenizer of T5, or its id on the Hugging Face Hub; stored with the policy.
         precision: Of the stored weights, whatever the policy computes in later. float16 halves a file of

@@ -32,7 +32,7 @@ def main(
 ) -> int:
     """Write the report of one or several evaluations, as one HTML file that needs nothing else.
 
-    Films are those that the evaluations made. Policies of the same name that differ get that of their folder
+    Videos are those that the evaluations made. Policies of the same name that differ get that of their folder
     too, as in mine@first.
 
     Example: openvima report first second --compare mine@first,mine@second --out report.html
@@ -150,7 +150,7 @@ def _page(
 
 
 def _clips(evaluations: dict[Path, "Results"], merged: "Merged") -> list["Clip"]:
-    """Films of all evaluations, under the names that policies have in the common report."""
+    """Videos of all evaluations, under the names that policies have in the common report."""
     from dataclasses import replace
 
     from openvima.video.clips import load_clips

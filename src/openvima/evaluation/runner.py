@@ -51,7 +51,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
-        MissingExtraError: Something is not installed that networks, films or Ray need.
+        MissingExtraError: Something is not installed that networks, videos or Ray need.
         WorkerError: A worker process died; what was finished is kept.
     """
     if config.boxes is not None:
@@ -134,9 +134,9 @@ def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, 
 
     batch = job.batch
     with one_thread(batch):
-        player = load_rollout_policy(batch, job.fingerprint)
+        rollout_policy = load_rollout_policy(batch, job.fingerprint)
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        outcomes = tuple(play(envs, batch.seeds, player))
+        outcomes = tuple(play(envs, batch.seeds, rollout_policy))
     count(len(outcomes))
     return outcomes
 

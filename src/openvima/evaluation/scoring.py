@@ -56,8 +56,10 @@ def score(
     for batch in batches:
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
-        player = load_rollout_policy(batch) if given is None else PromptedRolloutPolicy(given, batch.ablation)
-        outcomes[batch] = tuple(play(envs, batch.seeds, player))
+        rollout_policy = (
+            load_rollout_policy(batch) if given is None else PromptedRolloutPolicy(given, batch.ablation)
+        )
+        outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy))
     kinds = {
         source.name: {"kind": "object"} if source.name in policies else source.record()
         for source in config.sources

@@ -27,7 +27,7 @@ class PolicySource:
 
     Args:
         name: Name in the results.
-        source: "oracle", "random", "untrained", the name of a preset or of a trained policy of the package,
+        source: "oracle", "random", "untrained", the name of a preset or of a bundled checkpoint,
             what else `load_policy` takes, or the address of a policy server.
     """
 
@@ -49,7 +49,7 @@ class PolicySource:
         Raises:
             UnknownPolicyError: There is no such run folder.
             CheckpointError: The run folder, or the package, holds no weights.
-            PolicyError: A folder here is named like a policy of the package and holds a checkpoint, too.
+            PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
         if self.kind == "remote":

@@ -104,7 +104,7 @@ class _Artist:
         self.rasteriser = rasteriser
         self.problems: list[str] = []
 
-    def portrait(self, object_name: str, texture_name: str, view: View, *, detail: Detail = 1) -> Card:
+    def thumbnail(self, object_name: str, texture_name: str, view: View, *, detail: Detail = 1) -> Card:
         return self._picture(
             _slug(f"{object_name} in {texture_name} {view}"),
             f"{texture_name} {object_name}" + (", from above" if view == "top" else ""),
@@ -133,9 +133,9 @@ class _Artist:
 
 def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> Card:
     hero = _HEROES[index % len(_HEROES)]
-    views = [artist.portrait(spec.name, hero, view, detail=2) for view in VIEWS]
+    views = [artist.thumbnail(spec.name, hero, view, detail=2) for view in VIEWS]
     palette = _PALETTES[index % len(_PALETTES)]
-    strip = [artist.portrait(spec.name, name, "front") for name in palette]
+    strip = [artist.thumbnail(spec.name, name, "front") for name in palette]
     facts = {
         "size": _extent(artist, spec),
         "mass": f"{1000 * spec.mass_kg:g} g",
@@ -184,7 +184,7 @@ def _texture_card(artist: _Artist, spec: TextureSpec) -> Card:
         "id": _slug(f"texture {spec.name}"),
         "name": spec.name,
         "kind": "",
-        "views": [artist.swatch(spec.name), artist.portrait(_SAMPLE_OBJECT, spec.name, "front")],
+        "views": [artist.swatch(spec.name), artist.thumbnail(_SAMPLE_OBJECT, spec.name, "front")],
         "strip": [],
         "facts": facts,
         "roles": rows,

@@ -80,12 +80,12 @@ def unpack(data: bytes) -> Any:  # Any: whatever was sent
     """
     import msgpack
 
-    tally = _Tally()
+    counter = _ItemCounter()
     try:
         return msgpack.unpackb(
             data,
-            object_hook=tally.map_or_array,
-            list_hook=tally.list,
+            object_hook=counter.map_or_array,
+            list_hook=counter.list,
             max_array_len=MAX_LENGTH,
             max_map_len=MAX_LENGTH,
             max_ext_len=0,
@@ -97,7 +97,7 @@ def unpack(data: bytes) -> Any:  # Any: whatever was sent
         raise MessageError(f"these {len(data):,} bytes are no whole MessagePack message: {reason}") from error
 
 
-class _Tally:
+class _ItemCounter:
     """Counts the values of a message while it is read."""
 
     def __init__(self) -> None:

@@ -64,8 +64,8 @@ class Session:
             seen = read_list(message, "act", "observations", self._max_episodes)
             actions = self._act([decode_observation(one, f"observation {n}") for n, one in enumerate(seen)])
             near_ties = getattr(self._policy, "near_ties", None)
-            told = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
-            return pack({"type": "act", "actions": actions, **told})
+            extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
+            return pack({"type": "act", "actions": actions, **extra})
         if isinstance(message, dict) and "type" not in message:
             return pack(self._infer(message))
         raise MessageError(
