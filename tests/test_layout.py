@@ -126,6 +126,7 @@ def test_the_simulation_half_works_without_torch(module: str) -> None:
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_no_module_prints_outside_the_command_line() -> None:
     for file in SOURCE.rglob("*.py"):
         if file.relative_to(SOURCE).parts[0] == "cli":

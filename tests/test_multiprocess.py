@@ -58,6 +58,7 @@ def test_one_worker_counts_over_all_items(tmp_path: Path, monkeypatch: pytest.Mo
     assert counts == [3, 6]
 
 
+@pytest.mark.slow
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     paths = [tmp_path / "a", tmp_path / "b"]
     code = (

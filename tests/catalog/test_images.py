@@ -24,6 +24,7 @@ def digests(images):
     return {name: hashlib.sha256(image.tobytes()).hexdigest()[:16] for name, image in images.items()}
 
 
+@pytest.mark.slow
 def test_all_textures_are_images_of_bytes(images):
     for name, image in images.items():
         assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3, name

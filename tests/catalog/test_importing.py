@@ -212,6 +212,7 @@ def imported_reference(tmp_path_factory) -> Path:
 
 
 @needs_reference
+@pytest.mark.slow
 def test_golden_import_equals_the_checkout_bit_for_bit(imported_reference, monkeypatch):
     monkeypatch.setenv("OPENVIMA_CACHE", str(imported_reference))
     ours, theirs = load_assets("original"), OriginalAssets(REFERENCE)

@@ -29,6 +29,7 @@ def import_small_pack(tmp_path, monkeypatch, *, damaged: bool = False) -> int:
     return main(["assets", "import", str(tmp_path / "checkout")])
 
 
+@pytest.mark.slow
 def test_a_gallery_prints_its_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gallery, "draw_thumbnail", lambda *_, **__: np.zeros((1, 1, 4), np.uint8))
     assert main(["assets", "gallery", "--out", str(tmp_path / "gallery")]) == 0

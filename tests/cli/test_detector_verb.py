@@ -45,6 +45,7 @@ def detector(tiny, tmp_path) -> Path:
     return tmp_path / "detector"
 
 
+@pytest.mark.slow
 def test_evaluate_and_show_accept_a_training_run(data, tiny, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sizes.DETECTORS, "small", lambda: tiny)
     run = tmp_path / "run"
@@ -137,6 +138,7 @@ def test_evaluate_plays_with_the_boxes_of_a_trained_detector(detector, tmp_path,
     assert [row.get("ablation", "") for row in rows] == ["", "detected_boxes"]
 
 
+@pytest.mark.slow
 def test_demo_films_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
     film = tmp_path / "film.mp4"
     words = ["demo", "rotate", "--policy", "untrained", "--out", str(film)]

@@ -21,6 +21,7 @@ def published(tmp_path):
     return write_published(build_network(small_vima(), seed=2), tmp_path / "2M.ckpt")
 
 
+@pytest.mark.slow
 def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys) -> None:
     assert main(["policies"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -34,6 +35,7 @@ def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys)
     assert rows["preset"][3:] == [*size.parts, "total", "trained", "frozen"]
 
 
+@pytest.mark.slow
 def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(capsys, monkeypatch) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich then takes the output for a terminal
     monkeypatch.setenv("TERM", "dumb")
@@ -44,6 +46,7 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(capsys, monkeypa
     assert "207.76" in shown and "363.90" in shown and "…" not in shown
 
 
+@pytest.mark.slow
 def test_the_list_can_be_read_by_machines(capsys) -> None:
     assert main(["policies", "--json"]) == 0
     records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}
@@ -96,6 +99,7 @@ def test_without_a_tokenizer_it_says_so_and_one_can_be_added(published, tmp_path
     load_policy(third)
 
 
+@pytest.mark.slow
 def test_the_best_checkpoint_of_a_run_is_exported_in_half_the_bytes(tmp_path, capsys) -> None:
     run, out = tmp_path / "run", tmp_path / "out"
     for seed, name in enumerate(("000001", "000002")):

@@ -46,6 +46,7 @@ def test_a_whole_data_set_is_clean(folder: Path, demos: list[Demonstration]) -> 
 
 
 @pytest.mark.parametrize("name", ["dataset.json", "index.parquet", FIRST, SECOND])
+@pytest.mark.slow
 def test_any_accident_is_found_and_named(folder: Path, name: str) -> None:
     path, whole, hashes = folder / name, (folder / name).read_bytes(), read_all(folder)
     for seed in range(60):

@@ -38,6 +38,7 @@ def ray() -> Iterator[ModuleType]:
 
 
 @pytest.mark.parametrize("workers", [2, 4])
+@pytest.mark.slow
 def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Path, workers: int) -> None:
     reports: list[GenerationProgress] = []
     generate(config(tmp_path, workers=workers), reports.append)
@@ -45,6 +46,7 @@ def test_the_number_of_workers_does_not_change_a_byte(whole: Path, tmp_path: Pat
     assert (reports[0].done, reports[-1].done, reports[-1].total) == (0, 6, 6)
 
 
+@pytest.mark.slow
 def test_ray_started_for_the_work_gives_the_same_bytes_and_is_stopped(whole: Path, tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     reports: list[GenerationProgress] = []
@@ -56,6 +58,7 @@ def test_ray_started_for_the_work_gives_the_same_bytes_and_is_stopped(whole: Pat
     assert last.tried >= 6
 
 
+@pytest.mark.slow
 def test_ray_stopped_by_hand_leaves_whole_files_and_is_continued(
     whole: Path, tmp_path: Path, ray: ModuleType
 ) -> None:

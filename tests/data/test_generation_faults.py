@@ -73,6 +73,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.mark.parametrize("begin_with", ["nothing", "less"])
+@pytest.mark.slow
 def test_killed_at_random_moments_it_ends_up_with_the_same_bytes(
     server: Server, tmp_path: Path, begin_with: str
 ) -> None:
@@ -127,6 +128,7 @@ def _whole_shards(folder: Path, expected: dict[str, bytes]) -> set[str]:
     return {name for name, content in found.items() if content == expected[name]}
 
 
+@pytest.mark.slow
 def test_the_command_killed_with_its_workers_is_continued(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = f"generate --tasks {','.join(TASKS)} --episodes 3 --shard-size 2 --workers 2 --out".split()
@@ -238,6 +240,7 @@ def _largest_file(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_with_a_message_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
     """A real small disk, mounted where only the commands of this test see it."""
     small_disk = tmp_path / "disk"

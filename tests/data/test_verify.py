@@ -81,6 +81,7 @@ def test_one_episode_of_each_task_is_replayed_by_default(whole: Path) -> None:
     assert verify(whole, NONE).num_replayed == 0
 
 
+@pytest.mark.slow
 def test_two_workers_find_the_same(folder: Path) -> None:
     (folder / FIRST).write_bytes(b"")
     (folder / "extra.arrow").write_bytes(b"")

@@ -14,7 +14,9 @@ TASKS = ("visual_manipulation", "rearrange", "same_shape", "sweep_without_exceed
 EPISODES = 5
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task", [TASKS[0], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[1:])]
+)
 def test_it_finds_the_objects_of_scenes_and_prompts(task: str) -> None:
     extractor = load_extractor()
     level = "L2" if task.startswith("sweep") else "L3"

@@ -138,6 +138,7 @@ def test_the_layout_of_detectron2_is_that_of_ours_name_by_name(foreign):
     assert torch.equal(given["backbone.lateral.3.weight"], foreign["backbone.fpn_lateral5.weight"])
 
 
+@pytest.mark.slow
 def test_a_file_of_detectron2_is_read_and_finds_something(foreign, tmp_path):
     torch.save({"model": foreign, "iteration": 7}, tmp_path / "mask_rcnn.pth")
     network = load_detectron2(tmp_path / "mask_rcnn.pth")

@@ -50,6 +50,7 @@ def trained(tiny, rectangles):
     return network.eval()
 
 
+@pytest.mark.slow
 def test_a_trained_network_detects_rectangles(trained, rectangles):
     detector = FrameDetector(trained)
     for seed in range(10_000, 10_005):

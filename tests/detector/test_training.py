@@ -104,6 +104,7 @@ train_detector(DetectorTrainingConfig.of(settings))
 """
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(settings, tiny, tmp_path):
     plain = {
         name: str(value) if isinstance(value, Path) else value

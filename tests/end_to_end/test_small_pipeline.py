@@ -116,6 +116,7 @@ def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], 
     assert not (tmp_path / "quick").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, capsys) -> None:
     demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
     run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)

@@ -3,7 +3,11 @@
 import os
 from pathlib import Path
 
+import pytest
+
 from openvima.env import TabletopEnv
+
+pytestmark = pytest.mark.slow
 
 NUM_RESETS = 1000
 MB = 2**20

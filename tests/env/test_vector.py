@@ -56,6 +56,7 @@ def pair(request: pytest.FixtureRequest) -> Iterator[VectorEnv]:
     envs.close()
 
 
+@pytest.mark.slow
 def test_spaces_are_batches_of_the_single_ones(pair: VectorEnv) -> None:
     single = TabletopEnv("rotate")
     assert pair.single_observation_space == single.observation_space
@@ -180,6 +181,7 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.slow
 def test_the_next_step_after_an_end_begins_an_episode(kind: str) -> None:
     envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, seeds=[3, 4, 5, 6])
     assert envs.reset()[1]["seed"].tolist() == [3, 4]
@@ -198,6 +200,7 @@ def test_the_next_step_after_an_end_begins_an_episode(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.slow
 def test_the_same_step_can_end_an_episode_and_begin_another(kind: str) -> None:
     envs = openvima.make_vec(
         "rotate", 2, vectorization_mode=kind, seeds=range(3, 7), autoreset_mode="SameStep"
@@ -220,6 +223,7 @@ def test_the_same_step_can_end_an_episode_and_begin_another(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.slow
 def test_without_autoreset_an_ended_episode_waits_for_its_reset(kind: str) -> None:
     envs = openvima.make_vec("rotate", 2, vectorization_mode=kind, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=[3, 4])
@@ -236,6 +240,7 @@ def test_without_autoreset_an_ended_episode_waits_for_its_reset(kind: str) -> No
     envs.close()
 
 
+@pytest.mark.slow
 def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
     def play(num_envs: int, kind: str) -> dict[int, object]:
         envs = openvima.make_vec("rotate", num_envs, vectorization_mode=kind, level="L2")
@@ -257,6 +262,7 @@ def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
     ("kind", "settings"),
     [("sync", {}), ("async", {}), ("async", {"context": "spawn", "shared_memory": False})],
 )
+@pytest.mark.slow
 def test_gymnasiums_own_function_gives_the_same_bytes(kind: str, settings: dict) -> None:
     envs = gymnasium.make_vec(
         "openvima/rotate-v0", num_envs=2, vectorization_mode=kind, vector_kwargs=settings, level="L1"
@@ -324,6 +330,7 @@ def test_an_unknown_kind_is_refused() -> None:
         openvima.make_vec("rotate", 2, vectorization_mode="threads")
 
 
+@pytest.mark.slow
 def test_all_tasks_fit_into_one_batch() -> None:
     envs = openvima.make_vec(openvima.list_tasks())
     observations, _ = envs.reset(seed=20)

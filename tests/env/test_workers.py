@@ -73,6 +73,7 @@ def wait_until_gone(pids: list[int]) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_reaches_the_caller_and_ends_all() -> None:
     envs = build()
     envs.reset(seed=[1, 2])
@@ -86,6 +87,7 @@ def test_an_error_in_a_worker_reaches_the_caller_and_ends_all() -> None:
     envs.close()
 
 
+@pytest.mark.slow
 def test_an_error_that_cannot_be_sent_ends_all_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("openvima.env.workers._TIMEOUT_S", 0.5)
     envs = build()
@@ -95,6 +97,7 @@ def test_an_error_that_cannot_be_sent_ends_all_too(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("is_stepping", [False, True])
+@pytest.mark.slow
 def test_a_killed_worker_is_reported_and_ends_all(is_stepping: bool) -> None:
     envs = build(functools.partial(Faulty, step_s=0.3))
     envs.reset(seed=0)
@@ -109,6 +112,7 @@ def test_a_killed_worker_is_reported_and_ends_all(is_stepping: bool) -> None:
     envs.close()
 
 
+@pytest.mark.slow
 def test_closing_after_a_kill_is_quiet() -> None:
     envs = build()
     envs.processes[0].kill()
@@ -122,6 +126,7 @@ def test_a_worker_that_does_not_start_is_reported() -> None:
         build(FailsToStart())
 
 
+@pytest.mark.slow
 def test_closing_lets_idle_workers_finish_and_stops_busy_ones() -> None:
     idle, busy = build(), build(functools.partial(Faulty, step_s=60))
     for envs in (idle, busy):
@@ -134,6 +139,7 @@ def test_closing_lets_idle_workers_finish_and_stops_busy_ones() -> None:
     assert [process.exitcode for process in busy.processes] == [-signal.SIGTERM] * 2
 
 
+@pytest.mark.slow
 def test_a_call_at_the_wrong_time_is_refused_and_changes_nothing() -> None:
     envs = build()
     envs.reset(seed=0)
@@ -144,6 +150,7 @@ def test_a_call_at_the_wrong_time_is_refused_and_changes_nothing() -> None:
     envs.close()
 
 
+@pytest.mark.slow
 def test_closed_environments_leave_no_file_handles() -> None:
     def num_handles() -> int:
         return len(os.listdir("/proc/self/fd"))
@@ -158,6 +165,7 @@ def test_closed_environments_leave_no_file_handles() -> None:
     assert counts[0] == counts[1]  # the first starts the process that looks after shared resources
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + GUARD + "main()")
     assert process.stdout.readline() == "starting\n"
@@ -171,6 +179,7 @@ def test_ctrl_c_ends_everything_with_one_traceback(tmp_path: Path) -> None:
     wait_until_gone(workers)
 
 
+@pytest.mark.slow
 def test_workers_leave_ctrl_c_to_their_parent_from_the_first_moment_on(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + GUARD + "main()")
     process.stdout.readline()
@@ -203,6 +212,7 @@ def test_ctrl_c_while_workers_start_ends_them(tmp_path: Path) -> None:
     wait_until_gone([int(pid) for pid in pids])
 
 
+@pytest.mark.slow
 def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + GUARD + "main()")
     process.stdout.readline()
@@ -213,6 +223,7 @@ def test_workers_do_not_outlive_their_parent(tmp_path: Path) -> None:
     wait_until_gone(workers)
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_gets_a_hint(tmp_path: Path) -> None:
     process = start(tmp_path, SCRIPT + "main()")
     _, errors = process.communicate(timeout=60)

@@ -26,11 +26,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return evaluate(replace(NETWORK, out=tmp_path_factory.mktemp("whole")))
 
 
+@pytest.mark.slow
 def test_four_workers_do_not_change_a_byte(whole: Path, tmp_path: Path) -> None:
     """Two are compared with one in `test_runner.py`; starting processes with torch takes seconds each."""
     assert evaluate(replace(NETWORK, out=tmp_path, workers=4)).read_bytes() == whole.read_bytes()
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_bytes_and_is_stopped(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,6 +43,7 @@ def test_ray_gives_the_same_bytes_and_is_stopped(
     assert not ray.is_initialized()
 
 
+@pytest.mark.slow
 def test_batches_of_one_give_the_same_outcomes(whole: Path, tmp_path: Path) -> None:
     single = Results.read(evaluate(replace(NETWORK, out=tmp_path, batch=1)))
     assert single.rows == Results.read(whole).rows

@@ -100,6 +100,7 @@ def test_tables_show_ours_beside_the_published(findings: Findings) -> None:
     assert [line.split(" | ")[1] for line in made["scaling"].splitlines()[2:]] == ["50", "500", "50", "500"]
 
 
+@pytest.mark.slow
 def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findings: Findings) -> None:
     page = tmp_path / "docs" / "page.md"
     page.parent.mkdir()
@@ -123,6 +124,7 @@ def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findin
     assert "It shows" in (tmp_path / "out.md").read_text()
 
 
+@pytest.mark.slow
 def test_without_trainings_the_levels_remain(tmp_path: Path, shipped: Results) -> None:
     findings = find(shipped, [])
     write(findings, tmp_path / "out", tmp_path, [], WHERE)

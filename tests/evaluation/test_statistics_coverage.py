@@ -49,6 +49,7 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("episodes", [8, 50])
 @pytest.mark.parametrize("rates", [STRONG, WEAK, NEARLY_PERFECT])
+@pytest.mark.slow
 def test_intervals_of_level_means_cover_the_truth_at_their_rate(rates, episodes):
     rng = np.random.default_rng(episodes)
     hits = 0
@@ -75,6 +76,7 @@ def test_intervals_of_one_paired_difference_cover_the_truth_at_their_rate(a, b):
 
 
 @pytest.mark.parametrize("episodes", [8, 50])
+@pytest.mark.slow
 def test_intervals_of_mean_differences_cover_the_truth_at_their_rate(episodes):
     rng = np.random.default_rng(episodes)
     a, b = np.array([0.98, 0.9, 0.7, 0.5, 0.3]), np.array([0.98, 0.95, 0.5, 0.4, 0.3])

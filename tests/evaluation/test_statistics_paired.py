@@ -48,6 +48,7 @@ def test_ends_of_the_interval_are_where_tangos_statistic_is_critical(counts):
     assert tango_statistic(pairs, high) == pytest.approx(-1.959964, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_the_interval_agrees_with_mcnemars_chi_squared_test_on_what_is_noise():
     mcnemar_of = pytest.importorskip("statsmodels.stats.contingency_tables").mcnemar
     for only_a, only_b in product(range(13), range(13)):
@@ -139,6 +140,7 @@ def test_no_counts_and_impossible_settings_are_refused():
         mcnemar(-1, 3)
 
 
+@pytest.mark.slow
 def test_holm_agrees_with_statsmodels():
     multipletests = pytest.importorskip("statsmodels.stats.multitest").multipletests
     for p_values in ([0.01, 0.04, 0.03], [0.2], [0.5, 0.9, 0.001, 0.001, 0.02], [1.0, 1.0]):

@@ -22,6 +22,7 @@ APART = ("policy_server", "custom_learner")
 @pytest.mark.parametrize(
     "example", [path for path in EXAMPLES if path.stem not in APART], ids=lambda path: path.stem
 )
+@pytest.mark.slow
 def test_the_example_runs_and_is_short(
     example: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,6 +42,7 @@ def test_the_custom_policy_reads_the_prompt_and_inherits_from_nothing() -> None:
     assert mine.mean >= 0.8 and random.mean <= 0.2
 
 
+@pytest.mark.slow
 def test_a_task_file_is_all_that_demonstrations_and_scores_need(tmp_path: Path) -> None:
     environment = {**os.environ, registry.TASK_FILES_VARIABLE: str(EXAMPLES[0].with_name("custom_task.py"))}
 

@@ -33,6 +33,7 @@ def differences() -> dict[str, list[StepDifference]]:
 
 
 @pytest.mark.parametrize(("mode", "same_moved"), [("oracle", 0.99), ("perturbed", 0.95)])
+@pytest.mark.slow
 def test_golden_actions_move_the_same_bodies(mode, same_moved) -> None:
     assert summary(differences()[mode])["same_moved"] >= same_moved
 

@@ -72,6 +72,7 @@ def test_golden_object_images_are_drawn_alike(name) -> None:
 
 
 @pytest.mark.parametrize("name", ONE_OF_EACH_TASK)
+@pytest.mark.slow
 def test_golden_scenes_of_prompts_are_drawn_alike_at_recovered_poses(name) -> None:
     recorded = golden(name)
     prompts = [prompt for prompt in recorded.prompts if prompt.shown]

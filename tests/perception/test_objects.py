@@ -188,6 +188,7 @@ def test_prompt_images_keep_the_order_of_their_records_and_drop_what_is_hidden()
     assert observe_prompt_image(image).ids.tolist() == [3, 2]
 
 
+@pytest.mark.slow
 def test_real_observations_have_boxes_of_exactly_the_segmented_pixels() -> None:
     for seed, task in enumerate(("visual_manipulation", "rotate", "sweep_without_exceeding")):
         env = TabletopEnv(task)

@@ -72,6 +72,7 @@ def step_of(record, step: int):
 
 
 @torch.no_grad()
+@pytest.mark.slow
 def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(network, demonstrations) -> None:
     scores, batch = told(network, demonstrations)
     bins_BTC = encode_bins(to_unit_range(batch.targets.actions_BTC))
@@ -101,6 +102,7 @@ def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(netw
         previous = batch.targets.actions_BTC[:, step : step + 1]
 
 
+@pytest.mark.slow
 def test_a_component_is_told_by_those_before_it_alone(network, demonstrations) -> None:
     scores, batch = told(network, demonstrations)
     for component in range(ACTION_WIDTH):
@@ -155,6 +157,7 @@ def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[d
 
 
 @torch.no_grad()
+@pytest.mark.slow
 def test_greedy_actions_with_caches_are_those_without_exactly(network, demonstrations) -> None:
     """In a batch of episodes that end at different steps, against one episode at a time."""
     runs = demonstrations[-3:]
@@ -277,6 +280,7 @@ def chance_of_either(config: PolicyConfig, demonstration) -> float:
     return torch.stack(chances).prod(0).sum().item()
 
 
+@pytest.mark.slow
 def test_two_right_answers_are_not_mixed(demonstrations) -> None:
     """Three components differ: told independently, one of the two actions comes out once in four times."""
     single = next(demo for demo in demonstrations if demo.num_steps == 1)

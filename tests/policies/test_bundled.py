@@ -90,6 +90,7 @@ def test_an_unknown_name_is_told_the_name_of_the_package(packaged: Path) -> None
         find_checkpoint("something")
 
 
+@pytest.mark.slow
 def test_without_its_weights_the_message_says_where_they_belong(packaged: Path, capsys) -> None:
     (packaged / "model.safetensors").unlink()
     for work in (load_policy, weights_hash, find_checkpoint):
@@ -136,6 +137,7 @@ def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(packaged:
     assert f"--policy {SMALL},mine={SMALL},copy=RUN " in Path("again.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_it_is_filmed_and_listed_and_shown(packaged: Path, capsys) -> None:
     assert main(["demo", "rotate", "--policy", SMALL, "--out", "film.mp4"]) == 0
     assert Path("film.mp4").stat().st_size > 0

@@ -42,6 +42,7 @@ def test_weights_and_sizes_come_back_bit_for_bit(saved, small_sizes) -> None:
 @pytest.mark.parametrize(
     "name", ["nano", "vima-nano", "gato-nano", "flamingo-nano", "gpt-nano", "midas-nano"]
 )
+@pytest.mark.slow
 def test_a_loaded_network_is_complete_constants_and_frozen_weights_included(name: str, tmp_path) -> None:
     sizes = preset(name)
     sizes = replace(sizes, prompt=replace(sizes.prompt, train_words=False, trained_layers=1))

@@ -358,6 +358,7 @@ def test_the_first_asked_object_is_taught_to_be_what_looks_like_the_picked_one(h
 
 
 @pytest.mark.parametrize(("kind", "first"), [("first", AT_FIRST), ("scenes", IN_PROMPT)])
+@pytest.mark.slow
 def test_it_learns_to_copy_the_place_of_what_looks_alike_and_does_so_for_looks_never_seen(kind, first):
     """Objects differ from step to step; that a remembered one looks like the picked one stays the same."""
     with torch.random.fork_rng(devices=[]):
@@ -431,6 +432,7 @@ def test_what_to_pick_depends_on_what_lies_beside_and_on_what_a_scene_shows_ther
     assert (changed > 1e-6).tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
     """Tokens and looks are drawn anew, so nothing else tells the objects apart."""
     with torch.random.fork_rng(devices=[]):

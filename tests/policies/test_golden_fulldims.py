@@ -32,7 +32,7 @@ from openvima.policies.config import PolicyConfig
 from openvima.policies.network import outline_network
 from openvima.policies.published import config_from_published, to_published
 
-pytestmark = needs("fulldims")
+pytestmark = [pytest.mark.slow, needs("fulldims")]
 
 TABLES = re.compile(
     r".*(pos_embed|latents|positions_embed\.weight|prompt_embedding\._embed_layer\.weight|t5\.shared\.weight"

@@ -118,6 +118,7 @@ def test_the_bins_loss_reaches_every_parameter_but_the_appearance_that_pointing_
 
 
 @pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.slow
 def test_the_loss_reaches_every_parameter_of_the_nano_presets(family, demonstrations) -> None:
     model, moved = reached(preset(f"{family}-nano"), demonstrations)
     assert names(model) - moved == set()

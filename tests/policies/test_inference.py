@@ -33,7 +33,13 @@ def network_of(name: str) -> PolicyNetwork:
     return network
 
 
-@pytest.fixture(scope="module", params=NAMES)
+FAST = ("nano", "small")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
+)
 def policy(request) -> NetworkPolicy:
     """One policy in double precision for each kind of network; every test resets it."""
     return NetworkPolicy(network_of(request.param))
@@ -128,6 +134,7 @@ def test_keeping_what_was_read_changes_nothing_in_a_ragged_batch(policy, prompts
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.slow
 def test_in_single_precision_it_agrees_to_a_ten_thousandth(name, prompts, pool) -> None:
     policy = NetworkPolicy(network_of(name), dtype=torch.float32)
     steps = played(policy, prompts, pool)
@@ -214,6 +221,7 @@ def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.slow
 def test_half_precision_gives_valid_actions(name, prompts, pool) -> None:
     policy = NetworkPolicy(network_of(name), dtype=torch.bfloat16)
     for action, query in played(policy, prompts, pool).values():

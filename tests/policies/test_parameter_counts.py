@@ -21,6 +21,7 @@ def test_the_trunk_of_vima_has_the_published_size(size: str, millions: float) ->
 
 
 @pytest.mark.parametrize("size", TRUNKS)
+@pytest.mark.slow
 def test_the_trunks_of_all_members_are_of_equal_size(size: str) -> None:
     trunks = [policy_size(preset(f"{family}-{size}")).parts["trunk"].total for family in FAMILIES]
     assert max(trunks) < 1.003 * min(trunks)  # self blocks have biases, cross blocks none

@@ -117,6 +117,7 @@ def test_a_tokenizer_is_stored_with_the_policy_and_read_again(
     assert_same_actions(loaded, policy, demonstrations)
 
 
+@pytest.mark.slow
 def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
     network, stored = load_network(published)
     assert stored is None

@@ -27,6 +27,7 @@ def digests(task: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_what_was_played_before_leaves_no_trace() -> None:
     """Caches of models, shapes and images are warm the second time, and in another order."""
     envs = {task: TabletopEnv(task) for task in list_tasks()}
@@ -37,7 +38,13 @@ def test_what_was_played_before_leaves_no_trace() -> None:
     assert first == again == fresh
 
 
-@pytest.mark.parametrize("task", list_tasks())
+FAST_TIER = ("rotate", "sweep_without_exceeding")  # one task for each end effector
+
+
+@pytest.mark.parametrize(
+    "task",
+    [task if task in FAST_TIER else pytest.param(task, marks=pytest.mark.slow) for task in list_tasks()],
+)
 def test_two_processes_give_the_same_bytes(task: str) -> None:
     code = (
         "import importlib.util, sys; "

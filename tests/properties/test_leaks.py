@@ -60,11 +60,13 @@ def excess(counts: collections.Counter[tuple[int, int]]) -> float:
 
 
 @pytest.mark.parametrize("task", list_tasks())
+@pytest.mark.slow
 def test_no_rank_in_any_order_predicts_the_answer(task: str) -> None:
     found = ranks(task, task_spec(task).levels[0])
     assert {kind: excess(counts) for kind, counts in found.items() if excess(counts) > LIMIT} == {}
 
 
+@pytest.mark.slow
 def test_the_original_order_gives_the_answer_away() -> None:
     """The same test finds the leak of the original benchmark, where objects come in the order of roles."""
     found = ranks("visual_manipulation", "L1", compat=True)

@@ -238,6 +238,7 @@ def test_labels_are_those_of_the_naive_twin() -> None:
 
 
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="is this very run")
+@pytest.mark.slow
 def test_the_kernels_stay_within_their_arrays() -> None:
     """Run this file uncompiled, where an index past the end raises."""
     run = subprocess.run(

@@ -71,6 +71,7 @@ def quick_portraits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "draw_thumbnail", one_pixel)
 
 
+@pytest.mark.slow
 def test_the_page_names_every_object_and_texture_and_all_its_pictures_exist(
     tmp_path, quick_portraits
 ) -> None:
@@ -91,6 +92,7 @@ def test_the_page_names_every_object_and_texture_and_all_its_pictures_exist(
     assert "http" not in text.replace("http://www.w3.org", "")
 
 
+@pytest.mark.slow
 def test_the_page_says_where_things_are_used(tmp_path, quick_portraits) -> None:
     text = write_gallery(tmp_path, load_assets())[0].read_text(encoding="utf-8")
     cards = {card.split("</h3>")[0].split("<h3>")[1]: card for card in text.split("<article")[1:]}
@@ -101,6 +103,7 @@ def test_the_page_says_where_things_are_used(tmp_path, quick_portraits) -> None:
     assert "256 × 256 pixels" in cards["tiger"]
 
 
+@pytest.mark.slow
 def test_swatches_show_the_whole_texture_in_a_bounded_size(tmp_path, quick_portraits) -> None:
     write_gallery(tmp_path, load_assets())
     with Image.open(tmp_path / PICTURES / "texture-polka-dot.png") as swatch:
@@ -109,6 +112,7 @@ def test_swatches_show_the_whole_texture_in_a_bounded_size(tmp_path, quick_portr
         assert swatch.getcolors() == [(swatch.width * swatch.height, (78, 121, 167))]
 
 
+@pytest.mark.slow
 def test_what_a_pack_lacks_is_reported_and_the_rest_is_shown(tmp_path, quick_portraits) -> None:
     page, problems = write_gallery(tmp_path, _Incomplete())
     assert set(problems) == {"textures/tiger.jpg is missing", "kitting/heart.obj is missing"}

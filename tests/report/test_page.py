@@ -183,6 +183,7 @@ def test_a_policy_missing_on_a_task_leaves_an_empty_cell(results, tmp_path):
     assert rotate[1].strip() == "–"
 
 
+@pytest.mark.slow
 def test_seventeen_tasks_and_eight_policies_fit_in(tmp_path, results):
     row = results.rows[0]
     rows = tuple(

@@ -24,6 +24,7 @@ def test_a_pose_times_its_inverse_is_the_identity(pose: Pose) -> None:
 
 
 @given(poses, poses, vectors)
+@pytest.mark.slow
 def test_chained_poses_map_points_one_after_the_other(a: Pose, b: Pose, point: tuple[float, ...]) -> None:
     np.testing.assert_allclose((a @ b).transform(np.array(point)), a.transform(b.transform(point)), atol=1e-9)
 

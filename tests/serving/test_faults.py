@@ -146,6 +146,7 @@ def test_a_thousand_malformed_messages_are_refused_one_by_one(url: str) -> None:
     assert plays(url, 3)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_clients_of_any_kind(url: str) -> None:
     random = Random(8)
 
@@ -286,6 +287,7 @@ def test_a_client_that_goes_while_the_policy_thinks_is_forgotten() -> None:
             pytest.fail("the place of a client that had gone was never free again")
 
 
+@pytest.mark.slow
 def test_a_server_that_stops_leaves_nothing_behind() -> None:
     before = counts()
     for _ in range(3):

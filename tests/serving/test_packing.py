@@ -111,6 +111,7 @@ def test_what_is_no_message_is_refused_with_a_reason(data: bytes, message: str) 
         unpack(data)
 
 
+@pytest.mark.slow
 def test_no_message_takes_many_times_its_size() -> None:
     inner = b"\xdc" + MAX_LENGTH.to_bytes(2, "big")
     wide = b"\xdc" + (MAX_VALUES // MAX_LENGTH + 8).to_bytes(2, "big")

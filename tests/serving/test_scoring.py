@@ -86,6 +86,7 @@ def test_sessions_share_the_weights_and_nothing_else(network_policy: NetworkPoli
     assert len(network_policy.act([None])) == 1
 
 
+@pytest.mark.slow
 def test_an_evaluation_through_a_server_has_the_outcomes_of_one_without(
     network_policy: NetworkPolicy, tmp_path: Path
 ) -> None:
@@ -103,6 +104,7 @@ def test_an_evaluation_through_a_server_has_the_outcomes_of_one_without(
     assert url not in there.read_text()
 
 
+@pytest.mark.slow
 def test_two_workers_play_through_one_server(tmp_path: Path) -> None:
     short = replace(TINY, tasks=("rotate",), episodes=2, batch=1)
     config = replace(short, policies=("random",), out=tmp_path / "one")

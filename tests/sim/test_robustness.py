@@ -18,6 +18,7 @@ NUM_ACTIONS = 4
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
 def test_random_actions_never_lose_a_body(seed) -> None:
     rng = np.random.default_rng(seed)
     world = World(random_table(rng, ("suction", "spatula")[seed % 2]), ASSETS)
@@ -36,6 +37,7 @@ def test_random_actions_never_lose_a_body(seed) -> None:
                 assert now.pose.planar_distance(before.pose) < 3.0, (action, now)
 
 
+@pytest.mark.slow
 def test_a_heap_of_bodies_in_one_another_comes_apart() -> None:
     names = ("bowl", "container", "letter A") * 3
     bodies = [(name, 0.5 + 0.01 * i, 0.01 * i, 0.3 * i) for i, name in enumerate(names)]
@@ -57,6 +59,7 @@ def digest() -> str:
     return content.hexdigest()
 
 
+@pytest.mark.slow
 def test_another_process_or_processor_gives_the_same_bytes() -> None:
     """The other one multiplies matrices as an early 64-bit processor would, if NumPy's library can."""
     tests = Path(__file__).parents[1]

@@ -53,6 +53,7 @@ def point_of(pose: Pose) -> int:
     return index
 
 
+@pytest.mark.slow
 def test_walks_are_uniform(problems: list[Problem]) -> None:
     walks = []
     for problem in problems:
@@ -61,6 +62,7 @@ def test_walks_are_uniform(problems: list[Problem]) -> None:
     assert_uniform(walks, [(start, a, b) for start in range(5) for a in (1, 4) for b in (1, 4)])
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "L4")
     assert len(drawn_from.dragged_objects) == 19 and len(drawn_from.dragged_textures) == 49
@@ -70,6 +72,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     assert_uniform((frames(problem)[0][1].object for problem in problems), drawn_from.dragged_objects)
 
 
+@pytest.mark.slow
 def test_the_distractors_of_table_and_frames_are_drawn_apart(problems: list[Problem]) -> None:
     num_alike = num_same_shape = num_same_texture = 0
     for problem in problems:
@@ -85,6 +88,7 @@ def test_the_distractors_of_table_and_frames_are_drawn_apart(problems: list[Prob
     assert 0.01 < num_same_texture / NUM_EPISODES / 2 < 0.03  # nearly 1 in 49
 
 
+@pytest.mark.slow
 def test_everything_lies_straight_on_the_table(problems: list[Problem]) -> None:
     for problem in problems[:300]:
         moved, distractor = roles(problem)
@@ -96,6 +100,7 @@ def test_everything_lies_straight_on_the_table(problems: list[Problem]) -> None:
             assert placement.pose.z == pytest.approx(rest_z_m, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_frames_show_the_start_and_the_target_of_each_move(problems: list[Problem]) -> None:
     for problem in problems[:300]:
         moved, _ = roles(problem)
@@ -109,6 +114,7 @@ def test_the_frames_show_the_start_and_the_target_of_each_move(problems: list[Pr
         assert {placement.id for placement in shown[0]} == {2, 3}
 
 
+@pytest.mark.slow
 def test_ids_say_nothing_about_the_role(problems: list[Problem]) -> None:
     assert_uniform((roles(problem)[0].id for problem in problems), (5, 6))
     assert_uniform((frames(problem)[0][0].id for problem in problems), (2, 3))
@@ -148,6 +154,7 @@ def test_a_wrong_difficulty_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("distance", "is_near"), [(0.0, True), (0.099, True), (0.101, False)])
+@pytest.mark.slow
 def test_each_step_must_bring_the_object_near_the_next_place(
     problems: list[Problem], distance: float, is_near: bool
 ) -> None:
@@ -160,12 +167,14 @@ def test_each_step_must_bring_the_object_near_the_next_place(
         assert played(problem, {moved.id: targets(problem)[0]}, last)[1].failure is not is_near
 
 
+@pytest.mark.slow
 def test_heading_and_height_do_not_count(problems: list[Problem]) -> None:
     moved, _ = roles(problems[0])
     moves = [{moved.id: place.moved(dz=0.2).rotated(2.0)} for place in targets(problems[0])]
     assert played(problems[0], *moves)[-1].success
 
 
+@pytest.mark.slow
 def test_a_step_that_does_not_count_ends_the_episode(problems: list[Problem]) -> None:
     for problem in problems[:20]:
         moved, distractor = roles(problem)
@@ -177,6 +186,7 @@ def test_a_step_that_does_not_count_ends_the_episode(problems: list[Problem]) ->
         assert played(problem, {moved.id: first}, {})[1].failure
 
 
+@pytest.mark.slow
 def test_no_place_may_be_skipped(problems: list[Problem]) -> None:
     ahead = [p for p in problems[:50] if targets(p)[1].planar_distance(roles(p)[0].pose) > 0.1]
     assert len(ahead) > 10
@@ -184,6 +194,7 @@ def test_no_place_may_be_skipped(problems: list[Problem]) -> None:
         assert played(problem, {roles(problem)[0].id: targets(problem)[1]})[0].failure
 
 
+@pytest.mark.slow
 def test_the_way_back_has_to_be_walked_too(problems: list[Problem]) -> None:
     back = next(p for p in problems if targets(p)[1].planar_distance(roles(p)[0].pose) < 1e-9)
     moved, _ = roles(back)
@@ -194,6 +205,7 @@ def test_the_way_back_has_to_be_walked_too(problems: list[Problem]) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_distractor_may_go_anywhere(problems: list[Problem]) -> None:
     moved, distractor = roles(problems[0])
     first, last = targets(problems[0])

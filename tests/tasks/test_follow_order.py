@@ -64,6 +64,7 @@ def test_all_ways_to_stack_are_known(num_blocks: int, num_moves: int, num_ways: 
         assert all(sorted(sum(step, ())) == list(range(num_blocks)) for step in way)
 
 
+@pytest.mark.slow
 def test_ways_to_stack_are_uniform(problems: list[Problem]) -> None:
     drawn = []
     for problem in problems:
@@ -74,6 +75,7 @@ def test_ways_to_stack_are_uniform(problems: list[Problem]) -> None:
     assert_uniform(drawn, all_stackings(3, 2))
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     all_roles = [roles(problem) for problem in problems]
@@ -86,6 +88,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     assert_frequencies(same_texture, {True: 3 / 19, False: 16 / 19})
 
 
+@pytest.mark.slow
 def test_blocks_share_the_shape_and_no_other_object_has_it(problems: list[Problem]) -> None:
     for problem in problems:
         blocks, (distractor,) = roles(problem)
@@ -96,6 +99,7 @@ def test_blocks_share_the_shape_and_no_other_object_has_it(problems: list[Proble
 
 
 @pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+@pytest.mark.slow
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from, shapes, textures = pool(TASK, level), set(), set()
     for seed in range(150):
@@ -106,6 +110,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
     assert textures == set(drawn_from.dragged_textures)
 
 
+@pytest.mark.slow
 def test_blocks_lie_in_a_row_away_from_the_distractor(problems: list[Problem], assets: Assets) -> None:
     for problem in problems:
         blocks, (distractor,) = roles(problem)
@@ -136,6 +141,7 @@ def test_frames_show_blocks_resting_on_those_below(difficulty: str, assets: Asse
                 assert sorted(stack) == pytest.approx(resting, abs=4e-3)
 
 
+@pytest.mark.slow
 def test_the_first_frame_is_the_start_and_the_others_are_what_the_goals_ask_for(
     problems: list[Problem],
 ) -> None:
@@ -148,12 +154,14 @@ def test_the_first_frame_is_the_start_and_the_others_are_what_the_goals_ask_for(
             assert {id_of[p.texture]: p.pose for p in frame} == poses
 
 
+@pytest.mark.slow
 def test_a_block_keeps_its_id_over_all_frames(problems: list[Problem]) -> None:
     for problem in problems[:300]:
         looks = [[(p.id, p.texture) for p in frame] for frame in frames(problem)]
         assert looks == [looks[0]] * 3 and [object_id for object_id, _ in looks[0]] == [2, 3, 4]
 
 
+@pytest.mark.slow
 def test_ids_say_nothing_about_the_place(problems: list[Problem]) -> None:
     assert_uniform((roles(problem)[0][0].id for problem in problems), (5, 6, 7, 8))
     first = [min(frames(problem)[0], key=lambda p: p.pose.y).id for problem in problems]
@@ -201,6 +209,7 @@ def test_numbers_out_of_range_are_refused(name: str, value: int, allowed: str) -
 
 
 @pytest.mark.parametrize(("distance", "is_near"), [(0.0, True), (0.099, True), (0.101, False)])
+@pytest.mark.slow
 def test_each_step_must_bring_its_block_near_the_place_shown(
     problems: list[Problem], distance: float, is_near: bool
 ) -> None:
@@ -212,6 +221,7 @@ def test_each_step_must_bring_its_block_near_the_place_shown(
         assert played(problem, first, far[1])[1].failure is not is_near
 
 
+@pytest.mark.slow
 def test_a_block_that_fell_beside_its_stack_counts(problems: list[Problem]) -> None:
     for problem in problems[:20]:
         fallen = [
@@ -220,6 +230,7 @@ def test_a_block_that_fell_beside_its_stack_counts(problems: list[Problem]) -> N
         assert played(problem, *fallen)[-1].success
 
 
+@pytest.mark.slow
 def test_other_objects_and_other_orders_are_failures(problems: list[Problem]) -> None:
     for problem in problems[:100]:
         blocks, (distractor,) = roles(problem)
@@ -234,6 +245,7 @@ def test_other_objects_and_other_orders_are_failures(problems: list[Problem]) ->
         assert played(problem, first, {})[1].failure
 
 
+@pytest.mark.slow
 def test_a_move_that_is_undone_has_to_be_made(problems: list[Problem]) -> None:
     def undoes(problem: Problem) -> bool:
         first, last = (list(frame) for frame in (frames(problem)[0], frames(problem)[-1]))
@@ -244,6 +256,7 @@ def test_a_move_that_is_undone_has_to_be_made(problems: list[Problem]) -> None:
     assert [outcome.success for outcome in played(problem, *moves(problem))] == [False, True]
 
 
+@pytest.mark.slow
 def test_blocks_that_are_still_to_be_moved_must_stay(problems: list[Problem]) -> None:
     problem = next(p for p in problems if len({goal.object_id for goal in p.goals}) == 2)
     first, last = moves(problem)

@@ -55,6 +55,7 @@ def test_counts_can_be_chosen(task: str) -> None:
 
 
 @both_tasks
+@pytest.mark.slow
 def test_nothing_is_decided_at_the_start(task: str) -> None:
     for seed in range(200):
         problem = problem_of(task, seed, difficulty="hard" if seed % 2 else "easy")
@@ -75,6 +76,7 @@ def test_with_compat_an_episode_may_be_lost_at_the_start() -> None:
 
 
 @both_tasks
+@pytest.mark.slow
 def test_an_object_may_be_laid_near_another_of_its_kind(task: str) -> None:
     """Only what would decide the episode is kept apart."""
     distances = []
@@ -167,6 +169,7 @@ def test_compat_places_base_then_objects_then_distractors(task: str) -> None:
 
 
 @both_tasks
+@pytest.mark.slow
 def test_sampling_hardly_ever_has_to_start_anew(task: str) -> None:
     redraws = {
         difficulty: sum(

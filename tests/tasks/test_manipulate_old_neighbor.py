@@ -84,6 +84,7 @@ def test_the_neighbour_stands_in_the_named_direction() -> None:
             assert cell_of(neighbour, num_columns) == (row + down, column + right)
 
 
+@pytest.mark.slow
 def test_cells_directions_and_gaps_are_drawn_evenly() -> None:
     cells = [(row, column) for row in range(3) for column in range(2)]
     assert_uniform([cell_of(roles(problem)[0]) for problem in problems()], cells)
@@ -103,6 +104,7 @@ def test_cells_directions_and_gaps_are_drawn_evenly() -> None:
 
 
 @pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 200), ("L2", 300), ("L3", 500)])
+@pytest.mark.slow
 def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
     all_roles = [roles(problem) for problem in problems(level, num=num)]
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])

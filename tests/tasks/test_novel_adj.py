@@ -68,12 +68,14 @@ def difference(first: Placement, second: Placement) -> str:
     return ("lighter", "darker")[texture_spec(first.texture).is_dark]
 
 
+@pytest.mark.slow
 def test_word_meaning_and_less_are_uniform_and_independent(problems: list[Problem]) -> None:
     asked = [read(problem) for problem in problems]
     combinations = list(itertools.product(WORDS, (False, True), MEANINGS))
     assert_uniform([(a.word, a.is_flipped, a.meaning) for a in asked], combinations)
 
 
+@pytest.mark.slow
 def test_the_prompt_is_the_published_text_with_one_space_between_words(problems: list[Problem]) -> None:
     for problem in problems:
         asked = read(problem)
@@ -83,6 +85,7 @@ def test_the_prompt_is_the_published_text_with_one_space_between_words(problems:
         assert problem.prompt.text == expected
 
 
+@pytest.mark.slow
 def test_the_twins_differ_as_the_comparisons_do_and_the_right_one_is_asked_for(
     problems: list[Problem],
 ) -> None:
@@ -94,6 +97,7 @@ def test_the_twins_differ_as_the_comparisons_do_and_the_right_one_is_asked_for(
         assert difference(target, twin) == wanted
 
 
+@pytest.mark.slow
 def test_all_comparisons_show_the_same_and_by_as_much_as_on_the_table(problems: list[Problem]) -> None:
     factors = []
     for problem in problems:
@@ -112,6 +116,7 @@ def test_all_comparisons_show_the_same_and_by_as_much_as_on_the_table(problems: 
     assert_uniform(deciles.tolist(), range(10))
 
 
+@pytest.mark.slow
 def test_the_last_pictures_are_gray_and_not_stretched(problems: list[Problem]) -> None:
     for problem in problems:
         target, base, _ = roles(problem)
@@ -122,6 +127,7 @@ def test_the_last_pictures_are_gray_and_not_stretched(problems: list[Problem]) -
             assert (shown[name].object, shown[name].size) == (original.object, original.size)
 
 
+@pytest.mark.slow
 def test_gray_pictures_hold_no_colour_of_the_texture(problems: list[Problem], assets: Assets) -> None:
     rendered = Rasteriser(assets).prompt(problems[0].prompt)
     for name in ("dragged_obj", "base_obj"):
@@ -135,6 +141,7 @@ def test_gray_pictures_hold_no_colour_of_the_texture(problems: list[Problem], as
             )
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     all_roles, asked = [roles(problem) for problem in problems], [read(problem) for problem in problems]
@@ -148,6 +155,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
         assert_uniform([placement.texture for placement in shown], drawn_from.dragged_textures)
 
 
+@pytest.mark.slow
 def test_a_base_and_two_movable_twins_stand_apart(problems: list[Problem]) -> None:
     for problem in problems:
         target, base, (twin,) = roles(problem)
@@ -163,6 +171,7 @@ def test_a_base_and_two_movable_twins_stand_apart(problems: list[Problem]) -> No
 
 
 @pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+@pytest.mark.slow
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool(TASK, level)
     for seed in range(150):
@@ -176,6 +185,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
 
 
 @pytest.mark.parametrize("level", ["train", "L3"])
+@pytest.mark.slow
 def test_outcomes_change_at_the_limits(level: str) -> None:
     for seed in range(25):
         problem = sample_episode(TASK, level=level, seed=seed, difficulty="hard", num_distractors=1).problem

@@ -44,6 +44,7 @@ def test_the_task_is_held_out_for_the_fourth_level() -> None:
     assert task_spec(TASK).levels == ("L4",)
 
 
+@pytest.mark.slow
 def test_words_and_order_of_introductions_are_uniform(problems: list[Problem]) -> None:
     forms, matches = zip(*map(matched, problems), strict=True)
     assert_uniform(forms, FORMS)
@@ -56,6 +57,7 @@ def test_words_and_order_of_introductions_are_uniform(problems: list[Problem]) -
     assert_uniform([(match["target"], match["base"]) for match in matches], pairs)
 
 
+@pytest.mark.slow
 def test_gray_pictures_introduce_target_and_base_once_each(problems: list[Problem]) -> None:
     for problem in problems:
         images = dict(problem.prompt.images)
@@ -69,6 +71,7 @@ def test_gray_pictures_introduce_target_and_base_once_each(problems: list[Proble
             assert (shown.object, shown.texture, shown.scale) == (original.object, "gray", (1, 1, 1))
 
 
+@pytest.mark.slow
 def test_five_bodies_stand_apart_and_only_bases_are_fixed(problems: list[Problem]) -> None:
     base_shapes = pool(TASK, "L4").base_objects
     for problem in problems:
@@ -85,6 +88,7 @@ def test_five_bodies_stand_apart_and_only_bases_are_fixed(problems: list[Problem
         )
 
 
+@pytest.mark.slow
 def test_textures_of_distractors_come_from_both_lists_put_together(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "L4")
     entries = collections.Counter((*drawn_from.dragged_textures, *drawn_from.base_textures))
@@ -93,6 +97,7 @@ def test_textures_of_distractors_come_from_both_lists_put_together(problems: lis
     assert_frequencies(drawn, {texture: count / 91 for texture, count in entries.items()})
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_of_twins_and_bases_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "L4")
     all_roles = [roles(problem) for problem in problems]

@@ -33,6 +33,7 @@ def matched(problem: Problem) -> tuple[str, re.Match[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_two_different_nouns_are_introduced_in_either_order(problems: list[Problem]) -> None:
     forms, matches = zip(*map(matched, problems), strict=True)
     assert_uniform(forms, FORMS)
@@ -40,6 +41,7 @@ def test_two_different_nouns_are_introduced_in_either_order(problems: list[Probl
     assert_uniform([(match["target"], match["base"]) for match in matches], pairs)
 
 
+@pytest.mark.slow
 def test_the_pictures_are_gray_and_of_target_and_base(problems: list[Problem]) -> None:
     for problem in problems[:200]:
         target, base, _ = roles(problem)
@@ -51,6 +53,7 @@ def test_the_pictures_are_gray_and_of_target_and_base(problems: list[Problem]) -
             assert image.placement.texture == "gray" and shown.texture != "gray"
 
 
+@pytest.mark.slow
 def test_textures_and_bases_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     all_roles = [roles(problem) for problem in problems]
@@ -61,6 +64,7 @@ def test_textures_and_bases_are_uniform(problems: list[Problem]) -> None:
     assert_uniform([distractors[0].texture for _, _, distractors in all_roles], textures)
 
 
+@pytest.mark.slow
 def test_a_distractor_has_a_third_shape_and_is_fixed_if_a_base(problems: list[Problem]) -> None:
     base_shapes = pool(TASK, "train").base_objects
     num_bases = 0
@@ -74,6 +78,7 @@ def test_a_distractor_has_a_third_shape_and_is_fixed_if_a_base(problems: list[Pr
 
 
 @pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+@pytest.mark.slow
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool(TASK, level)
     for seed in range(150):

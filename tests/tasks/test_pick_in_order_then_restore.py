@@ -86,6 +86,7 @@ def test_six_bases_stand_in_two_rows(difficulty: str, num_targets: int) -> None:
         assert problem.oracle_max_steps == num_targets + 2
 
 
+@pytest.mark.slow
 def test_source_and_targets_are_drawn_evenly() -> None:
     drawn = []
     for problem in problems():
@@ -95,6 +96,7 @@ def test_source_and_targets_are_drawn_evenly() -> None:
 
 
 @pytest.mark.parametrize(("level", "num"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 300)])
+@pytest.mark.slow
 def test_each_level_has_its_shapes_and_textures(level: str, num: int) -> None:
     all_roles = [roles(problem) for problem in problems(level, num=num)]
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])

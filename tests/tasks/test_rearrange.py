@@ -46,10 +46,12 @@ def clean() -> Problem:
     return sample_episode(TASK, seed=2, num_objects=1, conflict_rate=0).problem
 
 
+@pytest.mark.slow
 def test_one_two_or_three_objects_have_to_be_moved(problems: list[Problem]) -> None:
     assert_frequencies((len(p.goals) for p in problems), {1: 0.4, 2: 0.4, 3: 0.2})
 
 
+@pytest.mark.slow
 def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
     problems: list[Problem],
 ) -> None:
@@ -62,6 +64,7 @@ def test_only_a_single_object_has_a_distractor_and_half_of_these_are_in_its_way(
     assert not any(p.prerequisites for p in problems if len(p.goals) > 1)
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     movables = [placement for problem in problems for placement, _ in moves(problem)]
@@ -70,6 +73,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
 
 
 @pytest.mark.parametrize("level", ["train", "L2", "L3"])
+@pytest.mark.slow
 def test_a_distractor_has_another_shape_and_any_of_the_49_textures(level: str) -> None:
     distractors = []
     for seed in range(1000):
@@ -91,6 +95,7 @@ def test_distractors_can_be_kept_to_the_textures_of_the_level() -> None:
             assert {p.texture for p in episode.problem.scene.placements} <= set(TEXTURE_SETS[textures])
 
 
+@pytest.mark.slow
 def test_nothing_starts_in_the_way_of_a_target(problems: list[Problem]) -> None:
     for problem in problems:
         goals, taken = moves(problem), distractor_of(problem)
@@ -106,6 +111,7 @@ def test_nothing_starts_in_the_way_of_a_target(problems: list[Problem]) -> None:
                 assert taken.pose.planar_distance(own.pose) >= 0.1
 
 
+@pytest.mark.slow
 def test_a_distractor_in_the_way_stands_exactly_on_the_target_at_its_own_height(
     problems: list[Problem], assets: Assets
 ) -> None:
@@ -124,6 +130,7 @@ def test_a_distractor_in_the_way_stands_exactly_on_the_target_at_its_own_height(
         assert parked.pose.planar_distance(own.pose) >= 0.11
 
 
+@pytest.mark.slow
 def test_the_picture_shows_the_objects_at_their_targets_and_no_distractor(problems: list[Problem]) -> None:
     for problem in problems:
         shown = {(p.object, p.texture, p.size, p.pose) for p in pictured(problem)}
@@ -131,6 +138,7 @@ def test_the_picture_shows_the_objects_at_their_targets_and_no_distractor(proble
         assert sorted(p.id for p in pictured(problem)) == list(range(2, 2 + len(problem.goals)))
 
 
+@pytest.mark.slow
 def test_the_prompt_is_the_published_sentence(problems: list[Problem]) -> None:
     assert {p.prompt.text for p in problems} == {"Rearrange to this {scene}."} == {task_spec(TASK).template}
 

@@ -53,6 +53,7 @@ def test_the_prompt_is_the_published_sentence() -> None:
     assert {sample_episode(TASK, seed=seed).problem.prompt.text for seed in range(20)} == {sentence}
 
 
+@pytest.mark.slow
 def test_objects_go_back_to_their_starts_in_an_order_of_its_own() -> None:
     orders = []
     for seed in range(600):
@@ -217,6 +218,7 @@ def test_bad_options_are_refused() -> None:
             sample_episode(TASK, seed=0, **options)
 
 
+@pytest.mark.slow
 def test_bad_luck_is_rare() -> None:
     for level in ("train", "L3"):
         assert sum(sample_episode(TASK, level=level, seed=seed).num_redraws for seed in range(400)) <= 8

@@ -33,6 +33,7 @@ def all_roles(level: str, num_episodes: int) -> list[Roles]:
 
 
 @pytest.mark.parametrize(("level", "num_episodes"), [("train", 2000), ("L1", 300), ("L2", 300), ("L3", 500)])
+@pytest.mark.slow
 def test_each_level_has_its_shapes_and_textures(level: str, num_episodes: int) -> None:
     episodes = all_roles(level, num_episodes)
     dragged_textures, base_textures = (TEXTURE_SETS[name] for name in TEXTURES[level])

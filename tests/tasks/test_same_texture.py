@@ -20,6 +20,7 @@ def all_roles() -> list[Roles]:
     return [roles(sample_episode("same_texture", level="L4", seed=seed).problem) for seed in range(2000)]
 
 
+@pytest.mark.slow
 def test_bases_and_textures_are_uniform(all_roles: list[Roles]) -> None:
     assert len(TEXTURE_SETS["T_first"]) == 24 and len(TEXTURE_SETS["T_second"]) == 25
     assert_uniform([base.object for base, _, _ in all_roles], BASES)

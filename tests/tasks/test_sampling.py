@@ -72,6 +72,7 @@ def test_the_same_seed_gives_the_same_episode_and_another_seed_another(task: str
 
 
 @pytest.mark.parametrize("task", list_tasks())
+@pytest.mark.slow
 def test_domains_and_levels_share_no_scene(task: str) -> None:
     level = task_spec(task).levels[0]
     scenes = [
@@ -123,6 +124,7 @@ def test_no_two_objects_cover_the_same_cell(task: str, assets: Assets) -> None:
         assert np.max(alone) <= 1, seed
 
 
+@pytest.mark.slow
 def test_ids_say_nothing_about_roles() -> None:
     episodes = [sample_episode("visual_manipulation", seed=seed) for seed in range(1200)]
     counts = collections.Counter(roles(episode)[0].id for episode in episodes)

@@ -33,6 +33,7 @@ def problems() -> list[Problem]:
     return [sample_episode(TASK, seed=seed).problem for seed in range(NUM_EPISODES)]
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     drawn_from = task_spec(TASK).pool("train")
     all_roles = [roles(problem) for problem in problems]
@@ -46,6 +47,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
 
 
 @pytest.mark.parametrize("level", ["train", "L1", "L2", "L3"])
+@pytest.mark.slow
 def test_every_level_draws_from_its_pool(level: str) -> None:
     drawn_from = pool(TASK, level)
     for seed in range(150):
@@ -56,6 +58,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
             assert distractor.texture in (*drawn_from.dragged_textures, *drawn_from.base_textures)
 
 
+@pytest.mark.slow
 def test_a_distractor_looks_like_the_base_or_has_the_texture_of_the_target(problems: list[Problem]) -> None:
     kinds = []
     for target, base, (distractor,) in map(roles, problems):
@@ -70,11 +73,13 @@ def test_a_distractor_looks_like_the_base_or_has_the_texture_of_the_target(probl
     assert 0.44 < np.mean(kinds) < 0.51  # bases are a little harder to place
 
 
+@pytest.mark.slow
 def test_a_base_as_distractor_may_have_any_other_texture(problems: list[Problem]) -> None:
     seen = {d.texture for _, base, (d,) in map(roles, problems) if d.object == base.object}
     assert seen == {*TEXTURE_SETS["C1"], *TEXTURE_SETS["C2"]}
 
 
+@pytest.mark.slow
 def test_the_picture_shows_the_target_among_things_of_other_textures(problems: list[Problem]) -> None:
     num_same_shape = num_same_place = 0
     for problem in problems:
@@ -90,11 +95,13 @@ def test_the_picture_shows_the_target_among_things_of_other_textures(problems: l
     assert num_same_place == 0
 
 
+@pytest.mark.slow
 def test_ids_in_the_picture_do_not_tell_the_target(problems: list[Problem]) -> None:
     ids = (p.id for problem in problems for p in pictured(problem) if p.texture == roles(problem)[0].texture)
     assert_uniform(ids, (2, 3))
 
 
+@pytest.mark.slow
 def test_the_prompt_names_both_textures(problems: list[Problem]) -> None:
     assert task_spec(TASK).template == (
         "Put the {dragged_texture} object in {scene} into the {base_texture} object."
@@ -105,6 +112,7 @@ def test_the_prompt_names_both_textures(problems: list[Problem]) -> None:
         assert match and match.groups() == (target.texture, base.texture)
 
 
+@pytest.mark.slow
 def test_nothing_starts_within_the_tolerance_of_anything(problems: list[Problem]) -> None:
     for problem in problems:
         poses = [placement.pose for placement in problem.scene.placements]
@@ -152,6 +160,7 @@ def test_hard_exchanges_the_textures(difficulty: str, dragged: str, base: str) -
         assert target.texture in TEXTURE_SETS[dragged] and container.texture in TEXTURE_SETS[base]
 
 
+@pytest.mark.slow
 def test_medium_draws_two_different_textures_of_one_set() -> None:
     sets = []
     for seed in range(400):
@@ -202,5 +211,6 @@ def test_with_compat_objects_hover_and_keep_the_order_of_placing() -> None:
         assert [p.texture == target.texture for p in pictured(problem)] == [True, False]
 
 
+@pytest.mark.slow
 def test_bad_luck_is_rare() -> None:
     assert sum(sample_episode(TASK, level="L3", seed=seed).num_redraws for seed in range(500)) <= 5

@@ -52,6 +52,7 @@ def determiner(problem: Problem) -> str:
 
 
 @TASKS
+@pytest.mark.slow
 def test_one_two_and_three_blocks_come_as_often_as_they_should(task: str) -> None:
     pairs = [blocks(problem) for problem in problems_of(task)]
     assert_frequencies([len(swept) for swept, _ in pairs], {1: 0.5, 2: 0.25, 3: 0.25})
@@ -60,6 +61,7 @@ def test_one_two_and_three_blocks_come_as_often_as_they_should(task: str) -> Non
 
 @TASKS
 @pytest.mark.parametrize(("difficulty", "most"), [("medium", 2), ("hard", 3)])
+@pytest.mark.slow
 def test_difficulty_brings_more_blocks(task: str, difficulty: str, most: int) -> None:
     sampled = [
         sample_episode(task, level=level_of(task), seed=seed, difficulty=difficulty) for seed in range(300)
@@ -130,6 +132,7 @@ def test_compat_takes_blocks_as_they_fall(task: str) -> None:
 
 
 @pytest.mark.parametrize(("task", "level"), LEVELS)
+@pytest.mark.slow
 def test_textures_of_the_four_roles_follow_the_level(task: str, level: str) -> None:
     of_blocks, of_flat = {"train": ("C1", "C2"), "L1": ("C1", "C2"), "L2": ("C2", "C1")}.get(
         level, ("T_first", "T_second")

@@ -12,6 +12,7 @@ def problems() -> list[Problem]:
     return [sample_episode("sweep_without_exceeding", seed=seed).problem for seed in range(1000)]
 
 
+@pytest.mark.slow
 def test_bounds_line_and_zones_have_the_published_sizes(problems: list[Problem]) -> None:
     line_xs = []
     for problem in problems:
@@ -37,6 +38,7 @@ def test_bounds_line_and_zones_have_the_published_sizes(problems: list[Problem])
     assert 0.3425 <= min(line_xs) < 0.344 and 0.4355 < max(line_xs) <= 0.437
 
 
+@pytest.mark.slow
 def test_the_line_lies_anywhere_in_its_range(problems: list[Problem]) -> None:
     line_xs = [p.pose.x for problem in problems for p in problem.scene.placements if p.object == "line"]
     counts, _ = np.histogram(line_xs, bins=10, range=(0.3425, 0.437))

@@ -134,6 +134,7 @@ def test_an_open_block_must_stay_in_the_workspace() -> None:
 
 
 @pytest.mark.parametrize("difficulty", LENGTHS)
+@pytest.mark.slow
 def test_the_oracle_never_touches_the_line(difficulty: str) -> None:
     env = TabletopEnv("sweep_without_touching", level="L4", domain="eval", difficulty=difficulty)
     for seed in range(8):

@@ -84,6 +84,7 @@ def rotated_clockwise(placement: Placement, problem: Problem, *, off_deg: float 
     return placement.pose.rotated(-math.radians(asked_deg(problem) + off_deg))
 
 
+@pytest.mark.slow
 def test_angle_texture_and_number_are_uniform(problems: list[Problem]) -> None:
     drawn_from = pool(TASK, "train")
     assert_uniform(map(asked_deg, problems), (30, 60, 90, 120, 150))
@@ -94,6 +95,7 @@ def test_angle_texture_and_number_are_uniform(problems: list[Problem]) -> None:
     assert_uniform((roles(problem)[1][0].texture for problem in problems), drawn_from.dragged_textures)
 
 
+@pytest.mark.slow
 def test_exactly_the_objects_to_turn_have_the_texture_named(problems: list[Problem]) -> None:
     for problem in problems:
         targets, distractors = roles(problem)
@@ -103,6 +105,7 @@ def test_exactly_the_objects_to_turn_have_the_texture_named(problems: list[Probl
         assert texture not in {distractor.texture for distractor in distractors}
 
 
+@pytest.mark.slow
 def test_distractors_may_look_like_each_other_or_share_the_shape(problems: list[Problem]) -> None:
     shared = [roles(p)[1][0].object == roles(p)[0][0].object for p in problems]
     assert_frequencies(shared, {True: 1 / 8, False: 7 / 8})
@@ -110,6 +113,7 @@ def test_distractors_may_look_like_each_other_or_share_the_shape(problems: list[
     assert_frequencies((a.texture == b.texture for a, b in pairs), {True: 1 / 18, False: 17 / 18})
 
 
+@pytest.mark.slow
 def test_every_example_shows_the_angle_on_another_texture(problems: list[Problem]) -> None:
     for problem in problems[:500]:
         targets, _ = roles(problem)
@@ -122,6 +126,7 @@ def test_every_example_shows_the_angle_on_another_texture(problems: list[Problem
             assert (before.pose.z, before.id) == (0.0, 2)
 
 
+@pytest.mark.slow
 def test_examples_lie_near_the_middle_at_any_heading(problems: list[Problem]) -> None:
     poses = [before.pose for problem in problems[:700] for before, _ in examples(problem)]
     assert_uniform((int((pose.x - 0.4375) // 0.025) for pose in poses), range(5))
@@ -129,6 +134,7 @@ def test_examples_lie_near_the_middle_at_any_heading(problems: list[Problem]) ->
     assert_uniform((pose.yaw_rad // (math.pi / 4) for pose in poses), range(-4, 4))
 
 
+@pytest.mark.slow
 def test_the_examples_of_two_shapes_show_both(problems: list[Problem]) -> None:
     firsts = []
     for problem in problems:
@@ -138,6 +144,7 @@ def test_the_examples_of_two_shapes_show_both(problems: list[Problem]) -> None:
     assert_uniform(firsts, (True, False))
 
 
+@pytest.mark.slow
 def test_the_goals_turn_the_objects_on_the_spot(problems: list[Problem]) -> None:
     for problem in problems[:300]:
         for goal in problem.goals:
@@ -162,6 +169,7 @@ def test_every_level_draws_from_its_pool(level: str) -> None:
     assert textures == set(drawn_from.dragged_textures)
 
 
+@pytest.mark.slow
 def test_ids_say_nothing_about_the_role(problems: list[Problem]) -> None:
     assert_uniform((roles(problem)[0][0].id for problem in problems), (5, 6, 7))
 
@@ -171,6 +179,7 @@ def test_no_draw_is_thrown_away() -> None:
 
 
 @pytest.mark.parametrize(("difficulty", "num_objects"), [("easy", 3), ("medium", 4), ("hard", 5)])
+@pytest.mark.slow
 def test_difficulty_adds_objects(difficulty: str, num_objects: int) -> None:
     numbers = []
     for seed in range(200):
@@ -232,6 +241,7 @@ def test_pools_that_cannot_work_are_refused(
 
 
 @pytest.mark.parametrize("off_deg", [0, 14.5, -14.5, 15.5, -15.5, 180])
+@pytest.mark.slow
 def test_an_object_has_to_be_turned_by_the_angle_shown(problems: list[Problem], off_deg: float) -> None:
     for problem in [p for p in problems[:60] if len(p.goals) == 1]:
         ((target,), _) = roles(problem)
@@ -241,6 +251,7 @@ def test_an_object_has_to_be_turned_by_the_angle_shown(problems: list[Problem], 
         )
 
 
+@pytest.mark.slow
 def test_the_other_direction_is_wrong(problems: list[Problem]) -> None:
     problem = next(p for p in problems if len(p.goals) == 1 and asked_deg(p) == 120)
     ((target,), _) = roles(problem)
@@ -248,6 +259,7 @@ def test_the_other_direction_is_wrong(problems: list[Problem]) -> None:
 
 
 @pytest.mark.parametrize(("distance", "success"), [(0.049, True), (0.051, False)])
+@pytest.mark.slow
 def test_an_object_has_to_stay_where_it_was(problems: list[Problem], distance: float, success: bool) -> None:
     problem = with_targets(problems, 1)
     ((target,), _) = roles(problem)
@@ -257,6 +269,7 @@ def test_an_object_has_to_stay_where_it_was(problems: list[Problem], distance: f
     )
 
 
+@pytest.mark.slow
 def test_objects_count_in_any_order_and_once_and_for_all(problems: list[Problem]) -> None:
     problem = with_targets(problems, 2)
     (one, two), _ = roles(problem)
@@ -271,6 +284,7 @@ def test_objects_count_in_any_order_and_once_and_for_all(problems: list[Problem]
     assert judged(problem, first, gone, second).success
 
 
+@pytest.mark.slow
 def test_turning_a_distractor_only_costs_a_step(problems: list[Problem]) -> None:
     problem = with_targets(problems, 1)
     (target,), (distractor, _) = roles(problem)
@@ -281,6 +295,7 @@ def test_turning_a_distractor_only_costs_a_step(problems: list[Problem]) -> None
 
 
 @pytest.mark.parametrize(("distance", "failure"), [(0.049, True), (0.051, False)])
+@pytest.mark.slow
 def test_a_distractor_must_not_take_the_place(
     problems: list[Problem], distance: float, failure: bool
 ) -> None:
@@ -290,6 +305,7 @@ def test_a_distractor_must_not_take_the_place(
 
 
 @pytest.mark.parametrize(("off_deg", "failure"), [(14, True), (16, False)])
+@pytest.mark.slow
 def test_an_object_must_not_match_a_distractor(
     problems: list[Problem], off_deg: float, failure: bool
 ) -> None:

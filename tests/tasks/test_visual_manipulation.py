@@ -31,6 +31,7 @@ def problems() -> list[Problem]:
     return [sample_episode("visual_manipulation", seed=seed).problem for seed in range(NUM_EPISODES)]
 
 
+@pytest.mark.slow
 def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     pool = task_spec("visual_manipulation").pool("train")
     targets, bases = [roles(p)[0] for p in problems], [roles(p)[1] for p in problems]
@@ -43,6 +44,7 @@ def test_shapes_and_textures_are_uniform(problems: list[Problem]) -> None:
     assert all(0.6 < count * 14 / NUM_EPISODES < 1.5 for count in counts.values())
 
 
+@pytest.mark.slow
 def test_a_distractor_shares_shape_or_texture_but_never_both(problems: list[Problem]) -> None:
     shared = collections.Counter()
     for problem in problems:
@@ -55,6 +57,7 @@ def test_a_distractor_shares_shape_or_texture_but_never_both(problems: list[Prob
     assert min(shared.values()) > 10 and len(shared) == 4
 
 
+@pytest.mark.slow
 def test_distractors_that_look_like_bases_are_fixed(problems: list[Problem]) -> None:
     pool = task_spec("visual_manipulation").pool("train")
     num_bases = 0
@@ -66,6 +69,7 @@ def test_distractors_that_look_like_bases_are_fixed(problems: list[Problem]) -> 
     assert 0.15 < num_bases / NUM_EPISODES < 0.26  # 4 of 18 shapes, some of them harder to place
 
 
+@pytest.mark.slow
 def test_nothing_starts_within_the_tolerance_of_anything(problems: list[Problem]) -> None:
     for problem in problems:
         placements = problem.scene.placements
@@ -74,11 +78,13 @@ def test_nothing_starts_within_the_tolerance_of_anything(problems: list[Problem]
         )
 
 
+@pytest.mark.slow
 def test_the_prompt_is_the_published_sentence(problems: list[Problem]) -> None:
     assert {p.prompt.text for p in problems} == {"Put the {dragged_obj_1} into the {base_obj}."}
     assert [name for name, _ in problems[0].prompt.images] == ["dragged_obj_1", "base_obj"]
 
 
+@pytest.mark.slow
 def test_the_goal_is_the_place_of_the_base(problems: list[Problem]) -> None:
     (goal,) = problems[0].goals
     _, base, _ = roles(problems[0])

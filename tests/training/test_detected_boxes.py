@@ -210,6 +210,7 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
         {"augmentation.inverse_dynamics_prob": 0.5, "optimizer.grad_accum_steps": 2},
     ],
 )
+@pytest.mark.slow
 def test_a_mixed_run_that_was_killed_ends_as_if_nothing_had_happened(settings, tmp_path, change) -> None:
     settings |= {"loader.boxes": HOOK, **change}
     whole = train(TrainingConfig.of({**settings, "out": tmp_path / "whole"}))
@@ -219,6 +220,7 @@ def test_a_mixed_run_that_was_killed_ends_as_if_nothing_had_happened(settings, t
     load_policy(str(whole))
 
 
+@pytest.mark.slow
 def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(settings, data, tmp_path) -> None:
     short = {**settings, "pretraining.steps": 0, "schedule.steps": 2, "object_cache": tmp_path / "tokens"}
     detected = train(TrainingConfig.of({**short, "loader.boxes": HOOK, "loader.detected_prob": 1.0}))
@@ -240,6 +242,7 @@ def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(sett
     assert written["demonstrations"]["boxes"] == plugged_boxes(HOOK).name
 
 
+@pytest.mark.slow
 def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None:
     """The same weights get the same score whether or not some learnt from detected boxes."""
     still = {
@@ -258,6 +261,7 @@ def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None
     assert lines["true"] == lines["mixed"] != lines["detected"]
 
 
+@pytest.mark.slow
 def test_another_detector_is_another_run(settings, tmp_path) -> None:
     file = tmp_path / "extractors.py"
     file.write_text("from noisy_extractor import make\n")

@@ -38,7 +38,10 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
     return main([str(word) for word in (*words, "--schedule.checkpoint-every", 1, *options)])
 
 
-@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt", "midas"])
+@pytest.mark.parametrize(
+    "family",
+    ["vima", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gato", "flamingo", "gpt", "midas"))],
+)
 def test_a_run_can_be_interrupted_and_gives_a_policy_that_acts(family, data, tmp_path, monkeypatch) -> None:
     preset, whole, torn = f"{family}-nano", tmp_path / "whole", tmp_path / "torn"
     assert run_train(data, whole, preset) == 0
@@ -66,6 +69,7 @@ def test_a_run_can_be_interrupted_and_gives_a_policy_that_acts(family, data, tmp
     Action.from_arrays(action)
 
 
+@pytest.mark.slow
 def test_without_an_appearance_embedding_there_is_no_matching_and_the_images_are_learnt(
     data, tmp_path
 ) -> None:

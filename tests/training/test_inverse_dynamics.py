@@ -144,6 +144,7 @@ def last_weights(run: Path) -> dict[str, "torch.Tensor"]:
     return load_file(sorted((run / "checkpoints").glob("2-cloning-*"))[-1] / "model.safetensors")
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
     words = [
         "--data",
@@ -169,6 +170,7 @@ def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("finetune", [False, True])
+@pytest.mark.slow
 def test_what_has_matched_looks_need_not_do_so_again(finetune, settings, tmp_path) -> None:
     """The crop encoder is taken over, and stays as it is unless it is to be tuned."""
     first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
@@ -191,6 +193,7 @@ def test_what_has_matched_looks_need_not_do_so_again(finetune, settings, tmp_pat
     assert crops <= kept if not finetune else not crops <= kept
 
 
+@pytest.mark.slow
 def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
     first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
     other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano-bins", init_from=str(first))

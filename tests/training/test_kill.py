@@ -22,6 +22,8 @@ from openvima.policies import presets
 from openvima.policies.config import PolicyConfig
 from openvima.training import TrainingConfig, train
 
+pytestmark = pytest.mark.slow
+
 sizes, settings = json.loads(sys.argv[1])
 presets.PRESETS["tiny"] = lambda: PolicyConfig.from_dict(sizes)
 settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])

@@ -154,6 +154,7 @@ def _interrupts_at(step: int):
 
 @pytest.mark.skipif(find_spec("tensorboard") is None, reason="tensorboard is not installed")
 @pytest.mark.filterwarnings("ignore")  # of the reader, whose package is not ours
+@pytest.mark.slow
 def test_tensorboard_shows_the_metrics(settings) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

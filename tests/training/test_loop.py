@@ -22,6 +22,7 @@ def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:
 
 
 @pytest.mark.parametrize("killed_at", [1, 3, 4, 7])
+@pytest.mark.slow
 def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_path, killed_at):
     whole = TrainingConfig.of({**settings, "out": tmp_path / "whole"})
     torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
@@ -36,6 +37,7 @@ def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_
     assert (whole.out / "config.yaml").read_bytes() == (torn.out / "config.yaml").read_bytes()
 
 
+@pytest.mark.slow
 def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
     config = TrainingConfig.of(settings)
     train_until(config, 7)
@@ -50,6 +52,7 @@ def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
     assert steps == [(0, 2), (0, 4), (1, 2), (1, 4), (1, 6)]
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_left_as_it_is(settings):
     config = TrainingConfig.of(settings)
     train(config)
@@ -58,6 +61,7 @@ def test_a_finished_run_is_left_as_it_is(settings):
     assert {file: file.stat().st_mtime_ns for file in config.out.rglob("*.safetensors")} == before
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_weights(settings, tmp_path):
     runs = [TrainingConfig.of({**settings, "seed": seed, "out": tmp_path / str(seed)}) for seed in (0, 1)]
     first, second = (final_weights(train(run)) for run in runs)
@@ -74,6 +78,7 @@ def test_global_random_state_and_threads_are_left_alone(settings):
     assert torch.get_num_threads() == threads
 
 
+@pytest.mark.slow
 def test_other_settings_on_a_run_are_named_and_force_begins_anew(settings):
     train(TrainingConfig.of(settings))
     changed = {**settings, "schedule.steps": 2, "optimizer.learning_rate": 5e-4}
@@ -109,6 +114,7 @@ def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
     load_policy(str(run))
 
 
+@pytest.mark.slow
 def test_metrics_name_stage_and_step_and_hold_no_times(settings):
     run = train(TrainingConfig.of(settings))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -122,6 +128,7 @@ def test_metrics_name_stage_and_step_and_hold_no_times(settings):
     assert not any("second" in key for line in lines for key in line)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_it_could_name_its_best_checkpoint_names_it_later(settings):
     best = train(TrainingConfig.of(settings)) / "checkpoints" / "best.txt"
     name = best.read_text()
@@ -139,6 +146,7 @@ def test_a_damaged_checkpoint_is_named(settings):
         train(config)
 
 
+@pytest.mark.slow
 def test_what_an_interrupted_save_left_behind_is_removed(settings):
     config = TrainingConfig.of(settings)
     leftover = config.out / "checkpoints" / "2-cloning-000002.partial"
@@ -149,6 +157,7 @@ def test_what_an_interrupted_save_left_behind_is_removed(settings):
     assert not leftover.exists()
 
 
+@pytest.mark.slow
 def test_the_progress_report_ends_at_the_total(settings):
     seen = []
     train(TrainingConfig.of(settings), lambda done, total, note: seen.append((done, total, note)))
@@ -164,6 +173,7 @@ def test_the_progress_report_ends_at_the_total(settings):
         {"pretraining.finetune_crop_encoder": True},
     ],
 )
+@pytest.mark.slow
 def test_bins_and_tuned_crops_train_too(settings, change):
     run = train(TrainingConfig.of({**settings, **change}))
     load_policy(str(run))

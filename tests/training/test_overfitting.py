@@ -25,6 +25,8 @@ from openvima.training.parallel import Parallel  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of, source_of  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 DEMONSTRATIONS = {
     "rotate": 22,
     "visual_manipulation": 6,

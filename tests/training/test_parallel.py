@@ -24,6 +24,8 @@ from openvima.policies import presets
 from openvima.policies.config import PolicyConfig
 from openvima.training import TrainingConfig, train
 
+pytestmark = pytest.mark.slow
+
 sizes, settings = json.loads(sys.argv[1])
 presets.PRESETS["tiny-bins"] = lambda: PolicyConfig.from_dict(sizes)
 kill_at = settings.pop("kill_at", None)

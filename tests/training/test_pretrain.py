@@ -56,6 +56,7 @@ def test_mixed_colours_leave_grey_alone():
     assert 0.3 < unchanged < 0.8
 
 
+@pytest.mark.slow
 def test_the_matching_loss_falls_when_pairs_are_told_apart():
     torch.manual_seed(0)
     encoder = ObjectEncoder(

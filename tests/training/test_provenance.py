@@ -12,6 +12,7 @@ from openvima.training import TrainingConfig, train
 from openvima.training.provenance import git_state, provenance
 
 
+@pytest.mark.slow
 def test_every_start_of_a_run_is_noted(settings, data):
     config = TrainingConfig.of({**settings, "schedule.checkpoint_every": 3})
     train(config)

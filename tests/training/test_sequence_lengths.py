@@ -77,6 +77,7 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
     assert not list(config.out.glob("checkpoints/*"))
 
 
+@pytest.mark.slow
 def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
     cache, network, processor = case
     monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_PLACES", 1)  # so that all are read

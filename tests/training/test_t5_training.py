@@ -95,6 +95,7 @@ def kill_at_4(done: int, total: int, note: str) -> None:
         raise Killed
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settings, t5, tmp_path) -> None:
     whole = train(TrainingConfig.of({**t5_settings, "out": tmp_path / "whole"}))
     torn = TrainingConfig.of({**t5_settings, "out": tmp_path / "torn"})
@@ -127,6 +128,7 @@ def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> 
     assert not t5_settings["out"].exists()
 
 
+@pytest.mark.slow
 def test_weights_to_begin_with_bring_their_tokenizer(t5_settings, t5, tmp_path) -> None:
     first = train(TrainingConfig.of(t5_settings))
     t5.rename(t5.with_name("elsewhere"))

@@ -179,6 +179,7 @@ def test_shifted_crops_stay_near(pairs):
     assert torch.equal(moved.again.turns.nan_to_num(), pairs.again.turns.nan_to_num())
 
 
+@pytest.mark.slow
 def test_looks_and_turns_are_learnt_together():
     pairs = render_pairs(("twist",), num_scenes=20, seed=0, assets="procedural", variety=Variety(again=True))
     encoder = _encoder()
@@ -228,6 +229,7 @@ def test_a_turn_counts_as_right_within_fifteen_degrees():
     assert turning.turn_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
     import json
 

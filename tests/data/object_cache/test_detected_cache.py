@@ -91,6 +91,7 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
         ObjectCache(dataset, boxes="clumsy-3")
 
 
+@pytest.mark.slow
 def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:
     folders = [
         open_object_cache(Dataset(copy), folder=tmp_path / str(workers), boxes=CLUMSY, workers=workers).folder

@@ -71,6 +71,7 @@ def test_an_import_tells_its_origin_and_what_was_broken(source: Path, imported: 
     ]
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_does_not_change_a_byte(source: Path, imported: Path, tmp_path: Path) -> None:
     calls: list[tuple[int, int, str]] = []
     import_published(config(source, tmp_path, workers=2), report=lambda *numbers: calls.append(numbers))
