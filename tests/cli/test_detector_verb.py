@@ -139,10 +139,10 @@ def test_evaluate_plays_with_the_boxes_of_a_trained_detector(detector, tmp_path,
 
 
 @pytest.mark.slow
-def test_demo_films_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
-    film = tmp_path / "film.mp4"
-    words = ["demo", "rotate", "--policy", "untrained", "--out", str(film)]
+def test_demo_records_with_the_boxes_of_a_trained_detector(detector, tmp_path, capsys):
+    video = tmp_path / "video.mp4"
+    words = ["demo", "rotate", "--policy", "untrained", "--out", str(video)]
     assert main([*words, "--boxes", f"detector={detector}"]) == 0
-    assert film.stat().st_size > 0
+    assert video.stat().st_size > 0
     assert main(["demo", "rotate", "--boxes", "detector"]) == 2
     assert "uses no boxes" in capsys.readouterr().err

@@ -30,8 +30,8 @@ def test_tasks_speaks_json(capsys):
     assert "{" in tasks["visual_manipulation"]["prompt"]
 
 
-def test_demo_films_the_oracle(tmp_path, capsys):
-    path = tmp_path / "film.mp4"
+def test_demo_records_the_oracle(tmp_path, capsys):
+    path = tmp_path / "video.mp4"
     assert main(["demo", "rotate", "--seed", "1", "--out", str(path)]) == 0
     assert "solved; 1 step" in capsys.readouterr().out
     with av.open(str(path)) as container:

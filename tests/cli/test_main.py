@@ -73,7 +73,7 @@ def test_a_path_that_cannot_be_used_is_one_line_and_status_2(
 @pytest.mark.parametrize(
     "words",
     [
-        ["demo", "rotate", "--out", "film.gif"],
+        ["demo", "rotate", "--out", "video.gif"],
         ["report", "evaluation", "--out", "report.pdf"],
         ["quickstart", "--demonstrations", "0"],
         ["quickstart", "--workers", "0"],

@@ -170,7 +170,7 @@ def test_equal_results_give_equal_bytes(results, clip, metrics, tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-def test_results_without_films_and_training_make_a_report_without_those_sections(results, tmp_path):
+def test_results_without_videos_and_training_make_a_report_without_those_sections(results, tmp_path):
     page = Page(write_report(results, tmp_path / "report.html").read_text(encoding="utf-8"))
     assert "video" not in page.tags
     assert "training" not in page.ids
@@ -268,13 +268,13 @@ def test_many_tasks_and_causes_of_failure_are_summed_up(results, tmp_path):
     assert [cell.strip() for cell in table[-1][1:4]] == ["2 rarer causes", "14", "20.0 %"]
 
 
-def test_films_are_kept_beside_the_results(clip, tmp_path):
+def test_videos_are_kept_beside_the_results(clip, tmp_path):
     save_clips([clip], tmp_path)
     assert load_clips(tmp_path) == (clip,)
     assert (tmp_path / "videos" / clip.file_name).read_bytes() == clip.video
 
 
-def test_no_films_are_no_error_but_lost_ones_are(clip, tmp_path):
+def test_no_videos_are_no_error_but_lost_ones_are(clip, tmp_path):
     assert load_clips(tmp_path) == ()
     save_clips([clip], tmp_path)
     (tmp_path / "videos" / clip.file_name).unlink()

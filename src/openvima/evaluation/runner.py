@@ -51,7 +51,7 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
 
     Raises:
         ConfigError: The settings cannot be, or `config.out` holds results of other settings.
-        MissingExtraError: Something is not installed that networks, videos or Ray need.
+        MissingExtraError: An optional dependency (torch, Ray) is not installed.
         WorkerError: A worker process died; what was finished is kept.
     """
     if config.boxes is not None:
