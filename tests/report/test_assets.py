@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation import EvaluationConfig
+from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.sources import PolicySource
 from openvima.report import VideoSelection, assets, evaluate_and_report
+from openvima.report.page import default_command
 from openvima.video.clips import load_clips
 
 
@@ -67,7 +68,7 @@ def test_the_command_names_run_folders_and_what_differs_from_the_defaults():
     config = EvaluationConfig(
         ("mine=my runs/a", "oracle"), ("rotate",), ("L1", "L2"), episodes=7, seed=3, batch=4
     )
-    assert assets.command_of(config) == (
+    assert default_command(Results((), config.record()), config.policies) == (
         "openvima evaluate --policy 'mine=my runs/a,oracle' --tasks rotate --levels L1,L2 --episodes 7 "
         "--seed 3 --batch 4 --out DIR"
     )

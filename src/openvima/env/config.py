@@ -1,6 +1,5 @@
 """Settings that all environments of a run share: assets, difficulty, fidelity."""
 
-import shlex
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
@@ -63,12 +62,6 @@ class EnvConfig:
     def record(self) -> dict[str, str | bool]:
         """Return the settings for a record, without paths."""
         return {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
-
-    def words(self) -> list[str]:
-        """Return the command-line options that differ from the defaults."""
-        words = [f"--assets {shlex.quote(self.assets)}"] if self.assets != "procedural" else []
-        words += ["--compat"] if self.compat else []
-        return words + ([f"--difficulty {self.difficulty}"] if self.difficulty != "easy" else [])
 
 
 DEFAULT_ENV_CONFIG = EnvConfig()

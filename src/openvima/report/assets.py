@@ -2,7 +2,6 @@
 
 import importlib.util
 import re
-import shlex
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,8 +9,6 @@ from pathlib import Path
 
 from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation.config import (
-    DEFAULT_BATCH,
-    DEFAULT_DEVICE,
     Batch,
     EvaluationConfig,
     cells,
@@ -21,7 +18,7 @@ from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import PolicySource
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import PACKAGED
-from openvima.report.page import write_report
+from openvima.report.page import default_command, write_report
 from openvima.video.clips import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
@@ -108,7 +105,7 @@ def evaluate_and_report(
     write_report(
         results,
         config.out / REPORT_NAME,
-        command=command_of(config),
+        command=default_command(results, config.policies),
         metrics=find_metrics(config.sources),
         clips=_recorded(recording_jobs(config, videos, results), config, note),
     )
@@ -217,26 +214,6 @@ def record_clip(job: RecordingJob, count: Callable[[int], None]) -> Clip:
         video=video,
         poster=poster,
     )
-
-
-def command_of(config: EvaluationConfig) -> str:
-    """The command that reproduces an evaluation."""
-    words = [
-        "openvima evaluate",
-        f"--policy {shlex.quote(','.join(config.policies))}",
-        f"--tasks {','.join(config.tasks)}",
-        f"--levels {','.join(config.levels)}",
-        f"--episodes {config.episodes}",
-        f"--seed {config.seed}",
-        *config.env_config.words(),
-        *([] if config.batch == DEFAULT_BATCH else [f"--batch {config.batch}"]),
-        *([f"--ablations {','.join(config.ablations)}"] if config.ablations else []),
-        *([f"--boxes {shlex.quote(config.boxes)}"] if config.boxes else []),
-        *([] if config.device == DEFAULT_DEVICE else [f"--device {config.device}"]),
-        *([f"--precision {config.precision}"] if config.precision else []),
-        "--out DIR",
-    ]
-    return " ".join(words)
 
 
 def find_metrics(sources: Sequence[PolicySource]) -> Path | None:

@@ -88,12 +88,20 @@ def write_report(
     return atomic_write_file(out, page)
 
 
-def default_command(results: Results) -> str:
-    """Compose the command from the settings; of run folders and servers only the names are known."""
+def default_command(results: Results, policies: Sequence[str] = ()) -> str:
+    """Compose the command that reproduces an evaluation from its settings.
+
+    Args:
+        results: The evaluation.
+        policies: Its policies as given; by default their names, with placeholders for paths and addresses.
+    """
     config = results.config
-    policies = [_policy_word(name, results.policies.get(name, {})) for name in results.policy_names()]
+    policies = policies or [
+        _policy_word(name, results.policies.get(name, {})) for name in results.policy_names()
+    ]
     words = [
-        f"openvima evaluate --policy {','.join(policies)} --tasks {','.join(config.get('tasks', ['all']))}",
+        f"openvima evaluate --policy {shlex.quote(','.join(policies))}",
+        f"--tasks {','.join(config.get('tasks', ['all']))}",
         f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)}",
         f"--seed {config.get('seed', 0)}",
         *[
