@@ -1,13 +1,13 @@
-"""How fast the detector finds objects and learns, on one core.
+"""Speed of the detector on one core: inference and training.
 
     python benchmarks/detector.py [--quick] [--detector FOLDER] [--preset NAME] [--rounds R] [--json FILE]
 
-Frames are those of episodes that the oracle plays, one moment of each. Detecting is timed for both frames of
-a moment: by the network alone, and as for a policy, with boxes paired between the views and crops cut out.
-What the mask head costs depends on how many objects are found, so a trained detector is needed for that: that
-of the package, or another. Without one the weights are random, and as many objects are let through as the
-frames show. A training step holds augmentation, losses, gradients and the optimizer, not the reading of
-shards. Times are CPU times of this process; ways take turns, and medians are reported.
+Frames come from oracle episodes, one time step of each. Inference is timed for both views of a time step: the
+network alone, and the full extractor with boxes matched across views and crops. The cost of the mask head
+depends on the number of detections, so the bundled detector or another trained one is used. Without one the
+weights are random, and the number of detections is limited to that of the objects. A training step includes
+augmentation, losses, gradients and the optimizer, but no reading of shards. Times are CPU times of this
+process in alternating rounds; medians are reported.
 """
 
 import argparse
@@ -45,7 +45,7 @@ QUICK_TASKS = ("rotate", "visual_manipulation")
 DEFAULTS = DetectorTrainingConfig(data=Path(), out=Path())  # of training
 
 
-def moments(tasks: Sequence[str], episodes: int) -> list[dict[str, Any]]:
+def observations_of(tasks: Sequence[str], episodes: int) -> list[dict[str, Any]]:
     """Return one observation of each episode, with its `ee`."""
     found = []
     for task in tasks:
@@ -57,22 +57,22 @@ def moments(tasks: Sequence[str], episodes: int) -> list[dict[str, Any]]:
 
 
 def frames_of(observation: dict[str, Any]) -> list[Frame]:
-    """Return both frames of an observation, with the objects that they show."""
+    """Return both frames of an observation, with their objects."""
     ids = range(FIRST_OBJECT_ID[("suction", "spatula")[observation["ee"]]], BACKGROUND_ID)
     return [frame_of(observation["rgb"][view], observation["segm"][view], ids) for view in VIEWS]
 
 
 def detector_to_measure(folder: Path | None, preset: str, objects: int) -> tuple[FrameDetector, str]:
-    """Return a detector, and whose weights it has."""
+    """Return a detector and a name for its weights."""
     if folder is not None or (preset == "small" and BUNDLED.is_dir()):
-        return load_detector(folder), "the package's" if folder is None else str(folder)
+        return load_detector(folder), "bundled" if folder is None else str(folder)
     torch.manual_seed(0)
     network = MaskRCNN(replace(detector_config(preset), score_threshold=0.0, max_detections=objects))
     return FrameDetector(network.eval()), f"random weights of {preset}"
 
 
 def training_step(preset: str, frames: Sequence[Frame]) -> Callable[[], None]:
-    """Return a function that does one step of training on some of the frames."""
+    """Return a function that runs one training step."""
     torch.manual_seed(0)
     network = MaskRCNN(detector_config(preset))
     learner = DetectorLearner(network, sampled=DEFAULTS.proposals_per_frame).train()
@@ -99,34 +99,34 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Time everything in turns, after a first round that warms up."""
+    """Time everything in alternating rounds, after a warm-up round."""
     tasks = QUICK_TASKS if options.quick else list_tasks()
-    observations = moments(tasks, 1 if options.quick else 2)
+    observations = observations_of(tasks, 1 if options.quick else 2)
     frames = [frame for observation in observations for frame in frames_of(observation)]
-    shown = statistics.mean(len(frame.boxes) for frame in frames)
-    detector, whose = detector_to_measure(options.detector, options.preset, round(shown))
+    num_objects = statistics.mean(len(frame.boxes) for frame in frames)
+    detector, name = detector_to_measure(options.detector, options.preset, round(num_objects))
     extractor, step = DetectedObjects(detector), training_step(options.preset, frames)
-    times: dict[str, list[float]] = {"detect": [], "find": [], "train": []}
+    times: dict[str, list[float]] = {"detect": [], "extract": [], "train": []}
     for number in range(options.rounds + 1):
-        detect, find = [], []
+        detect, extract = [], []
         for observation in observations:
             pair = [observation["rgb"][view] for view in VIEWS]
             detect.append(seconds(lambda pair=pair: [detector.detect(rgb, "") for rgb in pair]))
-            find.append(seconds(lambda observation=observation: extractor.in_observation(observation)))
+            extract.append(seconds(lambda observation=observation: extractor.in_observation(observation)))
         train = seconds(step)
         if number:
             times["detect"] += detect
-            times["find"] += find
+            times["extract"] += extract
             times["train"].append(train)
     found = [len(detector.detect(frame.rgb, "").boxes) for frame in frames]
     return {
-        "detector": whose,
+        "detector": name,
         "pairs": len(observations),
-        "objects_a_frame": round(shown, 2),
-        "found_a_frame": round(statistics.mean(found), 2),
-        "detect_ms_a_pair": summary(times["detect"], 1e3),
-        "find_objects_ms_a_pair": summary(times["find"], 1e3),
-        f"training_s_a_step_of_{DEFAULTS.batch}_frames": summary(times["train"], 1.0),
+        "objects_per_frame": round(num_objects, 2),
+        "detections_per_frame": round(statistics.mean(found), 2),
+        "detect_ms_per_pair": summary(times["detect"], 1e3),
+        "extract_objects_ms_per_pair": summary(times["extract"], 1e3),
+        f"training_s_per_step_of_{DEFAULTS.batch}_frames": summary(times["train"], 1.0),
     }
 
 
@@ -140,10 +140,12 @@ def main() -> None:
     """Measure, print, and write the numbers as JSON if asked."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--quick", action="store_true", help="two moments and one round, to try it out")
-    parser.add_argument("--detector", type=Path, help="trained detector; by default the package's")
-    parser.add_argument("--preset", default="small", choices=("small", "resnet50"), help="what is trained")
-    parser.add_argument("--rounds", type=int, default=5, help="rounds, after a first that warms up")
+    parser.add_argument("--quick", action="store_true", help="two time steps and one round, for a smoke test")
+    parser.add_argument("--detector", type=Path, help="trained detector; by default the bundled one")
+    parser.add_argument(
+        "--preset", default="small", choices=("small", "resnet50"), help="size of the trained network"
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="rounds after the warm-up")
     parser.add_argument("--json", type=Path, help="file to write")
     options = parser.parse_args()
     if options.quick:
