@@ -80,7 +80,7 @@ def test_success_failure_and_step_limit_are_told_apart():
     assert [o.kind for o in outcomes] == ["", "object left the workspace", OUT_OF_STEPS]
 
 
-def test_the_player_is_asked_for_running_episodes_only():
+def test_the_rollout_policy_is_asked_for_running_episodes_only():
     player = RolloutPolicy()
     play([Env({"success": True}), Env({}, {}, {})], [0, 1], player)
     assert player.num_envs == 2

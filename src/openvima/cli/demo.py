@@ -28,7 +28,7 @@ def main(
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1, L2, L3 or L4; by default the task's first.
-        policy: oracle, openvima-small (trained, comes with the package), random, untrained, a preset, the
+        policy: oracle, openvima-small (bundled), random, untrained, a preset, the
             folder of a training run, a published file, an id on the Hugging Face Hub, or a policy server
             (ws://HOST:PORT).
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.

@@ -67,9 +67,9 @@ def main(
         difficulty: easy, as for all published results, medium or hard.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all.
-        boxes: Detector of detected_boxes, which it implies: "detector" for the one that
-            comes with the package, detector=FOLDER for one that `openvima detector train` made, or
-            MODULE:FUNCTION or FILE.py:FUNCTION, which makes an ObjectExtractor.
+        boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
+            detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
+            FILE.py:FUNCTION, which makes an ObjectExtractor.
         in_context: Also prompt with a demonstration of each episode, "Follow this motion: …";
             by default of twist, follow_motion and follow_order, for policies trained without these tasks.
         batch: Episodes that are run together, with batched inference.

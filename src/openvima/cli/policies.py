@@ -18,7 +18,7 @@ FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
     "positions: position tables and learned tokens; images: with the layer that joins tool and image",
-    "The sizes are named after the trunk. `openvima policies show NAME` tells more of one.",
+    "The sizes are named after the decoder. `openvima policies show NAME` tells more of one.",
 )
 DEFAULT = "list"  # what `openvima policies` does without a further word
 

@@ -30,7 +30,7 @@ def main(
     Example: openvima serve runs/first --port 8000
 
     Args:
-        policy: openvima-small (trained, comes with the package), the folder of a training run, a published
+        policy: openvima-small (bundled), the folder of a training run, a published
             file, an id on the Hugging Face Hub, a preset, random or untrained.
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token.

@@ -68,7 +68,7 @@ Report = Callable[[GenerationProgress], None]
 def reporter(
     report: Report | None, blocks: Sequence[Block], missing: Sequence[Block]
 ) -> Callable[[Counts], None]:
-    """Make of a caller's `report` what an engine calls; it is told at once what was there before.
+    """Make of a caller's `report` what an engine calls; it first receives what was there before.
 
     Args:
         report: The caller's, if it wants to know.

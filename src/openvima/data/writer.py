@@ -15,7 +15,7 @@ from openvima.data.manifest import BROKEN_NAME, INDEX_NAME, MANIFEST_NAME
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
 
-COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few per cent
+COMPRESSION_LEVELS = {"zstd": 3}  # higher ones are much slower for a few percent
 BUFFER_BYTES = 1 << 20  # Arrow writes an episode in 150 pieces
 
 

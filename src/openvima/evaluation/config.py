@@ -56,7 +56,7 @@ class EvaluationConfig:
         ablations: Input ablations to evaluate besides, for each policy that reads prompts: names of
             `openvima.evaluation.ablations.ABLATIONS`; "random" and "oracle", which are added as policies; or
             ("all",). "in_context", which prompts with a demonstration of the episode, is not part of "all".
-        boxes: For the ablation "detected_boxes": "detector" for the one that comes with the package,
+        boxes: For the ablation "detected_boxes": "detector" for the bundled one,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
         engine: "processes" of this machine, or "ray".

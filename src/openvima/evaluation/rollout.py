@@ -80,7 +80,7 @@ class _EpisodeSlot:
 def play(
     envs: Sequence[TabletopEnv],
     seeds: Sequence[int],
-    player: RolloutPolicy,
+    policy: RolloutPolicy,
     *,
     after_step: Callable[[TabletopEnv], None] | None = None,
 ) -> list[EpisodeOutcome]:
@@ -89,7 +89,7 @@ def play(
     Args:
         envs: Environments of one task and level.
         seeds: Seed of the episode of each.
-        player: Decides the actions.
+        policy: Decides the actions.
         after_step: Called with an environment after each of its steps, for recording.
 
     Returns:
@@ -99,12 +99,12 @@ def play(
         PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
     """
     slots = [_EpisodeSlot(env, seed) for env, seed in zip(envs, seeds, strict=True)]
-    player.begin(envs)
+    policy.begin(envs)
     while any(slot.outcome is None for slot in slots):
-        decisions = player.decide([slot.observation for slot in slots])
+        decisions = policy.decide([slot.observation for slot in slots])
         if len(decisions) != len(slots):
             raise PolicyError(f"the policy gave {len(decisions)} actions for {len(slots)} observations.")
-        near_ties = player.near_ties() or [False] * len(slots)
+        near_ties = policy.near_ties() or [False] * len(slots)
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:
                 slot.near_ties += is_near_tie

@@ -49,7 +49,7 @@ def write_report(
         command: The command that repeats the evaluation; by default put together from `results.config`.
         metrics: `metrics.jsonl` of the training run, for its curves.
         runs: Folders of training runs, for theirs.
-        clips: Filmed episodes.
+        clips: Recorded episodes.
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
 

@@ -103,7 +103,7 @@ def sample_adjective_example(
     return AdjectiveExample(comparison_text(num_comparisons), fills, asked, other)
 
 
-def place_base_and_twins(
+def place_base_and_pair(
     table: TableSampler, example: AdjectiveExample, *, num_distractors: int, difficulty: str
 ) -> tuple[Placement, Placement, list[Placement]]:
     """Place a base, the target and its twin, and distractors of other shapes.

@@ -14,7 +14,7 @@ from openvima.tasks.comparisons import (
     MEANINGS,
     NUM_COMPARISONS,
     comparison_text,
-    place_base_and_twins,
+    place_base_and_pair,
     sample_adjective_example,
 )
 from openvima.tasks.into_base import into_base
@@ -54,7 +54,7 @@ def sample(
     example = sample_adjective_example(
         table, adjectives=adjectives, meanings=meanings, num_comparisons=num_comparisons
     )
-    base, target, others = place_base_and_twins(
+    base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(

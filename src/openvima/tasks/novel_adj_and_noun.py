@@ -15,7 +15,7 @@ from openvima.tasks.comparisons import (
     MEANINGS,
     NUM_COMPARISONS,
     comparison_text,
-    place_base_and_twins,
+    place_base_and_pair,
     sample_adjective_example,
 )
 from openvima.tasks.into_base import into_base
@@ -60,7 +60,7 @@ def sample(
     )
     noun, base_noun = choose_words(table, "nouns", nouns, count=2)
     introductions = in_any_order(table, INTRODUCTIONS)
-    base, target, others = place_base_and_twins(
+    base, target, others = place_base_and_pair(
         table, example, num_distractors=num_distractors, difficulty=difficulty
     )
     prompt = Prompt.parse(

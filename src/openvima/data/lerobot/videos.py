@@ -1,4 +1,4 @@
-"""The pictures of one feature as H.264 films, many episodes in a file.
+"""The images of one feature as H.264 videos, many episodes per file.
 
 Measured on 451 steps of 13 tasks: halving the resolution of colours (yuv420p) alone leaves 35 dB, with errors
 of up to 185 of 255 levels on textures, however fine the quantiser. Without that and without loss (yuv444p,
@@ -41,7 +41,7 @@ class VideoPlace:
 
 
 class NumberedVideo:
-    """The films of one feature; a context manager.
+    """The videos of one feature; a context manager.
 
     Each episode begins with a frame that needs no other, so reading one never decodes those before. There are
     no frames out of order, and encoders have one thread: the same pictures give the same bytes.
