@@ -1,10 +1,10 @@
-"""How close our physics is to that of the public benchmark: where bodies lie after recorded actions.
+"""Agreement of the physics with VIMA-Bench: final poses of bodies after recorded actions.
 
     python benchmarks/dynamics.py --episodes FILE --assets DIR [--json FILE]
 
 Replays every step of recorded episodes from its recorded start, with the original asset pack and the
-benchmark's inexact arm (`compat`). `oracle` steps are clean solutions; `perturbed` ones turn and shift
-places, put objects onto others and pick beside them. A body counts as moved from 5 mm on. Steps in which
+benchmark's inexact arm (`compat`). `oracle` steps are clean solutions; `perturbed` ones rotate and shift
+place poses, stack objects and miss picks. A body counts as moved from 5 mm on. Steps in which
 other bodies moved, or one ended more than 20 mm elsewhere, are listed one by one.
 """
 

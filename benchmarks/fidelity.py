@@ -1,4 +1,4 @@
-"""How close our images are to those of the public benchmark, task by task.
+"""Agreement of images with VIMA-Bench, by task.
 
     python benchmarks/fidelity.py --scenes DIR --assets DIR [--json FILE]
 
@@ -6,8 +6,8 @@ Draws recorded scenes and all their prompt images with the original asset pack, 
 bodies of at least 30 pixels (segmentation, intersection over union) and whole images (mean absolute
 difference of colours, of 255). Bodies that the benchmark let overlap at equal heights count as one.
 
-The recordings do not say where bodies lie in scenes that a prompt shows. Those poses are recovered from the
-images themselves, and the agreement is given apart, as "recovered": it tells less.
+The recordings lack the poses of bodies in prompt scenes. These are recovered from the images, and their
+agreement is listed separately as "recovered".
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""How many evaluation episodes of each task and level the oracle solves.
+"""Success of the oracle on the evaluation episodes of each task and level.
 
     python benchmarks/oracle.py [--episodes N] [--workers K] [--levels L1,L2,…] [--out DIR] [--record]
 
-Plays them with `openvima evaluate`'s machinery (an interrupted run goes on), prints every failure with its
-seed and reason, and with `--record` writes the counts to where `openvima tasks` shows them.
+Runs them with `openvima evaluate` (resumable), prints every failure with its seed and reason, and with
+`--record` writes the counts for `openvima tasks`.
 """
 
 import argparse

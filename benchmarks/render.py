@@ -1,9 +1,9 @@
-"""How long images take: observations, prompt images and label rasters, on one core.
+"""Render times of observations, prompt images and label rasters, on one core.
 
     python benchmarks/render.py [--assets procedural|CHECKOUT] [--rounds R] [--json FILE]
 
 One observation is RGB and segmentation of both views. Scenes are objects at random places: few small ones,
-the bodies with most triangles, and so on. Compilation and the making of shapes and textures are not counted.
+the bodies with most triangles, and so on. Compilation and building of shapes and textures are excluded.
 """
 
 import argparse

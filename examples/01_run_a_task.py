@@ -1,4 +1,4 @@
-"""Run one task with `python examples/01_run_a_task.py`: read the prompt, let the oracle act, see the end."""
+"""Run one task with `python examples/01_run_a_task.py`: print the prompt and execute the oracle's action."""
 
 import openvima
 
@@ -11,7 +11,7 @@ for part in env.unwrapped.prompt.sequence():  # text and images in reading order
 print("Front view:", observation["rgb"]["front"].shape, observation["rgb"]["front"].dtype)
 print("Objects in view:", sorted(set(observation["segm"]["top"].ravel().tolist()) - {0, 1}))
 
-decision = env.unwrapped.oracle_decision()  # the scripted solver; a policy sees only prompt and observation
+decision = env.unwrapped.oracle_decision()  # the scripted oracle; a policy gets prompt and observation
 print("Pick at", decision.action.pose0_position, "place at", decision.action.pose1_position)
 
 observation, reward, terminated, truncated, info = env.step(decision.action.to_arrays())

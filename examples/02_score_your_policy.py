@@ -1,8 +1,8 @@
-"""Play episodes with a policy of your own: anything with `reset(prompts)` and `act(observations)`.
+"""Roll out your own policy: anything with `reset(prompts)` and `act(observations)`.
 
-Run it with `python examples/02_score_your_policy.py`. This policy never reads the prompt: it puts the second
-largest object in view into the largest, which is right about every second time. The loop over steps is
-written out; `custom_policy.py` has a policy that reads the prompt, and is scored in one line.
+Run it with `python examples/02_score_your_policy.py`. This policy ignores the prompt and puts the second
+largest visible object into the largest, which solves about half of the episodes. The loop over steps is
+explicit; `custom_policy.py` has a policy that uses the prompt, evaluated in one line.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ class IntoTheLargest:
     """Puts the second largest object into the largest."""
 
     def reset(self, prompts):
-        """Begin a batch of episodes; a real policy would encode the prompts here."""
+        """Start a batch of episodes; a real policy encodes the prompts here."""
 
     def act(self, observations):
         """Return an action for each observation; None stands for an episode that is over."""
@@ -28,17 +28,17 @@ class IntoTheLargest:
         largest = ids[np.argsort(-counts, kind="stable")][:2]
         points = [np.argwhere(segm == i).mean(axis=0)[::-1] for i in largest]  # column, row
         place, pick = unproject(np.array([points[0], points[-1]]), TOP)[:, :2].astype(np.float32)
-        turn = np.array([0, 0, 0, 1], np.float32)
+        rotation = np.array([0, 0, 0, 1], np.float32)
         return {
             "pose0_position": pick,
-            "pose0_rotation": turn,
+            "pose0_rotation": rotation,
             "pose1_position": place,
-            "pose1_rotation": turn,
+            "pose1_rotation": rotation,
         }
 
 
 def score(policy, task, level, episodes):
-    """Play episodes one after the other and return the share of solved ones."""
+    """Roll out episodes and return the success rate."""
     env = openvima.make(task, level=level, domain="eval").unwrapped
     solved = 0
     for seed in range(episodes):

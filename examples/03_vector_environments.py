@@ -1,6 +1,6 @@
-"""Play several episodes at once, each in a process of its own: `python examples/03_vector_environments.py`.
+"""Run several environments in worker processes: `python examples/03_vector_environments.py`.
 
-The sub-environments have different tasks and prompts; one policy decides for all of them.
+The sub-environments have different tasks and prompts; one policy acts in all of them.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ TASKS = ["visual_manipulation", {"task": "rotate", "level": "L2"}]  # the others
 
 
 def play_round(envs, policy, seeds):
-    """Play one episode in every sub-environment; return which were solved."""
+    """Run one episode in every sub-environment; return which were solved."""
     observations, _ = envs.reset(seed=seeds)
-    policy.reset(envs.get_attr("prompt"))  # text and images, one prompt a sub-environment
+    policy.reset(envs.get_attr("prompt"))  # one prompt per sub-environment
     solved, running = np.zeros(envs.num_envs, bool), np.ones(envs.num_envs, bool)
     while running.any():
-        rows = list(iterate(envs.observation_space, observations))  # one observation a sub-environment
+        rows = list(iterate(envs.observation_space, observations))  # one observation per sub-environment
         actions = policy.act([row if running[i] else None for i, row in enumerate(rows)])
-        # An episode that is over is followed by another, which stands idle until the round is over.
+        # A finished episode is followed by another one, which waits for the end of the round.
         observations, rewards, terminated, truncated, _ = envs.step(stack_actions(actions))
         solved |= running & (rewards == 1)
         running &= ~(terminated | truncated)
@@ -29,7 +29,7 @@ def play_round(envs, policy, seeds):
 
 
 def main():
-    """Play eight rounds with a policy that acts at random."""
+    """Run eight rounds with a random policy."""
     envs = openvima.make_vec(TASKS, 4, vectorization_mode="async", level="L1", domain="eval")
     policy = load_policy("random", seed=0)  # or the folder of a run that `openvima train` wrote
     try:

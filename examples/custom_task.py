@@ -12,11 +12,11 @@ from openvima.tasks import TableSampler, register_task
 
 TEMPLATE = "Put the {dragged_obj} between the {first_obj} and the {second_obj}."
 TOLERANCE = Tolerance(position_m=0.05)
-GAP_M = (0.3, 0.6)  # between the two others: wide enough for a third, near enough to be seen as a pair
+GAP_M = (0.3, 0.6)  # between the two others: wide enough for a third
 
 
 def pool(objects: str, textures: str) -> Pool:
-    """Things to move of one set of shapes and one of textures; nothing is fixed to the table."""
+    """Movable objects of one set of shapes and one of textures, without bases."""
     return Pool(OBJECT_SETS[objects], (), TEXTURE_SETS[textures], ())
 
 
@@ -39,11 +39,11 @@ def sample(table: TableSampler, *, tolerance_m: float = TOLERANCE.position_m) ->
 
     first, second = table.place("neighbour", draw, count=2, tries=20)
     if not GAP_M[0] < first.pose.planar_distance(second.pose) < GAP_M[1]:
-        raise SamplingError("the neighbours are too near or too far")  # the sampler simply draws again
+        raise SamplingError("the neighbours are too near or too far")  # resampled
     middle = Pose.planar((first.pose.x + second.pose.x) / 2, (first.pose.y + second.pose.y) / 2)
     dragged = table.place_one("dragged object", draw, reject=lambda p: p.pose.planar_distance(middle) < 0.15)
     if len({(p.object, p.texture) for p in (first, second, dragged)}) < 3:
-        raise SamplingError("two of the three look the same")
+        raise SamplingError("two of the three are identical")
     return Problem(
         scene=table.scene(),
         prompt=Prompt.parse(

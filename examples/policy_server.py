@@ -1,4 +1,4 @@
-"""A policy server without openvima; any language that speaks WebSocket and MessagePack can do the same.
+"""A policy server without openvima; any language with WebSocket and MessagePack will do.
 
 Run `python examples/policy_server.py 8000`, then `openvima evaluate --policy mine=ws://127.0.0.1:8000`.
 """
@@ -19,7 +19,7 @@ def _unpack(m):
 
 
 def act(seen):
-    """Put the second largest object in view into the largest."""
+    """Put the second largest visible object into the largest."""
     ids, counts = np.unique(seen["segm"]["top"], return_counts=True)
     largest = ids[np.argsort(-np.where((ids > 1) & (ids < 255), counts, 0))][:2]  # 0 and 1 are the table
     place, pick = (np.argwhere(seen["segm"]["top"] == i).mean(axis=0) / 251 + (0.25, -0.51) for i in largest)
@@ -29,7 +29,7 @@ def act(seen):
 
 
 def serve_client(connection):
-    """Say what is served, then answer requests; the prompts, which come with "reset", are not read here."""
+    """Send the handshake, then answer requests; the prompts of "reset" are ignored."""
     connection.send(msgpack.packb({"protocol": "openvima-policy/1", "policy": {"name": "into-the-largest"}}))
     for request in (msgpack.unpackb(data, object_hook=_unpack) for data in connection):
         actions = [seen and act(seen) for seen in request.get("observations", [])]

@@ -20,7 +20,7 @@ def blocks(*poses: tuple[float, float, float]) -> World:
 
 
 @pytest.mark.parametrize("heading_rad", [0.0, 0.7, math.pi / 2, -2.5])
-def test_a_block_is_pushed_to_just_before_the_end_and_lies_flat_against_the_blade(heading_rad) -> None:
+def test_a_block_is_pushed_to_just_before_the_end_and_lies_flat_against_the_spatula(heading_rad) -> None:
     v = np.array([math.cos(heading_rad), math.sin(heading_rad)])
     start = np.array([0.5, 0.0]) - 0.1 * v
     end = start + 0.2 * v
@@ -81,7 +81,7 @@ def test_compat_ends_three_millimetres_earlier() -> None:
 
 
 @pytest.mark.parametrize("y", [0.0, 0.02])
-def test_a_blade_that_comes_down_on_a_block_nudges_it_forward_and_pushes_it_on(y) -> None:
+def test_a_spatula_that_comes_down_on_a_block_nudges_it_forward_and_pushes_it_on(y) -> None:
     world = blocks((0.614, y, 0.8))  # the spatula comes down at 0.62
     execution = world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
     assert execution.completed
@@ -91,14 +91,14 @@ def test_a_blade_that_comes_down_on_a_block_nudges_it_forward_and_pushes_it_on(y
     assert pose.z == pytest.approx(0.014, abs=2e-4)
 
 
-def test_a_blade_that_comes_down_on_the_side_of_a_block_nudges_it_sideways() -> None:
+def test_a_spatula_that_comes_down_on_the_side_of_a_block_nudges_it_sideways() -> None:
     world = blocks((0.618, 0.03, 0.4))
     before = world.scene[4].pose
     world.execute(Action.planar((0.6, 0.0), (0.5, 0.0)))
     assert 0.01 < world.scene[4].pose.planar_distance(before) < 0.02
 
 
-def test_a_block_just_behind_the_blade_is_left_alone() -> None:
+def test_a_block_just_behind_the_spatula_is_left_alone() -> None:
     behind = 0.02 + 0.0025 + 0.015 + 0.002  # run-up, half a spatula, half a block, 2 mm of air
     world = blocks((0.6 + behind, 0.0, 0.0))
     before = world.scene
@@ -152,7 +152,7 @@ def test_fixed_bodies_are_not_pushed() -> None:
     ("x", "y", "yaw_rad"),
     [(0.4578, -0.1225, -2.0892), (0.4553, -0.1202, -2.2721), (0.4595, -0.1253, -2.3764)],
 )
-def test_a_block_caught_between_blade_and_wall_is_not_flung_away(x, y, yaw_rad) -> None:
+def test_a_block_caught_between_spatula_and_wall_is_not_flung_away(x, y, yaw_rad) -> None:
     fixed = (("container", 0.2866, -0.2002, -0.6),)
     scene = table(("small block", x, y, yaw_rad), fixed=fixed, end_effector="spatula")
     world = World(scene, ASSETS)
@@ -183,7 +183,7 @@ def test_riding_bodies_are_watched_on_their_way() -> None:
     assert len(seen) > 20
 
 
-def test_compat_moves_the_blade_in_a_bow() -> None:
+def test_compat_moves_the_spatula_in_a_bow() -> None:
     # The straight way passes 35 mm beside the block's nearer side; the arm's bow leads 33 mm towards it, and
     # half the spatula's width more.
     scene = table(("small block", 0.65, 0.1, 0.0), end_effector="spatula")

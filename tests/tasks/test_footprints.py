@@ -57,10 +57,10 @@ def test_a_turned_square_reaches_farther() -> None:
 
 
 def test_the_box_around_a_turned_square_reaches_farther_than_the_square() -> None:
-    blade = Rectangle(0, 0, 0, 0.0025, 0.025)
+    spatula = Rectangle(0, 0, 0, 0.0025, 0.025)
     turned = Rectangle(0.02, 0.042, math.pi / 4, 0.015, 0.015)
-    assert blade.meets_box_around(turned) and not blade.comes_near(turned)
-    assert not blade.meets_box_around(Rectangle(0.02, 0.047, math.pi / 4, 0.015, 0.015))
+    assert spatula.meets_box_around(turned) and not spatula.comes_near(turned)
+    assert not spatula.meets_box_around(Rectangle(0.02, 0.047, math.pi / 4, 0.015, 0.015))
 
 
 def test_a_zone_is_a_rectangle() -> None:

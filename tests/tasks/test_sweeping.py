@@ -51,7 +51,7 @@ def pushed_to(sweep: Sweep) -> tuple[float, float]:
 
 
 def covered(sweep: Sweep) -> Rectangle:
-    """What the blade passes over, and a block in front of its middle, without any margin."""
+    """What the spatula passes over, and a block in front of its middle, without any margin."""
     dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
     length = math.hypot(dx, dy)
     back, front = -0.0225, length - SHORTFALL_M + 0.015
@@ -98,13 +98,13 @@ def test_the_next_block_stops_beside_the_one_swept_before() -> None:
     assert not covered(sweep).comes_near(Rectangle(0.5, 0.0, 0.0, 0.015, 0.015))
 
 
-def test_neighbours_too_close_for_the_blade_are_parted_first() -> None:
+def test_neighbours_too_close_for_the_spatula_are_parted_first() -> None:
     problem = problem_with({4: (0.65, -0.1), 5: (0.65, -0.066)}, {})
     x, y = pushed_to(plan(problem))
     assert x > ZONE.x + ZONE.size_x / 2 + 0.02 or abs(y) > ZONE.size_y / 2 + 0.02  # none goes in
 
 
-def test_with_a_neighbour_beside_the_blade_it_comes_down_a_little_aside() -> None:
+def test_with_a_neighbour_beside_the_spatula_it_comes_down_a_little_aside() -> None:
     sweep = plan(problem_with({4: (0.65, 0.0)}, {5: (0.69, 0.04)}))
     dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
     aside_m = (dx * (0.0 - sweep.start[1]) - dy * (0.65 - sweep.start[0])) / math.hypot(dx, dy)
@@ -113,21 +113,21 @@ def test_with_a_neighbour_beside_the_blade_it_comes_down_a_little_aside() -> Non
     assert sweep.end[0] < ZONE.x
 
 
-def test_the_blade_comes_down_clear_of_the_box_around_a_turned_neighbour() -> None:
-    # The simulation shifts a block off the blade's place by the box around it, seen from the blade.
+def test_the_spatula_comes_down_clear_of_the_box_around_a_turned_neighbour() -> None:
+    # The simulation shifts a block off the spatula's place by the box around it, seen from the spatula.
     problem = problem_with({4: (0.6938, 0.0596), 5: (0.7478, 0.0365)}, {}, yaw_rad=math.radians(72))
     sweep = plan(problem)
     other = {4: 5, 5: 4}[sweep.goal.object_id]
     dx, dy = sweep.end[0] - sweep.start[0], sweep.end[1] - sweep.start[1]
     length = math.hypot(dx, dy)
-    blade = Rectangle(
+    spatula = Rectangle(
         sweep.start[0] - 0.02 * dx / length,
         sweep.start[1] - 0.02 * dy / length,
         math.atan2(dy, dx),
         0.0025,
         0.025,
     )
-    assert not blade.meets_box_around(Rectangle.of_box(problem.scene[other].pose, 0.03, 0.03))
+    assert not spatula.meets_box_around(Rectangle.of_box(problem.scene[other].pose, 0.03, 0.03))
 
 
 @pytest.mark.parametrize(("y", "side"), [(0.15, 1), (-0.18, -1)])
