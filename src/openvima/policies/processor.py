@@ -316,15 +316,12 @@ class Processor:
             layout = self._layout_of(prompt.text, counts, ())
             objects = prompt.objects if layout.order is None else prompt.objects.select(layout.order)
             return _TokenSequence(layout, objects, is_scene, None)
-        tables = prompt.objects.split(prompt.objects_per_image)
-        images = [tables[number] for number in in_text]
-        num_visible = np.array([image.masks.sum(axis=0) for image in images], np.int64).reshape(
-            -1, len(VIEWS)
-        )
-        slots = tuple(num_visible.max(axis=0, initial=0).tolist())
+        ends = np.cumsum(prompt.objects_per_image)
+        rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
+        image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+        ordered = prompt.objects.select(np.concatenate([np.zeros(0, np.int64), *rows]))
+        objects, slots = _compact(ordered, image, len(rows))
         layout = self._layout_of(prompt.text, counts, slots)
-        padded = [_compact(image, max(slots)) for image in images]
-        objects = ObjectTable.concatenate(padded) if padded else prompt.objects.select(slice(0))
         mask, is_image = layout.is_word.copy(), ~layout.is_word
         mask[is_image] = objects.masks[layout.entries[is_image], layout.parts[is_image]]
         return _TokenSequence(layout, objects, is_scene, mask)
@@ -423,16 +420,24 @@ def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
     return _reorder_views(objects, order)
 
 
-def _compact(image: ObjectTable, count: int) -> ObjectTable:
-    """Move the visible objects of an image to the front of each view, in so many slots."""
-    order = np.argsort(~image.masks, axis=0, kind="stable")[:count]
-    image = _reorder_views(image, order)
-    extra = count - len(image)
+def _compact(objects: ObjectTable, image: np.ndarray, num_images: int) -> tuple[ObjectTable, tuple[int, ...]]:
+    """Move the visible objects of each image to the front of each view, in equally many slots.
 
-    def pad(column: np.ndarray) -> np.ndarray:
-        return np.pad(column, [(0, extra)] + [(0, 0)] * (column.ndim - 1))
-
-    return ObjectTable(pad(image.ids), pad(image.crop_index), pad(image.boxes), pad(image.grasps))
+    Returns:
+        Slots of all images, and how many of them the fullest image takes in each view.
+    """
+    rows = [np.flatnonzero(visible) for visible in objects.masks.T]
+    counts = [np.bincount(image[of_view], minlength=num_images) for of_view in rows]
+    slots = tuple(int(count.max(initial=0)) for count in counts)
+    columns = (objects.crop_index, objects.boxes, objects.grasps)
+    size = num_images * max(slots)
+    compact = [np.zeros((size, *column.shape[1:]), column.dtype) for column in columns]
+    for v, (of_view, count) in enumerate(zip(rows, counts, strict=True)):
+        rank = np.arange(len(of_view)) - (np.cumsum(count) - count)[image[of_view]]
+        slot = image[of_view] * max(slots) + rank
+        for new, old in zip(compact, columns, strict=True):
+            new[slot, v] = old[of_view, v]
+    return ObjectTable(np.full(size, -1), *compact), slots
 
 
 def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:

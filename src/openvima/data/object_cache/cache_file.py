@@ -143,7 +143,8 @@ class CacheFile:
         self._seeds = batch.column("seed").to_numpy()
         self._end_effectors = batch.column("end_effector").to_numpy()
         self._num_images = batch.column("num_images").to_numpy()
-        self._images = batch.column("images")
+        _, offsets, self._packed = batch.column("images").buffers()
+        self._image_offsets: list[int] = np.frombuffer(offsets, np.int64).tolist()
         self._codec = pa.Codec(IMAGE_CODEC)
         height, width = IMAGE_SIZES[self.kind]
         self._shape, self._image_bytes = (-1, 3, height, width), 3 * height * width
@@ -186,7 +187,8 @@ class CacheFile:
     def images(self, row: int) -> np.ndarray:
         """Return the images of one episode, shape (K, 3, height, width), uint8."""
         size = int(self._num_images[row]) * self._image_bytes
-        packed = self._images[row].as_buffer()
+        start, end = self._image_offsets[row : row + 2]
+        packed = self._packed.slice(start, end - start)
         try:
             pixels = self._codec.decompress(packed, decompressed_size=size) if size else b""
             return np.frombuffer(pixels, np.uint8).reshape(self._shape)
