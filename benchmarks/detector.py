@@ -126,7 +126,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "detections_per_frame": round(statistics.mean(found), 2),
         "detect_ms_per_pair": summary(times["detect"], 1e3),
         "extract_objects_ms_per_pair": summary(times["extract"], 1e3),
-        f"training_s_per_step_of_{DEFAULTS.batch}_frames": summary(times["train"], 1.0),
+        f"training_s_per_step_of_{DEFAULTS.loader.batch_size}_frames": summary(times["train"], 1.0),
     }
 
 
