@@ -100,13 +100,13 @@ def test_objects_are_counted_only_on_demand(demos: Path) -> None:
     assert titles == ["level", "steps in an episode", "end effector"]
 
 
-def test_failed_episodes_and_token_caches_are_told(
+def test_failed_episodes_and_object_caches_are_counted(
     demos: Path, tmp_path: Path, made_up: MadeUp, info: ShardInfo
 ) -> None:
     folder = tmp_path / "demos"
     (folder / "failed").mkdir(parents=True)
-    (folder / "tokens" / "objects-v1").mkdir(parents=True)
-    (folder / "tokens" / "objects-v1" / "a.arrow").write_bytes(bytes(1000))
+    (folder / "object_cache" / "objects-v1").mkdir(parents=True)
+    (folder / "object_cache" / "objects-v1" / "a.arrow").write_bytes(bytes(1000))
     for path in (folder / "stack-train-00000.arrow", folder / "failed" / "stack-train-00000.arrow"):
         with ShardWriter(path, info) as writer:
             writer.write(made_up(num_steps=0, num_images=0))

@@ -1,4 +1,4 @@
-"""Playing one shard's episodes with the oracle and writing them; what a worker does."""
+"""Rolling out the oracle for one shard and writing the episodes; the work of one process."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -27,31 +27,31 @@ def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
     with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
         kept = files.enter_context(ShardWriter(block.path, block.info))
         failed: ShardWriter | None = None
-        for num_tried, trial in enumerate(trials(block), start=1):
-            if isinstance(trial, Skipped):
-                skipped.append(trial)
-            elif trial.outcome.success:
-                kept.write(trial, skipped)
+        for num_tried, rollout in enumerate(rollouts(block), start=1):
+            if isinstance(rollout, Skipped):
+                skipped.append(rollout)
+            elif rollout.outcome.success:
+                kept.write(rollout, skipped)
                 num_kept, skipped = num_kept + 1, []
             else:
-                skipped.append(why_skipped(trial))
+                skipped.append(why_skipped(rollout))
                 if block.failed_path is not None:
                     if failed is None:
                         block.failed_path.parent.mkdir(exist_ok=True)
                         failed = files.enter_context(ShardWriter(block.failed_path, block.info))
-                    failed.write(trial)
-            num_redraws += 0 if isinstance(trial, Skipped) else trial.num_redraws
+                    failed.write(rollout)
+            num_redraws += 0 if isinstance(rollout, Skipped) else rollout.num_redraws
             count(num_kept, num_tried, num_redraws)
 
 
-def trials(block: Block) -> Iterator[Demonstration | Skipped]:
-    """Try seeds until enough of them are solved.
+def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:
+    """Roll out seeds until enough of them are solved.
 
     Args:
-        block: Where to look, and how many to find.
+        block: Its seeds and number of episodes.
 
     Yields:
-        What `attempt` makes of each seed; the last one is solved.
+        The result of `attempt` for each seed; the last one is solved.
 
     Raises:
         OracleError: The seeds ran out.
@@ -59,10 +59,10 @@ def trials(block: Block) -> Iterator[Demonstration | Skipped]:
     env = _env(block.info.task, block.info.level, block.env_config)
     num_solved, reason = 0, ""
     for seed in block.seeds:
-        trial = attempt(env, seed)
-        yield trial
-        if isinstance(trial, Skipped) or not trial.outcome.success:
-            reason = (trial if isinstance(trial, Skipped) else why_skipped(trial)).reason
+        rollout = attempt(env, seed)
+        yield rollout
+        if isinstance(rollout, Skipped) or not rollout.outcome.success:
+            reason = (rollout if isinstance(rollout, Skipped) else why_skipped(rollout)).reason
             continue
         num_solved += 1
         if num_solved == block.episodes:
@@ -74,7 +74,7 @@ def trials(block: Block) -> Iterator[Demonstration | Skipped]:
 
 
 def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
-    """Let the oracle play one episode, solved or not; say why if there is nothing to show."""
+    """Roll out one episode, solved or not; return the reason if there is none."""
     try:
         return rollout_oracle(env, seed)
     except SamplingError as error:
@@ -84,7 +84,7 @@ def attempt(env: TabletopEnv, seed: int) -> Demonstration | Skipped:
 
 
 def why_skipped(demo: Demonstration) -> Skipped:
-    """Say why an episode that was not solved is none to learn from."""
+    """Return the reason why an unsolved episode is skipped."""
     kind: SkipKind = "failed" if demo.outcome.failure else "unsolved"
     return Skipped(demo.seed, kind, demo.outcome.reason or f"not solved in {demo.num_steps} steps")
 

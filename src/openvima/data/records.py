@@ -1,4 +1,4 @@
-"""A demonstration: everything that one run of the oracle showed, did and led to."""
+"""A demonstration: observations, actions and outcome of one rollout of the oracle."""
 
 import itertools
 import json
@@ -43,8 +43,8 @@ class Demonstration:
         level: "train", "L1", "L2", "L3" or "L4".
         domain: Domain of the seed.
         seed: The episode's number.
-        num_redraws: Unlucky draws that the sampler threw away before this episode.
-        max_steps: Steps that a policy is given for this episode.
+        num_redraws: Rejected draws of the sampler before this episode.
+        max_steps: Maximal number of steps of a policy.
         prompt: Text and images.
         rgb: View name to images, shape (T + 1, 3, 128, 256), uint8: before the first step and after each.
         segm: View name to object ids, shape (T + 1, 128, 256), uint8.
@@ -90,7 +90,7 @@ class Demonstration:
         return len(self.actions)
 
     def observation(self, step: int) -> dict[str, object]:
-        """Return what the environment showed before action `step` (or at the end, for `step` = T)."""
+        """Return the observation before action `step` (or the last one, for `step` = T)."""
         return {
             "rgb": {view: images[step] for view, images in self.rgb.items()},
             "segm": {view: images[step] for view, images in self.segm.items()},
@@ -108,7 +108,7 @@ class Demonstration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What the oracle saw, and what it did then.
+    """An observation and the action of the oracle.
 
     Args:
         observation: As the environment gives it: "rgb" and "segm" of each view, and "ee".
@@ -162,7 +162,7 @@ def columns_of(demo: Demonstration, buffers: ImageBuffers | None = None) -> Colu
 
 
 def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
-    """Let the oracle play one episode.
+    """Roll out the oracle for one episode.
 
     Args:
         env: The environment; it is reset.

@@ -1,4 +1,4 @@
-"""Drawing the images of demonstrations that were stored without them.
+"""Rendering the images of demonstrations that were stored without them.
 
 The prompt's images follow from the seed, those of the cameras from the stored scenes. Both depend on the code
 that samples and draws, so the result is compared with the content hash of the demonstration as it was seen.
@@ -22,7 +22,7 @@ from openvima.tasks import sample_episode
 
 
 def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demonstration:
-    """Give a demonstration its images back.
+    """Render the images of a demonstration.
 
     Args:
         demo: The demonstration without images, as `decode` gives it.
@@ -52,7 +52,7 @@ def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demon
 def draw_observations(
     scenes: Sequence[Scene], info: ShardInfo
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Draw what the cameras saw of some scenes.
+    """Render the observations of some scenes.
 
     Args:
         scenes: N scenes.
@@ -69,7 +69,7 @@ def draw_observations(
 
 
 def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
-    """Draw the images of a demonstration's prompt.
+    """Render the prompt images of a demonstration.
 
     Args:
         demo: Names the episode; its own prompt is not used.
