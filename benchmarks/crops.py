@@ -104,7 +104,7 @@ def main() -> None:
             "objects": len(pairs.looks),
             "prompt": scene_accuracy(encoder, pairs),
             "again": scene_accuracy(encoder, pairs_again(pairs, pairs.again)),
-            **({"turn": turn_accuracy(encoder, pairs)} if encoder.config.turn_bins else {}),
+            **({"turn": turn_accuracy(encoder, pairs)} if encoder.config.rotation_bins else {}),
         }
         shares = "".join(
             f"{results[name].get(key, float('nan')):>9.1%}" for key in ("prompt", "again", "turn")

@@ -36,7 +36,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.runner import Job
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.rasteriser import Rasteriser
 from policy import random_network, tokenizer_of

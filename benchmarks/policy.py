@@ -39,9 +39,10 @@ from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import preset
 from openvima.policies.batch import HistoryBatch
-from openvima.policies.heads.base import ACTION_WIDTH, ActionTargets
+from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.build import outline_network
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
 from openvima.training.dataset import stack_images
@@ -143,7 +144,7 @@ class Training:
 
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
-        processor = Processor.of(network.config.images, tokenizer_of(network))
+        processor = Processor.of(network.config.inputs, tokenizer_of(network))
         episodes = [preprocess(demo, processor.input_kind) for demo in demos]
         examples, images = stack_images(episodes, processor)
         batch = processor.collate(episodes, [example.base for example in examples])

@@ -27,7 +27,7 @@ from openvima.perception.objects import (
 from openvima.policies.batch import WORD, HistoryBatch, PromptBatch
 from openvima.policies.nn.frame_encoder import FrameEncoderConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-from openvima.policies.nn.trunk import MAX_PLACES
+from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
@@ -226,7 +226,7 @@ class EpisodeReader:
 
     def _check_count(self, count: int) -> None:
         """Refuse what no history has room for; a long history may have less."""
-        limit = MAX_PLACES // (len(VIEWS) if self._reader.layout == "views" else 1) - 1
+        limit = MAX_POSITIONS // (len(VIEWS) if self._reader.layout == "views" else 1) - 1
         if count > limit:
             raise PolicyError(
                 f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 import torch
+from openvima.policies.families.vima import vima
 
 from openvima.policies.config import PolicyConfig
-from openvima.policies.families.common import Size
-from openvima.policies.families.vima import vima
-from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.published import to_published
+from openvima.policies.sizes import Size
 
 VOCABULARY_SIZE = 160
 

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+from openvima.policies.nn.comparison import ComparisonConfig
+
 from openvima.policies import preset
 from openvima.policies.config import PolicyConfig
-from openvima.policies.nn.comparison import ComparisonConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
 
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import preset
-from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
-from openvima.policies.heads.bins import encode_bins
+from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
+from openvima.policies.nn.bins import encode_bins
 from openvima.policies.processor import Processor
 from openvima.scene import Action
 from openvima.training.inverse_dynamics import motion_prompt

@@ -19,9 +19,9 @@ import openvima
 from openvima.perception.objects import observe, whole_frames
 from openvima.policies import preset
 from openvima.policies.batch import WORD
-from openvima.policies.heads.base import ACTION_PARTS, to_unit_range
-from openvima.policies.heads.bins import NUM_BINS, encode_bins
-from openvima.policies.nn.trunk import PrefixConfig
+from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
+from openvima.policies.nn.bins import NUM_BINS, encode_bins
+from openvima.policies.nn.decoder import PrefixConfig
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render import channels_last

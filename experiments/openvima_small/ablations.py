@@ -17,6 +17,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from openvima.policies.families.vima import vima
+from openvima.policies.heads.copying import CopyingConfig
+from openvima.policies.heads.pointing import PointingConfig
 from safetensors.torch import load_file
 
 from openvima.atomic_io import atomic_write_file
@@ -24,20 +27,17 @@ from openvima.cli.progress import progress_bar
 from openvima.data import Dataset
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.policies.base import WEIGHTS_FILE, find_checkpoint
+from openvima.policies.build import build_network
 from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.config import PolicyConfig
-from openvima.policies.families.common import SIZES
-from openvima.policies.families.vima import vima
-from openvima.policies.heads.copying import CopyingConfig
-from openvima.policies.heads.pointing import PointingConfig
-from openvima.policies.network import build_network
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.presets import PRESETS, small
+from openvima.policies.sizes import SIZES
 from openvima.training import TrainingConfig, train
 from openvima.training.recipes import RECIPES
 
-_CROPS = ("images.crop_encoder.", "images.appearance.", "images.turns.")
+_CROPS = ("images.crop_encoder.", "images.appearance.", "images.rotation.")
 _SETTINGS = {
     **{name: value for name, value in RECIPES["small"].items() if not name.startswith("pretraining.")},
     "pretraining.steps": 0,
@@ -71,7 +71,7 @@ class Variant:
 def _without_turns() -> PolicyConfig:
     config = small()
     assert isinstance(config.images, ObjectEncoderConfig)
-    return replace(config, images=replace(config.images, turn_bins=0))
+    return replace(config, images=replace(config.images, rotation_bins=0))
 
 
 def _with_dropout(share: float) -> PolicyConfig:

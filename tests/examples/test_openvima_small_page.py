@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("torch")
 
-from openvima.policies import preset
 from openvima.policies.heads.candidates import FreePoints
+
+from openvima.policies import preset
 from openvima.policies.parameter_counts import policy_size
 from openvima.training.recipes import RECIPES
 

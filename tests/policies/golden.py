@@ -31,9 +31,9 @@ from naive_inputs import (
 )
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectViews, see_nothing
-from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
-from openvima.policies.heads.bins import BinsHead, decode_bins
-from openvima.policies.network import Memory, PolicyNetwork, outline_network
+from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
+from openvima.policies.nn.bins import BinsHead, decode_bins
+from openvima.policies.build import Memory, PolicyNetwork, outline_network
 from openvima.policies.published import config_from_published, from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS
@@ -143,7 +143,7 @@ def encode_prompts(network: PolicyNetwork, prompts: Sequence[PromptInput]) -> Me
     """Encode prompts as a policy does."""
     stack = _stack(network)
     numbers = [stack.add(prompt.objects.crops) for prompt in prompts]
-    return network.encode_prompts(batch_prompts(prompts, numbers), _features(network, stack))
+    return network.encode_prompt(batch_prompts(prompts, numbers), _features(network, stack))
 
 
 def read_histories(
@@ -251,7 +251,7 @@ def _file(name: str) -> Path:
 
 
 def _stack(network: PolicyNetwork) -> ImageStack:
-    return ImageStack(Reader.of(network.config.images).image_size)
+    return ImageStack(Reader.of(network.config.inputs).image_size)
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:
@@ -288,7 +288,7 @@ def _places(
     network: PolicyNetwork, objects: ObjectViews, counts: Sequence[int]
 ) -> list[tuple[int, int, bool]]:
     """Slot, part and validity of the tokens of one image."""
-    reader = Reader.of(network.config.images)
+    reader = Reader.of(network.config.inputs)
     if reader.layout == "frames":
         return [(0, part, True) for part in range(reader.tokens_per_frame_pair)]
     return [

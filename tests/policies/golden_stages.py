@@ -26,10 +26,10 @@ from tests.policies.golden import (
 )
 
 from naive_inputs import WORD, HistoryBatch, Reader, StepInput
-from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, to_unit_range
-from openvima.policies.network import Memory, PolicyNetwork
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
+from openvima.policies.build import Memory, PolicyNetwork
 from openvima.policies.nn.places import Places
-from openvima.policies.nn.trunk import Decoder, PrefixTrunk
+from openvima.policies.nn.decoder import Decoder, PrefixTrunk
 from openvima.render.camera import VIEWS
 
 
@@ -123,7 +123,7 @@ def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -
     for name, view in zip(VIEWS, images, strict=True):
         result[f"prompt.vit.{name}"] = network.encode_images(torch.from_numpy(view)).numpy()
     entries = len(images[0])
-    num_parts = Reader.of(network.config.images).tokens_per_frame_pair if frames else len(VIEWS)
+    num_parts = Reader.of(network.config.inputs).tokens_per_frame_pair if frames else len(VIEWS)
     counts = [1] * num_parts if frames else [view.shape[1] for view in images]
 
     def by_image(tokens_ID: torch.Tensor) -> np.ndarray:

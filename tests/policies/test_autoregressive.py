@@ -12,17 +12,18 @@ from openvima.errors import ConfigError, PolicyError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.families.midas import with_autoregression, with_visual_residual  # noqa: E402
-from openvima.policies.heads.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
-from openvima.policies.heads.base import (  # noqa: E402
+from openvima.policies.config import with_autoregression, with_visual_residual  # noqa: E402
+from openvima.policies.nn.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
+from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ACTION_WIDTH,
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.heads.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
+from openvima.policies.nn.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
@@ -51,7 +52,7 @@ def network(request) -> PolicyNetwork:
 
 def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]:
     """A batch, and the features of its images."""
-    processor = Processor.of(network.config.images)
+    processor = Processor.of(network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     return collate_examples(processor, examples), network.encode_images(images)
 
@@ -61,7 +62,7 @@ def told(network: PolicyNetwork, demonstrations, actions: "torch.Tensor | None" 
     """Scores of all components of all actions, each (B, T, bins), and the batch."""
     batch, features = read(network, demonstrations)
     actions = batch.targets.actions_BTC if actions is None else actions
-    inputs = network(network.encode_prompts(batch.prompts, features), batch.history, features, actions)
+    inputs = network(network.encode_prompt(batch.prompts, features), batch.history, features, actions)
     return network.head.scores(inputs), batch
 
 
@@ -83,7 +84,7 @@ def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(netw
     )
 
     _, features = read(network, demonstrations)
-    memory = network.encode_prompts(batch.prompts, features)
+    memory = network.encode_prompt(batch.prompts, features)
     state, previous = network.begin(memory), torch.zeros_like(batch.targets.actions_BTC[:, :1])
     for step in range(steps_BT.shape[1]):
         has_previous = torch.full_like(steps_BT[:, :1], step > 0)
@@ -122,7 +123,7 @@ def test_a_component_is_told_by_those_before_it_alone(network, demonstrations) -
 def test_the_loss_is_that_of_the_published_head_on_these_scores(network, demonstrations) -> None:
     batch, features = read(network, demonstrations)
     actions = batch.targets.actions_BTC
-    inputs = network(network.encode_prompts(batch.prompts, features), batch.history, features, actions)
+    inputs = network(network.encode_prompt(batch.prompts, features), batch.history, features, actions)
     loss, metrics = network.head.loss(inputs, batch.targets)
     bins_BTC, exists = encode_bins(to_unit_range(actions)), batch.targets.steps_BT
     parts = torch.zeros((), dtype=torch.float64)
@@ -206,7 +207,7 @@ def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -
 
 def test_the_head_alone_cannot_decide(network, demonstrations) -> None:
     batch, features = read(network, demonstrations)
-    memory = network.encode_prompts(batch.prompts, features)
+    memory = network.encode_prompt(batch.prompts, features)
     inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
     with pytest.raises(PolicyError, match=r"call PolicyNetwork\.decide"):
         network.head.decide(inputs)

@@ -10,14 +10,14 @@ torch = pytest.importorskip("torch")
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from openvima.policies.heads.base import (  # noqa: E402
+from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ActionTargets,
     HeadInputs,
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.heads.bins import (  # noqa: E402
+from openvima.policies.nn.bins import (  # noqa: E402
     NUM_BINS,
     BinsConfig,
     BinsHead,

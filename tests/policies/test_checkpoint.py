@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import checkpoint, preset  # noqa: E402
 from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_folder, load_policy  # noqa: E402
+from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
     WEIGHTS_FILE,
@@ -19,7 +20,6 @@ from openvima.policies.checkpoint import (  # noqa: E402
     load_weights,
     save_checkpoint,
 )
-from openvima.policies.network import build_network, outline_network  # noqa: E402
 
 
 @pytest.fixture

@@ -6,8 +6,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
 from openvima.policies.nn.comparison import (  # noqa: E402
     Comparison,
     ComparisonConfig,
@@ -16,6 +14,9 @@ from openvima.policies.nn.comparison import (  # noqa: E402
     earlier,
     others,
 )
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 

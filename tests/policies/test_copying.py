@@ -7,8 +7,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.heads.base import ActionTargets, HeadInputs, Recollection, Remembered  # noqa: E402
 from openvima.policies.heads.candidates import (  # noqa: E402
     candidate_masks,
     candidate_positions,
@@ -16,6 +14,9 @@ from openvima.policies.heads.candidates import (  # noqa: E402
 )
 from openvima.policies.heads.copying import CopyingConfig, CopyingHead  # noqa: E402
 from openvima.policies.heads.pointing import at, turn_of, turned  # noqa: E402
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies.nn.actions import ActionTargets, HeadInputs, Recollection, Remembered  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5
 NUM_FIRST, NUM_SCENE = 3, 2

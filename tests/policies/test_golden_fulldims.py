@@ -28,8 +28,8 @@ from tests.policies.golden import (
 )
 from tests.policies.golden_stages import closed_loop, stages
 
+from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig
-from openvima.policies.network import outline_network
 from openvima.policies.published import config_from_published, to_published
 
 pytestmark = [pytest.mark.slow, needs("fulldims")]

@@ -12,8 +12,8 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file  # noqa: E402
 
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.network import outline_network  # noqa: E402
-from openvima.policies.nn.trunk import PrefixConfig  # noqa: E402
+from openvima.policies.build import outline_network  # noqa: E402
+from openvima.policies.nn.decoder import PrefixConfig  # noqa: E402
 from openvima.policies.published import (  # noqa: E402
     config_from_published,
     from_published,

@@ -24,7 +24,7 @@ from tests.policies.golden import (
 
 from naive_inputs import PromptInput, StepInput
 from openvima.perception.objects import ObjectViews
-from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork
 
 NAMES = ("vima_tiny", "gato_tiny", "flamingo_tiny", "gpt_tiny")
 

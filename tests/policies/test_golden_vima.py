@@ -17,7 +17,7 @@ from tests.policies.golden import (
 )
 from tests.policies.golden_stages import closed_loop, stages
 
-from openvima.policies.heads.bins import NUM_BINS, encode_bins
+from openvima.policies.nn.bins import NUM_BINS, encode_bins
 from openvima.policies.nn.text_encoder import relative_bucket
 
 NAME = "vima_tiny"

@@ -10,14 +10,15 @@ from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.families.common import Size  # noqa: E402
+from openvima.policies.sizes import Size  # noqa: E402
 from openvima.policies.families.flamingo import flamingo  # noqa: E402
 from openvima.policies.families.gato import gato  # noqa: E402
 from openvima.policies.families.gpt import gpt  # noqa: E402
 from openvima.policies.families.midas import midas  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
-from openvima.policies.heads.bins import BinsConfig  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.bins import BinsConfig  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
@@ -74,11 +75,11 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
     with torch.no_grad():  # layers that start at zero stop gradients on their first step
         for parameter in model.parameters():
             parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
-    processor = Processor.of(sizes.images)
+    processor = Processor.of(sizes.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
     features = model.encode_images(images)
-    memory = model.encode_prompts(batch.prompts, features)
+    memory = model.encode_prompt(batch.prompts, features)
     inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
     model.head.loss(inputs, batch.targets)[0].backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())

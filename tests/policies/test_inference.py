@@ -12,10 +12,11 @@ torch = pytest.importorskip("torch")
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
 from openvima.policies.inference import NetworkPolicy, drawing  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
-from openvima.policies.nn.trunk import MAX_PLACES  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
+from openvima.policies.nn.decoder import MAX_POSITIONS  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
@@ -107,7 +108,7 @@ def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
         observations = [[seen_by(row, t, pool) for t in range(step + 1)] for row in rows]
         history, stack = processor.encode_observations(observations, stack=stack)
         features = network.encode_images(torch.from_numpy(stack.images()))
-        memory = network.encode_prompts(batch, features)
+        memory = network.encode_prompt(batch, features)
         taken = np.zeros((len(rows), step + 1, ACTION_WIDTH))
         for place, row in enumerate(rows):
             taken[place, :-1] = [actions[row, t][0] for t in range(step)] or taken[place, :-1]
@@ -321,8 +322,8 @@ def test_a_prompt_longer_than_the_position_table_is_refused(policy, prompts) -> 
 
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
     policy.reset([prompts[0]])
-    with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_PLACES}"):
-        for _ in range(MAX_PLACES):
+    with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_POSITIONS}"):
+        for _ in range(MAX_POSITIONS):
             policy.act([pool[-1]])
 
 

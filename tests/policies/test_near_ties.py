@@ -6,8 +6,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.policies import preset  # noqa: E402
+from openvima.policies.build import build_network
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 

@@ -8,9 +8,9 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.heads.base import from_unit_range, to_unit_range  # noqa: E402
+from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
 from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
@@ -50,13 +50,13 @@ def test_images_and_trunk_of_different_widths_are_refused():
 @pytest.mark.slow
 def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, demonstrations):
     network = build_network(preset(name), seed=0).eval()
-    processor = Processor.of(network.config.images)
+    processor = Processor.of(network.config.inputs)
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
 
     def loss() -> torch.Tensor:
         features = network.encode_images(images)
-        memory = network.encode_prompts(batch.prompts, features)
+        memory = network.encode_prompt(batch.prompts, features)
         inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
         return network.head.loss(inputs, batch.targets)[0]
 

@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.policies import PRESETS, preset  # noqa: E402
-from openvima.policies.network import build_network, outline_network  # noqa: E402
+from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.parameter_counts import PARTS, Count, count_parameters, policy_size  # noqa: E402
 from openvima.policies.presets import FAMILIES  # noqa: E402
 

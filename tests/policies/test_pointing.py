@@ -7,8 +7,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import ConfigError  # noqa: E402
-from openvima.policies.heads.base import ACTION_PARTS, ActionTargets, HeadInputs  # noqa: E402
 from openvima.policies.heads.pointing import (  # noqa: E402
     PointingConfig,
     PointingHead,
@@ -17,6 +15,9 @@ from openvima.policies.heads.pointing import (  # noqa: E402
     turn_of,
     yaw_bin,
 )
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, HeadInputs  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 
 B, T, N, M, D, A = 3, 2, 4, 3, 8, 5

@@ -12,9 +12,9 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import UnknownPolicyError  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.base import Policy  # noqa: E402
-from openvima.policies.heads.bins import BinsConfig  # noqa: E402
+from openvima.policies.nn.bins import BinsConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402
 
 
@@ -132,7 +132,7 @@ def test_padding_changes_nothing(small_sizes, demonstrations) -> None:
     """The same prompt and steps, alone and beside longer ones, give the head the same tokens."""
     model = build_network(small_sizes, seed=4).double().eval()
     chosen = [demonstrations[0], demonstrations[-1]]
-    reader = Reader.of(small_sizes.images)
+    reader = Reader.of(small_sizes.inputs)
     prompts = [reader.read_prompt(demo.prompt) for demo in chosen]
     steps = [read_episode(reader, demo) for demo in chosen]
 
@@ -148,7 +148,7 @@ def test_padding_changes_nothing(small_sizes, demonstrations) -> None:
                 crops.append(step.objects.crops.reshape(-1, 3, 32, 32))
                 first += len(crops[-1])
         features = model.encode_images(torch.from_numpy(np.concatenate(crops)))
-        memory = model.encode_prompts(batch_prompts([prompts[row] for row in rows], numbers), features)
+        memory = model.encode_prompt(batch_prompts([prompts[row] for row in rows], numbers), features)
         history = batch_histories([steps[row] for row in rows], histories)
         actions = torch.full((*history.steps_BT.shape, 12), 0.3, dtype=torch.float64)
         return memory, model(memory, history, features, actions)

@@ -10,13 +10,13 @@ import yaml  # noqa: E402
 
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
 from openvima.policies import PRESETS, preset  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.families.common import SIZES  # noqa: E402
-from openvima.policies.heads.bins import NUM_BINS  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.nn.bins import NUM_BINS  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.vit import VitConfig  # noqa: E402
 from openvima.policies.presets import FAMILIES, SIZE_NAMES  # noqa: E402
+from openvima.policies.sizes import SIZES  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 
 

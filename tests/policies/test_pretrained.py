@@ -13,9 +13,9 @@ from openvima.errors import CheckpointError, MissingExtraError, PolicyError, Unk
 from openvima.evaluation.sources import weights_hash  # noqa: E402
 from openvima.policies import Policy, RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.base import TOKENIZER_FOLDER  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, load_network, load_pretrained  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
 from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402

@@ -10,18 +10,19 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import CheckpointError  # noqa: E402
-from openvima.policies import preset  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.families.common import Size  # noqa: E402
 from openvima.policies.families.flamingo import flamingo  # noqa: E402
 from openvima.policies.families.gato import gato  # noqa: E402
 from openvima.policies.families.gpt import gpt  # noqa: E402
 from openvima.policies.families.vima import vima  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network, outline_network  # noqa: E402
+
+from openvima.errors import CheckpointError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.build import build_network
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.nn.decoder import DecoderConfig, PrefixConfig  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork, outline_network  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
-from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
 from openvima.policies.published import (  # noqa: E402
     config_from_published,
@@ -29,6 +30,7 @@ from openvima.policies.published import (  # noqa: E402
     load_published,
     to_published,
 )
+from openvima.policies.sizes import Size  # noqa: E402
 
 MEMBERS = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 DECODER_NAMES = {

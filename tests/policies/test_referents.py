@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from naive_inputs import Reader, batch_prompts  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.referents import referents  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
@@ -57,10 +57,10 @@ def prompt():
 
 @torch.no_grad()
 def _encoded(network, prompt):
-    read = Reader.of(network.config.images).read_prompt(prompt)
+    read = Reader.of(network.config.inputs).read_prompt(prompt)
     images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
     batch = batch_prompts([read], [np.arange(len(images)).reshape(2, -1)])
-    return network.encode_prompts(batch, network.encode_images(images)), batch
+    return network.encode_prompt(batch, network.encode_images(images)), batch
 
 
 def test_a_noun_looks_as_the_picture_that_explained_it(network, prompt):

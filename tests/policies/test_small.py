@@ -14,9 +14,10 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.heads.base import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
@@ -54,11 +55,11 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
 
     Actions are those of the demonstrations, or others that were taken.
     """
-    processor = Processor.of(network.config.images)
+    processor = Processor.of(network.config.inputs)
     examples, images = examples_of(demos, processor)
     batch = collate_examples(processor, examples)
     features = network.encode_images(images)
-    memory = network.encode_prompts(batch.prompts, features)
+    memory = network.encode_prompt(batch.prompts, features)
     actions_BTC = batch.targets.actions_BTC if taken_BTC is None else taken_BTC
     inputs = network(memory, batch.history, features, actions_BTC)
     return inputs, network.head.decide(inputs)
@@ -67,11 +68,11 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
 @torch.no_grad()
 def read_stepwise(network: PolicyNetwork, demo: Demonstration) -> list[HeadInputs]:
     """The same as one episode is played, with the actions of the demonstration."""
-    processor = Processor.of(network.config.images)
+    processor = Processor.of(network.config.inputs)
     (example,), images = examples_of([demo], processor)
     batch = collate_examples(processor, [example])
     features = network.encode_images(images)
-    memory = network.encode_prompts(batch.prompts, features)
+    memory = network.encode_prompt(batch.prompts, features)
     state, given = network.begin(memory), []
     actions = torch.cat([torch.zeros(1, 1, 12), batch.targets.actions_BTC], dim=1)
     for t in range(demo.num_steps):
@@ -210,10 +211,10 @@ def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tel
     )
     told = []
     for prompt in (frames, with_object):
-        batch, stack = Processor.of(network.config.images).encode_prompts([prompt])
+        batch, stack = Processor.of(network.config.inputs).encode_prompts([prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
-            scenes = network.encode_prompts(batch, features).scenes
+            scenes = network.encode_prompt(batch, features).scenes
             shown = network._shown(
                 batch, batch.object_index_BL >= 0, features[batch.crop_index_VS], scenes.appearance_BKA[0]
             )
@@ -234,12 +235,12 @@ def test_motions_show_the_table(demos):
 
 def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):
     demo = demos[3]
-    processor = Processor.of(network.config.images)
+    processor = Processor.of(network.config.inputs)
     prompt = replace(demo.prompt, text="Rotate it 30 degrees.", images={})
     batch, stack = processor.encode_prompts([prompt])
     history, stack = processor.encode_observations([[demo.observation(0)]], stack=stack)
     features = network.encode_images(torch.from_numpy(stack.images()))
-    memory = network.encode_prompts(batch, features)
+    memory = network.encode_prompt(batch, features)
     inputs = network(memory, history, features, torch.zeros(1, 1, 12))
     assert network.head.decide(inputs).isfinite().all()
 
@@ -250,10 +251,10 @@ def test_roles_do_not_follow_from_names_of_textures_and_looks_of_words_do(networ
     memories = []
     for named in (first, *(("green", "purple") if first != "green" else ("purple", "green"))):
         named_prompt = replace(prompt, text=f"Put the {named} object in {rest}")
-        batch, stack = Processor.of(network.config.images).encode_prompts([named_prompt])
+        batch, stack = Processor.of(network.config.inputs).encode_prompts([named_prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
-            memories.append(network.encode_prompts(batch, features))
+            memories.append(network.encode_prompt(batch, features))
     _, green, purple = memories
     torch.testing.assert_close(green.roles_BLD, purple.roles_BLD)
     assert (green.tokens_BLD - purple.tokens_BLD).abs().max() > 1e-3

@@ -13,7 +13,8 @@ pytest.importorskip("transformers")
 
 from naive_inputs import Reader  # noqa: E402
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer, load_t5, tokenizer_for  # noqa: E402
 from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402

@@ -5,7 +5,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError, PolicyError  # noqa: E402
-from openvima.policies.nn.trunk import (  # noqa: E402
+from openvima.policies.nn.decoder import (  # noqa: E402
     Decoder,
     DecoderConfig,
     PrefixConfig,

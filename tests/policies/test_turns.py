@@ -6,10 +6,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.policies.nn.turns import RelativeRotation  # noqa: E402
+
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.policies.nn.turns import RelativeRotation  # noqa: E402
 
 BINS = 72
 FRONT, TOP = 0, 1

@@ -18,8 +18,8 @@ from openvima.evaluation import EvaluationConfig, Results, evaluate  # noqa: E40
 from openvima.evaluation.config import Batch, policy_sources  # noqa: E402
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.presets import preset  # noqa: E402
 from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
 

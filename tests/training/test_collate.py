@@ -12,7 +12,7 @@ from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
-from openvima.policies.heads.base import ACTION_PARTS  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training.dataset import stack_images  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402

@@ -13,7 +13,7 @@ from safetensors.torch import load_file  # noqa: E402
 from openvima.cli.main import main  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
 from openvima.training.schedule import step_seed  # noqa: E402

@@ -9,7 +9,7 @@ from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn import trunk  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
@@ -22,7 +22,7 @@ NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
 def case(request, data):
     """A cache, a network and its processor."""
     sizes = preset(request.param)
-    processor = Processor.of(sizes.images)
+    processor = Processor.of(sizes.inputs)
     return open_object_cache(Dataset(data), processor.input_kind), build_network(sizes, seed=0), processor
 
 
@@ -57,7 +57,7 @@ def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
     tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, as_motion))
     limit = max(motions) - 1
     for module in (sequence_lengths, trunk):
-        monkeypatch.setattr(module, "MAX_PROMPT_PLACES", limit)
+        monkeypatch.setattr(module, "MAX_PROMPT_POSITIONS", limit)
     with pytest.raises(DatasetError, match=r"^episode \d+ of \w+ read as a motion is too long to learn from"):
         sequence_lengths.check_lengths(cache, network, processor, motion_share=1.0)
     if max(tasks) <= limit:
@@ -68,7 +68,7 @@ def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
 
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
     for module in (sequence_lengths, trunk):
-        monkeypatch.setattr(module, "MAX_PLACES", 30)
+        monkeypatch.setattr(module, "MAX_POSITIONS", 30)
     config = TrainingConfig.of(
         {**settings, "preset": "midas-nano", "pretraining.steps": 0, "schedule.checkpoint_every": 1}
     )
@@ -80,7 +80,7 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
 @pytest.mark.slow
 def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
     cache, network, processor = case
-    monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_PLACES", 1)  # so that all are read
+    monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
     before = torch.get_rng_state()
     sequence_lengths.check_lengths(cache, network.train(), processor, motion_share=0.5)
     assert torch.equal(torch.get_rng_state(), before)

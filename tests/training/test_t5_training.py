@@ -11,8 +11,8 @@ pytest.importorskip("transformers")
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.network import build_network  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402

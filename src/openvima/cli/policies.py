@@ -17,7 +17,7 @@ Precision = Literal["float32", "bfloat16", "float16", "float64"]
 FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
-    "positions: position tables and learned tokens; images: with the layer that joins tool and image",
+    "positions: position tables and learned tokens; images: with the fusion of end effector and image",
     "The sizes are named after the decoder. `openvima policies show NAME` tells more of one.",
 )
 DEFAULT = "list"  # what `openvima policies` does without a further word
@@ -53,7 +53,7 @@ def list_(*, as_json: Json = False) -> int:
     _print_table(sizes)
     for name, policy in here.items():
         parameters = _millions(trained[name].whole.total)
-        print(f"\n{name}, bundled checkpoint, {parameters} M parameters")
+        print(f"\n{name}, a trained policy that comes with the package, {parameters} M parameters")
         _print_facts(policy)
     return 0
 
@@ -66,7 +66,7 @@ def show(
     Example: openvima policies show vima-200m
 
     Args:
-        policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a
+        policy: Name of a preset or of a trained policy of the package, a run folder or checkpoint folder, a
             published file, or an id on the Hugging Face Hub.
         as_json: Print JSON.
 
@@ -77,13 +77,16 @@ def show(
     from openvima.policies.bundled import PACKAGED
 
     require_torch("counting parameters")
+    from openvima.policies.config import config_to_dict
     from openvima.policies.parameter_counts import policy_size
 
     config, packaged = _config(policy), PACKAGED.get(policy)
     size = policy_size(config)
     if as_json:
         facts = _facts(packaged) if packaged else {}
-        print(json.dumps({"name": policy, **_record(size), **facts, "config": config.to_dict()}, indent=1))
+        print(
+            json.dumps({"name": policy, **_record(size), **facts, "config": config_to_dict(config)}, indent=1)
+        )
         return 0
     import yaml
 
@@ -93,7 +96,7 @@ def show(
     print(f"\n{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
     for part, count in {**size.parts, "total": size.whole}.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
-    print(f"\n{yaml.safe_dump(config.to_dict(), sort_keys=False)}", end="")
+    print(f"\n{yaml.safe_dump(config_to_dict(config), sort_keys=False)}", end="")
     return 0
 
 
@@ -115,7 +118,7 @@ def convert(
 
     Args:
         source: Published file, such as 200M.ckpt, a run folder, of which the best checkpoint is taken, a
-            checkpoint folder, or a bundled checkpoint.
+            checkpoint folder, or a trained policy of the package.
         out: Folder to write to; every `--policy` takes it.
         tokenizer: Folder of the tokenizer of T5, or its id on the Hugging Face Hub; stored with the policy.
         precision: Of the stored weights, whatever the policy computes in later. float16 halves a file of
@@ -170,7 +173,7 @@ def _summary(size: "PolicySize") -> str:
     layers = "1 layer" if size.num_layers == 1 else f"{size.num_layers} layers"
     whole = size.whole
     return (
-        f"{size.family}, width {size.width}, {layers}, {size.num_heads} heads; "
+        f"{size.architecture}, width {size.width}, {layers}, {size.num_heads} heads; "
         f"{_millions(whole.total)} M parameters, of which {_millions(whole.trainable)} M are trained"
     )
 
@@ -191,7 +194,7 @@ def _print_facts(policy: "PackagedPolicy") -> None:
 
 def _record(size: "PolicySize") -> dict[str, object]:
     return {
-        "family": size.family,
+        "architecture": size.architecture,
         "width": size.width,
         "layers": size.num_layers,
         "heads": size.num_heads,
@@ -218,11 +221,11 @@ def _print_table(sizes: dict[str, "PolicySize"]) -> None:
     for name in columns:
         style = "bold" if name in ("preset", "total") else ""
         table.add_column(name, justify="left" if name == "preset" else "right", no_wrap=True, style=style)
-    family = next(iter(sizes.values())).family
+    architecture = next(iter(sizes.values())).architecture
     for name, cells in rows.items():
-        if sizes[name].family != family:
+        if sizes[name].architecture != architecture:
             table.add_section()
-            family = sizes[name].family
+            architecture = sizes[name].architecture
         table.add_row(*(cells[column] for column in columns))
     console.print(table)
     for note in _NOTES:

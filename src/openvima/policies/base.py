@@ -128,8 +128,8 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
                 "for the folder, or work elsewhere for the preset."
             )
         require_torch(f"policy {name_or_run!r}")
+        from openvima.policies.build import build_network
         from openvima.policies.inference import NetworkPolicy
-        from openvima.policies.network import build_network
         from openvima.policies.presets import preset
 
         config = preset("nano" if name_or_run == "untrained" else name_or_run)

@@ -24,11 +24,12 @@ from openvima.policies.base import (
     WEIGHTS_FILE,
     find_checkpoint,
 )
-from openvima.policies.config import PolicyConfig
+from openvima.policies.build import outline_network
+from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
 from openvima.policies.differences import described, listed
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.network import PolicyNetwork, outline_network
-from openvima.policies.published import load_published
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.published.checkpoint import load_published
 from openvima.policies.t5 import T5Tokenizer, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 
@@ -106,7 +107,7 @@ def write_checkpoint(
         "policy": _KIND,
         "openvima": __version__,
         "precision": precision,
-        "config": network.config.to_dict(),
+        "config": config_to_dict(network.config),
     }
     (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
     if isinstance(tokenizer, T5Tokenizer):
@@ -159,7 +160,7 @@ def read_info(folder: Path) -> CheckpointInfo:
     if precision not in _PRECISIONS:
         raise CheckpointError(f"{file}: precision is {precision!r}; allowed: {', '.join(_PRECISIONS)}.")
     try:
-        return CheckpointInfo(PolicyConfig.from_dict(values["config"]), _PRECISIONS[precision])
+        return CheckpointInfo(config_from_dict(values["config"]), _PRECISIONS[precision])
     except ConfigError as error:
         raise CheckpointError(f"{file}: {error}") from error
 
@@ -266,7 +267,7 @@ def _other_size(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torc
 
 
 def _sizes(tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
-    layers = [name.split(".")[2] for name in tensors if name.startswith("trunk.self_blocks.")]
+    layers = [name.split(".")[2] for name in tensors if name.startswith("decoder.self_blocks.")]
     sizes = {"layers": 1 + max(int(layer) for layer in layers)} if layers else {}
     for what, name, axis in (("width", "observation_out.weight", 0), ("words", "prompt.words.weight", 0)):
         if name in tensors and tensors[name].ndim > axis:

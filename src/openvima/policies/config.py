@@ -1,79 +1,71 @@
-"""Sizes of a policy network, as a frozen record that checks itself and travels beside the weights."""
+"""Configs of all architectures: frozen records of sizes that check themselves."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from types import NoneType, UnionType
 from typing import Any, get_args, get_type_hints
 
-from openvima.errors import ConfigError
-from openvima.policies.heads.autoregressive import AutoregressiveConfig
-from openvima.policies.heads.bins import BinsConfig
-from openvima.policies.heads.copying import CopyingConfig
-from openvima.policies.heads.pointing import PointingConfig
-from openvima.policies.nn.comparison import ComparisonConfig
-from openvima.policies.nn.frame_encoder import FrameEncoderConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig
+from openvima.errors import ConfigError, unknown_name
+from openvima.policies.flamingo.config import FlamingoConfig
+from openvima.policies.gato.config import GatoConfig
+from openvima.policies.gpt.config import GptConfig
+from openvima.policies.midas.config import MidasConfig
+from openvima.policies.nn.autoregressive import AutoregressiveConfig
+from openvima.policies.nn.bins import BinsConfig
+from openvima.policies.pointer.config import PointerConfig
+from openvima.policies.vima.config import VimaConfig
+
+PolicyConfig = VimaConfig | GatoConfig | FlamingoConfig | GptConfig | MidasConfig | PointerConfig
+ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind in get_args(PolicyConfig)}
 
 
-@dataclass(frozen=True, slots=True)
-class PolicyConfig:
-    """All sizes of a network. The members of the family differ in `images` and `trunk`.
+def config_to_dict(config: PolicyConfig) -> dict[str, Any]:  # Any: plain YAML values
+    """Return nested dictionaries of plain values, for files; the architecture comes first."""
+    return {"architecture": config.architecture, **asdict(config)}
 
-    Args:
-        images: How images become tokens: object by object, or as whole frames.
-        prompt: Prompt encoder.
-        trunk: How the history is read in the light of the prompt.
-        head: How actions are given: as table bins, as bins one after the other, by pointing, or by
-            pointing with places to copy.
-        action_width: Width of the features of each part of a past action; not used where each component is a
-            token of its own.
-        query_token: Append a learned token to each step's images and act from there; without it the policy
-            acts from its last image token, as the published ones do.
-        comparison: Compare objects with each other and with those of the prompt, and add to their tokens how
-            they differ; None to leave them as they are.
+
+def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whatever a file holds
+    """Build a config from what `config_to_dict` returned.
+
+    Raises:
+        ConfigError: A field is missing or unknown, or the sizes contradict each other.
     """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"policy is {values!r}; it must be a mapping of architecture and sizes.")
+    architecture = values.get("architecture")
+    if architecture not in ARCHITECTURES:
+        raise ConfigError(unknown_name("architecture", str(architecture), ARCHITECTURES))
+    sizes = {name: value for name, value in values.items() if name != "architecture"}
+    return _build(ARCHITECTURES[architecture], sizes, "policy")
 
-    images: ObjectEncoderConfig | FrameEncoderConfig
-    prompt: PromptEncoderConfig
-    trunk: DecoderConfig | PrefixConfig
-    head: BinsConfig | AutoregressiveConfig | PointingConfig | CopyingConfig
-    action_width: int
-    query_token: bool = False
-    comparison: ComparisonConfig | None = None
 
-    def __post_init__(self) -> None:
-        if self.images.width != self.trunk.width:
-            raise ConfigError(
-                f"policy: image tokens are {self.images.width} wide, the trunk {self.trunk.width}; "
-                "make them equal."
-            )
-        images = self.images
-        matches = isinstance(images, ObjectEncoderConfig) and images.fuse_views and images.appearance_width
-        if isinstance(self.head, PointingConfig | CopyingConfig) and not (matches and self.query_token):
-            name = "pointing" if isinstance(self.head, PointingConfig) else "copying"
-            raise ConfigError(
-                f"policy: the {name} head needs objects with fuse_views, an appearance width above 0 "
-                "and a query token."
-            )
-        if self.comparison and not matches:
-            raise ConfigError(
-                "policy: comparison needs objects with fuse_views and an appearance width above 0."
-            )
+def appearance_width(config: PolicyConfig) -> int:
+    """Length of the appearance embedding; 0 for networks without one."""
+    has_objects = isinstance(config, VimaConfig | MidasConfig | PointerConfig)
+    return config.images.appearance_width if has_objects else 0
 
-    def to_dict(self) -> dict[str, Any]:  # Any: plain YAML values
-        """Return nested dictionaries of plain values, for files."""
-        return asdict(self)
 
-    @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> "PolicyConfig":
-        """Build a config from what `to_dict` returned.
+def with_autoregression(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
+    """Return the same network with autoregressive or with independent bins.
 
-        Raises:
-            ConfigError: A field is missing or unknown, or the sizes contradict each other.
-        """
-        return _build(PolicyConfig, values, "policy")
+    Raises:
+        ConfigError: The network points, and has no bins.
+    """
+    if isinstance(config, PointerConfig):
+        if not wanted:
+            return config
+        raise ConfigError("the pointer models have no autoregressive head; take nano-bins or another preset.")
+    head = config.head
+    if wanted:
+        head = AutoregressiveConfig(head.hidden_width, token_std=config.decoder.initial_std)
+    elif isinstance(head, AutoregressiveConfig):
+        head = BinsConfig(head.hidden_width)
+    return replace(config, head=head)
+
+
+def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
+    """Return the same network with or without the visual residual in its prompt encoder."""
+    return replace(config, prompt=replace(config.prompt, visual_residual=wanted))
 
 
 def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of several kinds
@@ -101,7 +93,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written 
 
 
 def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written in the dataclass
-    """How well the fields of a record fit a mapping; tells apart the records that a field may hold."""
+    """How well the fields of a record fit a mapping; selects among the records that a field may hold."""
     if not is_dataclass(kind) or not isinstance(value, Mapping):
         return 0
     names = {field.name for field in fields(kind)}

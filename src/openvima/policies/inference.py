@@ -14,8 +14,8 @@ from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
 from openvima.policies.base import Policy, prompt_number
 from openvima.policies.devices import usable_device
-from openvima.policies.heads.base import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
-from openvima.policies.network import HistoryState, Memory, PolicyNetwork
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
+from openvima.policies.build import HistoryState, Memory, PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
@@ -108,7 +108,7 @@ class NetworkPolicy(Policy):
                 f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to draw with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
-        self.processor = Processor.of(network.config.images, tokenizer, extractor)
+        self.processor = Processor.of(network.config.inputs, tokenizer, extractor)
         self.device = usable_device(device)
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
@@ -134,7 +134,7 @@ class NetworkPolicy(Policy):
             raise PolicyError("reset got no prompts; give one for each episode.")
         batch, stack = self.processor.encode_prompts(prompts)
         features_KF, features = self._encode(stack, {})
-        memory = self.network.encode_prompts(batch.to(self.device), features_KF)
+        memory = self.network.encode_prompt(batch.to(self.device), features_KF)
         seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
         self._episodes = _Episodes(
             places=tuple(range(len(prompts))),

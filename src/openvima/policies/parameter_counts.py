@@ -3,22 +3,28 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig
-from openvima.policies.network import PolicyNetwork, outline_network
-from openvima.policies.nn.frame_encoder import FrameEncoderConfig
-from openvima.policies.nn.trunk import DecoderConfig
+from openvima.policies.nn.policy_network import PolicyNetwork
 
-# Part → where its parameters are. The published names of sizes, such as 200M, count the trunk alone.
+# Part -> prefixes of its parameters; the first match counts. The published names of sizes, such as 200M,
+# count the blocks of the decoder alone.
 PARTS = {
-    "prompt": ("prompt.",),
-    "images": ("images.", "end_effectors.", "observation_out.", "compare_"),
-    "trunk": ("trunk.self_blocks.", "trunk.cross_blocks."),
-    "actions": ("actions.",),
-    "head": ("head.", "word_looks."),
-    "positions": ("trunk.positions.", "trunk.prompt_positions.", "trunk.separator", "query"),
+    "prompt": ("prompt.", "coreference."),
+    "images": (
+        "images.",
+        "frame_encoder.",
+        "resampler.",
+        "end_effectors.",
+        "observation_out.",
+        "correspondence.",
+        "prompt_correspondence.",
+    ),
+    "decoder": ("decoder.self_blocks.", "decoder.cross_blocks."),
+    "actions": ("actions.", "head.actions."),
+    "head": ("head.", "text_appearance."),
+    "positions": ("decoder.positions.", "decoder.prompt_positions.", "decoder.separator", "query"),
 }
-
-_FAMILIES = {"patches": "gato", "resampled": "flamingo", "class": "gpt"}  # by what becomes of frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +32,8 @@ class Count:
     """Numbers of parameters.
 
     Args:
-        trainable: Those that training changes.
-        frozen: Those that it leaves as they are.
+        trainable: Updated in training.
+        frozen: Not updated.
     """
 
     trainable: int = 0
@@ -44,14 +50,14 @@ class PolicySize:
     """How large a policy is.
 
     Args:
-        family: vima, gato, flamingo, gpt or midas.
-        width: Width of the trunk.
-        num_layers: Layers of the trunk: pairs of a cross block and a self block, or self blocks alone.
+        architecture: vima, gato, flamingo, gpt, midas or pointer.
+        width: Width of the decoder.
+        num_layers: Layers of the decoder: pairs of a cross block and a self block, or self blocks alone.
         num_heads: Heads of self-attention.
         parts: Parameters of each of `PARTS`.
     """
 
-    family: str
+    architecture: str
     width: int
     num_layers: int
     num_heads: int
@@ -65,28 +71,25 @@ class PolicySize:
 
 
 def policy_size(config: PolicyConfig) -> PolicySize:
-    """Count the parameters that a network of these sizes has; none is made for it."""
-    trunk = config.trunk
+    """Count the parameters of a network of these sizes without building it."""
+    decoder = config.decoder
     return PolicySize(
-        family=_family(config),
-        width=trunk.width,
-        num_layers=trunk.num_layers,
-        num_heads=trunk.num_self_heads if isinstance(trunk, DecoderConfig) else trunk.num_heads,
+        architecture=config.architecture,
+        width=decoder.width,
+        num_layers=decoder.num_layers,
+        num_heads=decoder.num_heads,
         parts=count_parameters(outline_network(config)),
     )
 
 
-def _family(config: PolicyConfig) -> str:
-    if isinstance(config.images, FrameEncoderConfig):
-        return _FAMILIES[config.images.readout]
-    return "vima" if isinstance(config.trunk, DecoderConfig) else "midas"
-
-
 def count_parameters(network: PolicyNetwork) -> dict[str, Count]:
     """Count the parameters of each part."""
-    counts = {}
-    for part, places in PARTS.items():
-        found = [parameter for name, parameter in network.named_parameters() if name.startswith(places)]
-        trainable = sum(parameter.numel() for parameter in found if parameter.requires_grad)
-        counts[part] = Count(trainable, sum(parameter.numel() for parameter in found) - trainable)
+    counts = dict.fromkeys(PARTS, Count())
+    for name, parameter in network.named_parameters():
+        part = next(part for part, prefixes in PARTS.items() if name.startswith(prefixes))
+        number, count = parameter.numel(), counts[part]
+        if parameter.requires_grad:
+            counts[part] = Count(count.trainable + number, count.frozen)
+        else:
+            counts[part] = Count(count.trainable, count.frozen + number)
     return counts

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from openvima.errors import UnknownPolicyError, unknown_name
@@ -9,92 +10,41 @@ from openvima.errors import UnknownPolicyError, unknown_name
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
 
-FAMILIES = ("vima", "gato", "flamingo", "gpt", "midas")
-# Written out, so that listing the names needs no torch; a test compares them with `families.common.SIZES`.
+PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the papers, in all sizes
+# Written out, so that listing the names needs no torch; a test compares them with `sizes.SIZES`.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
 
-def nano() -> "PolicyConfig":
-    """2.2 M parameters: small enough to train on two cores within minutes. It points."""
-    from openvima.policies.config import PolicyConfig
-    from openvima.policies.families.common import size
-    from openvima.policies.heads.pointing import PointingConfig
-    from openvima.policies.nn.conv_encoder import ConvConfig
-    from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-    from openvima.policies.nn.trunk import DecoderConfig
+def _sized(architecture: str, size_name: str) -> "PolicyConfig":
+    from openvima.policies.sizes import size
 
-    crop = ConvConfig(width=32, output_width=128)
-    return PolicyConfig(
-        images=ObjectEncoderConfig(
-            crop, box_width=64, width=128, fuse_views=True, appearance_width=128, crop_dropout=0.5
-        ),
-        prompt=size("nano").prompt,
-        trunk=DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4),
-        head=PointingConfig(),
-        action_width=64,
-        query_token=True,
-    )
+    module = import_module(f"openvima.policies.{architecture}.config")
+    return getattr(module, architecture)(size(size_name))
 
 
-def nano_bins() -> "PolicyConfig":
-    """As `nano`, with the table bins of the published policies instead of pointing."""
-    from dataclasses import replace
+def _nano() -> "PolicyConfig":
+    from openvima.policies.pointer.config import nano
 
-    from openvima.policies.heads.bins import BinsConfig
-
-    return replace(nano(), head=BinsConfig(hidden_width=256))
+    return nano()
 
 
-def small() -> "PolicyConfig":
-    """8.5 M parameters: it copies places that it has seen, and compares objects with each other."""
-    from openvima.policies.config import PolicyConfig
-    from openvima.policies.heads.copying import CopyingConfig
-    from openvima.policies.nn.comparison import ComparisonConfig
-    from openvima.policies.nn.conv_encoder import ConvConfig
-    from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-    from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-    from openvima.policies.nn.text_encoder import TextEncoderConfig
-    from openvima.policies.nn.trunk import DecoderConfig
-    from openvima.policies.tokenizer import vocabulary_size
+def _small() -> "PolicyConfig":
+    from openvima.policies.pointer.config import small
 
-    crop = ConvConfig(width=48, output_width=192, place_channels=32)
-    text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
-    return PolicyConfig(
-        images=ObjectEncoderConfig(
-            crop,
-            box_width=64,
-            width=192,
-            fuse_views=True,
-            appearance_width=128,
-            crop_dropout=0.35,
-            turn_bins=72,
-        ),
-        prompt=PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size(), referents=True),
-        trunk=DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
-        head=CopyingConfig(),
-        action_width=64,
-        query_token=True,
-        comparison=ComparisonConfig(),
-    )
+    return small()
 
 
-def _member(family: str, size_name: str) -> "PolicyConfig":
-    from openvima.policies.families.common import size
-    from openvima.policies.families.flamingo import flamingo
-    from openvima.policies.families.gato import gato
-    from openvima.policies.families.gpt import gpt
-    from openvima.policies.families.midas import midas
-    from openvima.policies.families.vima import vima
+def _nano_bins() -> "PolicyConfig":
+    from openvima.policies.vima.config import nano_bins
 
-    members = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
-    return members[family](size(size_name))
+    return nano_bins()
 
 
 PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
-    "nano": nano,
-    "nano-bins": nano_bins,
-    "small": small,
-    **{f"{family}-{size}": partial(_member, family, size) for family in FAMILIES for size in SIZE_NAMES},
+    "nano": _nano,
+    "nano-bins": _nano_bins,
+    "small": _small,
+    **{f"{name}-{size}": partial(_sized, name, size) for name in PUBLISHED for size in SIZE_NAMES},
 }
 
 
@@ -105,6 +55,6 @@ def preset(name: str) -> "PolicyConfig":
         UnknownPolicyError: There is no preset of that name.
     """
     if name not in PRESETS:
-        hint = f"Allowed: nano, nano-bins, small, and {'|'.join(FAMILIES)}-{'|'.join(SIZE_NAMES)}."
+        hint = f"Allowed: nano, nano-bins, small, and {'|'.join(PUBLISHED)}-{'|'.join(SIZE_NAMES)}."
         raise UnknownPolicyError(unknown_name("preset", name, PRESETS, hint))
     return PRESETS[name]()

@@ -28,10 +28,10 @@ from openvima.perception.preprocessing import (
     split_prompt,
 )
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
-from openvima.policies.heads.base import ActionTargets
+from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.frame_encoder import FrameEncoderConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
-from openvima.policies.nn.trunk import MAX_PLACES
+from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
@@ -285,7 +285,7 @@ class Processor:
                 "the observation shows no object; there is nothing to act on. Check its segmentation, or the "
                 "detector and its min_score."
             )
-        limit = MAX_PLACES // (len(VIEWS) if self.layout == "views" else 1) - 1
+        limit = MAX_POSITIONS // (len(VIEWS) if self.layout == "views" else 1) - 1
         if count > limit:
             raise PolicyError(
                 f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."

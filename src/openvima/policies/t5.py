@@ -16,9 +16,9 @@ from safetensors import safe_open
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
 from openvima.policies.hub import fetch_from_hub
-from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.published.table import T5, to_theirs
+from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, END_ID, PADDING_ID, Tokenizer
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     """The weights to be copied into, by their names in files of T5; published policies use these as well."""
     expected = {"shared.weight": network.prompt.words.weight.detach()}
     for ours, tensor in network.state_dict().items():
-        named = to_theirs("vima", ours) if ours.startswith("prompt.text.") else None
+        named = to_theirs(PROMPT_RULES, ours) if ours.startswith("prompt.text.") else None
         if named:
             expected["encoder" + named[0].removeprefix(T5)] = tensor
     return expected

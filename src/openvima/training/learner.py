@@ -16,7 +16,7 @@ from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
-from openvima.policies.network import PolicyNetwork
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.training.augment import augmented
 from openvima.training.dataset import Example, stack_images
@@ -116,7 +116,7 @@ class PolicyLearner(Learner):
         if batch.images is not None:
             features = network.encode_images(batch.images)
         assert features is not None  # batches without images are made only where there are features
-        memory = network.encode_prompts(batch.prompts, features)
+        memory = network.encode_prompt(batch.prompts, features)
         inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
         return network.head.loss(inputs, batch.targets)
 

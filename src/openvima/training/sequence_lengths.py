@@ -7,9 +7,9 @@ from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.errors import DatasetError, PolicyError
 from openvima.perception.preprocessing import split_prompt
-from openvima.policies.heads.base import ACTION_WIDTH
-from openvima.policies.network import PolicyNetwork
-from openvima.policies.nn.trunk import MAX_PLACES, MAX_PROMPT_PLACES
+from openvima.policies.nn.actions import ACTION_WIDTH
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.training.inverse_dynamics import as_motion, motion_text
@@ -36,7 +36,7 @@ def check_lengths(
     network.eval()
     for is_motion in [*([False] if motion_share < 1 else []), *([True] if motion_share else [])]:
         prompt, whole = _at_most(cache, processor, is_motion)
-        excess = np.maximum(prompt / MAX_PROMPT_PLACES, whole / MAX_PLACES)
+        excess = np.maximum(prompt / MAX_PROMPT_POSITIONS, whole / MAX_POSITIONS)
         longest = np.argsort(-excess, kind="stable")[:MAX_READ]
         for row in longest[excess[longest] > 1]:
             tokens = cache[int(row)]
@@ -75,7 +75,7 @@ def _read(network: PolicyNetwork, processor: Processor, tokens: PreprocessedEpis
     black = network.encode_images(torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device))
     features = black.expand(1 + len(tokens.images), *black.shape[1:])
     try:
-        memory = network.encode_prompts(batch.prompts, features)
+        memory = network.encode_prompt(batch.prompts, features)
         network(memory, batch.history, features, batch.targets.actions_BTC)
     except PolicyError as error:
         reading = " read as a motion" if is_motion else ""

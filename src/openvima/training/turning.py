@@ -45,7 +45,7 @@ def joint_loss(
         "contrastive_accuracy": alone,
         "second_view_accuracy": matched,
     }
-    if encoder.config.turn_bins:
+    if encoder.config.rotation_bins:
         rotation_loss = turn_loss(encoder, features, masks, again.turns)
         loss, metrics["loss/rotation"] = loss + rotation_loss, rotation_loss.detach()
         metrics["rotation_accuracy"] = _right_turns(encoder, features, masks, again.turns).float().mean()
@@ -110,7 +110,7 @@ def _compared(
     is_seen = (masks_2VK[0] & masks_2VK[1]).any(dim=0)
     rows = torch.nonzero(is_seen & ~turns_K.isnan())[:, 0]
     (first, second), (seen, seen_again) = features_2VKF[:, :, rows], masks_2VK[:, :, rows]
-    return encoder.turns(first, second, seen, seen_again), turns_K[rows]
+    return encoder.rotation(first, second, seen, seen_again), turns_K[rows]
 
 
 def _again(pairs: Pairs) -> Again:

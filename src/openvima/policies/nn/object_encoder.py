@@ -1,7 +1,7 @@
 """Objects to tokens: crop features and boxes of both views, as one token per view or as one for both.
 
 Shape suffixes: V views (front, top), N objects, F width of crop features, D width of a token, R bins of
-turns; `...` any axes.
+rotations; `...` any axes.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from openvima.errors import ConfigError
 from openvima.policies.nn.conv_encoder import ConvConfig, ConvEncoder
 from openvima.policies.nn.mlp import mlp
-from openvima.policies.nn.turns import RelativeRotation
+from openvima.policies.nn.relative_rotation import RelativeRotation
 from openvima.policies.nn.vit import VisionTransformer, VitConfig
 
 NUM_VIEWS = 2
@@ -35,11 +35,10 @@ class ObjectEncoderConfig:
         width: Width of an object token.
         fuse_views: One token for both views of an object, instead of one for each.
         appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
-        crop_dropout: Share of objects whose crop features are left out of their token in training. What is
-            then left, box and appearance embedding, serves for unknown objects as well: the policy does not
-            learn the training objects by heart.
-        turn_bins: Number of turns between which two images of an object are compared, 72 for steps of 5
-            degrees; 0 for no such comparison.
+        crop_dropout: Probability of dropping an object's crop features from its token in training, against
+            overfitting to the training objects: box and appearance embedding serve unknown objects as well.
+        rotation_bins: Classes of the relative rotation between two images of an object, 72 for steps of 5
+            degrees; 0 for no such estimate.
     """
 
     crop: VitConfig | ConvConfig
@@ -48,12 +47,7 @@ class ObjectEncoderConfig:
     fuse_views: bool = False
     appearance_width: int = 0
     crop_dropout: float = 0.0
-    turn_bins: int = 0
-
-    @property
-    def token_width(self) -> int:
-        """Width of what `forward` gives."""
-        return self.width
+    rotation_bins: int = 0
 
     def __post_init__(self) -> None:
         if self.appearance_width and not self.fuse_views:
@@ -62,14 +56,12 @@ class ObjectEncoderConfig:
             )
         if not 0 <= self.crop_dropout < 1:
             raise ConfigError(f"object encoder: crop_dropout is {self.crop_dropout}; it must lie in [0, 1).")
-        if self.turn_bins < 0 or self.turn_bins == 1:
+        if self.rotation_bins < 0 or self.rotation_bins == 1:
             raise ConfigError(
-                f"object encoder: turn_bins is {self.turn_bins}; it must be 0, or at least 2, such as 72."
+                f"object encoder: rotation_bins is {self.rotation_bins}; it must be 0, or at least 2."
             )
-        if self.turn_bins and not self.appearance_width:
-            raise ConfigError(
-                "object encoder: turn_bins needs an appearance width above 0; turns are learnt with looks."
-            )
+        if self.rotation_bins and not self.appearance_width:
+            raise ConfigError("object encoder: rotation_bins needs an appearance width above 0.")
 
 
 class ObjectEncoder(nn.Module):
@@ -95,8 +87,8 @@ class ObjectEncoder(nn.Module):
         self.fusion = nn.ModuleList(nn.Linear(width, config.width) for width in fusion_widths)
         if config.appearance_width:
             self.appearance = nn.Linear(NUM_VIEWS * features, config.appearance_width)
-        if config.turn_bins:
-            self.turns = RelativeRotation(features, config.turn_bins)
+        if config.rotation_bins:
+            self.rotation = RelativeRotation(features, config.rotation_bins)
 
     def encode_images(self, crops: torch.Tensor) -> torch.Tensor:
         """Encode crops of shape (..., 3, 32, 32), uint8, to features of shape (..., F)."""
@@ -131,7 +123,7 @@ class ObjectEncoder(nn.Module):
         return self.fusion[0](torch.cat([*seen, *visible], dim=-1))
 
     def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
-        """Embed what objects look like, wherever they lie.
+        """Embed the appearance of objects, independent of where they are.
 
         Args:
             features_VNF: Crop features, shape (..., 2, N, F).
@@ -144,14 +136,14 @@ class ObjectEncoder(nn.Module):
         both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
         return F.normalize(self.appearance(both), dim=-1)
 
-    def turn_between(
+    def rotation_between(
         self,
         features_a: torch.Tensor,
         features_b: torch.Tensor,
         masks_a: torch.Tensor,
         masks_b: torch.Tensor,
     ) -> torch.Tensor:
-        """Tell how far each object has turned from one image of it to another.
+        """Estimate the rotation of each object from one image to another.
 
         Args:
             features_a: Crop features in the first image, shape (..., 2, N, F).
@@ -160,11 +152,17 @@ class ObjectEncoder(nn.Module):
             masks_b: The same for the second image.
 
         Returns:
-            Probabilities of turns, shape (..., N, R); bin k is k / R of a circle, counter-clockwise seen from
-            above. Shapes that look the same at several angles have several peaks.
+            Probabilities of rotations, shape (..., N, R); bin k is k / R of a circle, counter-clockwise seen
+            from above. Symmetric shapes have several peaks.
         """
-        return self.turns(features_a, features_b, masks_a, masks_b).exp()
+        return self.rotation(features_a, features_b, masks_a, masks_b).exp()
 
 
 def _crop_encoder(config: VitConfig | ConvConfig) -> VisionTransformer | ConvEncoder:
     return VisionTransformer(config) if isinstance(config, VitConfig) else ConvEncoder(config)
+
+
+def check_widths(image_width: int, width: int) -> None:
+    """Raise a ConfigError unless image tokens are as wide as the decoder."""
+    if image_width != width:
+        raise ConfigError(f"image tokens are {image_width} wide, the decoder {width}; make them equal.")

@@ -1,7 +1,7 @@
-"""The prompt encoder: words and image tokens, interleaved, through a T5 encoder into the trunk's width.
+"""The prompt encoder: words and image tokens, interleaved, through a T5 encoder to the decoder's width.
 
-Shape suffixes: B batch, L prompt places, I image tokens of all prompts, W width of the text encoder, D width
-of the trunk, E width of an image token.
+Shape suffixes: B batch, L prompt positions, I image tokens of all prompts, W width of the text encoder, D
+width of the decoder, E width of an image token.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from torch import nn
 from openvima.errors import ConfigError
 from openvima.policies.nn.mlp import mlp
 from openvima.policies.nn.text_encoder import TextEncoder, TextEncoderConfig
+from openvima.policies.processor import PromptBatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,16 +22,13 @@ class PromptEncoderConfig:
 
     Args:
         text: The text encoder.
-        image_width: Hidden width of the stack that takes image tokens into the prompt.
+        image_width: Hidden width of the MLP that projects image tokens into the prompt.
         vocabulary_size: Number of word ids.
         tokenizer: "closed", the benchmark's own vocabulary; or "t5", that of T5, which needs its files.
         train_words: Whether the word embedding is trained.
-        trained_layers: How many of the last layers of the text encoder are trained, with its last norm; 0 for
-            a frozen one. None trains all of it, position biases included.
-        visual_residual: Add what goes into the text encoder for an image to what comes out at that place, so
-            that what an object looks like reaches the trunk even through a text encoder that knows words.
-        referents: Words bring along the pictures that stood behind the same word before: "This is a wug
-            {image}. Put the wug …"
+        trained_layers: How many of the last layers of the text encoder are trained, with its final norm; 0
+            freezes it. None trains all of it, position biases included.
+        visual_residual: Add the input of the text encoder to its output at image tokens (MIDAS).
     """
 
     text: TextEncoderConfig
@@ -40,7 +38,6 @@ class PromptEncoderConfig:
     train_words: bool = True
     trained_layers: int | None = None
     visual_residual: bool = False
-    referents: bool = False
 
     def __post_init__(self) -> None:
         if self.tokenizer not in ("closed", "t5"):
@@ -53,7 +50,7 @@ class PromptEncoderConfig:
 
 
 class PromptEncoder(nn.Module):
-    """Words and image tokens -> one sequence -> text encoder -> linear layer to the trunk's width.
+    """Words and image tokens -> one sequence -> text encoder -> linear layer to the decoder's width.
 
     "Put the {a} into the {b}." with one object in each image:
 
@@ -67,46 +64,38 @@ class PromptEncoder(nn.Module):
         self.images = mlp((image_token_width, config.image_width, config.image_width, words))
         self.text = TextEncoder(config.text)
         self.visual_residual = config.visual_residual
-        # How much a word stands for its picture.
-        self.refers = nn.Linear(words, 1) if config.referents else None
         # The published 768-wide policies have no layer here, since both widths are equal.
         self.out = nn.Identity() if words == width else nn.Linear(words, width, bias=False)
         self._freeze(config)
 
-    def forward(
-        self,
-        word_ids_BL: torch.Tensor,
-        object_index_BL: torch.Tensor,
-        mask_BL: torch.Tensor,
-        image_tokens_IE: torch.Tensor,
-        refers_BLL: torch.Tensor | None = None,
-    ) -> torch.Tensor:
+    def forward(self, prompts: PromptBatch, image_tokens_IE: torch.Tensor) -> torch.Tensor:
         """Encode prompts.
 
         Args:
-            word_ids_BL: Word ids.
-            object_index_BL: Row of the image token that stands at a place; negative where a word stands.
-            mask_BL: Which places are valid.
+            prompts: Word ids, and which image token stands where.
             image_tokens_IE: Image tokens.
-            refers_BLL: Which places each word refers to, see `referents`; only where words bring along
-                pictures.
 
         Returns:
-            Shape (B, L, D); masked places are finite and mean nothing.
+            Shape (B, L, D); masked positions are finite and carry no meaning.
         """
-        tokens_BLW = self.words(word_ids_BL)
+        tokens_BLW, images_BLW = self.embed(prompts, image_tokens_IE)
+        return self.encode(tokens_BLW, images_BLW, prompts.mask_BL)
+
+    def embed(self, prompts: PromptBatch, image_tokens_IE: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Embed words and images: the input of the text encoder, and the images of it alone, (B, L, W)."""
+        words_BLW = self.words(prompts.word_ids_BL)
         if not len(image_tokens_IE):
-            return self.out(self.text(tokens_BLW, mask_BL))
-        is_image_BL1 = (object_index_BL >= 0)[..., None]
-        chosen_BLW = self.images(image_tokens_IE)[object_index_BL.clamp(min=0)]
-        tokens_BLW = torch.where(is_image_BL1, chosen_BLW, tokens_BLW)
-        if self.refers is not None and refers_BLL is not None:
-            brought_BLW = refers_BLL @ chosen_BLW
-            tokens_BLW = tokens_BLW + torch.sigmoid(self.refers(tokens_BLW)) * brought_BLW
+            return words_BLW, torch.zeros_like(words_BLW)
+        is_image_BL1 = (prompts.object_index_BL >= 0)[..., None]
+        images_BLW = self.images(image_tokens_IE)[prompts.object_index_BL.clamp(min=0)] * is_image_BL1
+        return torch.where(is_image_BL1, images_BLW, words_BLW), images_BLW
+
+    def encode(
+        self, tokens_BLW: torch.Tensor, images_BLW: torch.Tensor, mask_BL: torch.Tensor
+    ) -> torch.Tensor:
+        """Run the text encoder on what `embed` returned, (B, L, D)."""
         encoded_BLW = self.text(tokens_BLW, mask_BL)
-        if self.visual_residual:
-            encoded_BLW = encoded_BLW + chosen_BLW * is_image_BL1
-        return self.out(encoded_BLW)
+        return self.out(encoded_BLW + images_BLW if self.visual_residual else encoded_BLW)
 
     def _freeze(self, config: PromptEncoderConfig) -> None:
         self.words.requires_grad_(config.train_words)

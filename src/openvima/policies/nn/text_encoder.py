@@ -1,6 +1,6 @@
 """A T5-style encoder over words and image tokens: relative positions, RMS norms, no scaling of scores.
 
-Shape suffixes: B batch, L prompt places, N those of all prompts up to their ends, H heads, W width, K
+Shape suffixes: B batch, L prompt positions, N those of all prompts up to their ends, H heads, W width, K
 width of one head.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from openvima.policies.nn.places import Places
+from openvima.policies.nn.unpad import Unpadder
 
 NUM_BUCKETS = 32  # half for keys before the query, half for keys after it
 _EXACT = 8  # distances below have a bucket each
@@ -47,26 +47,26 @@ class TextEncoder(nn.Module):
         nn.init.normal_(self.position_bias.weight, std=config.width**-0.5)
 
     def forward(self, tokens_BLW: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
-        """Let all places attend to all valid ones.
+        """Let all positions attend to all valid ones.
 
         Args:
             tokens_BLW: Word embeddings and image tokens, shape (B, L, W).
-            mask_BL: Which places are valid, shape (B, L), bool.
+            mask_BL: Which positions are valid, shape (B, L), bool.
 
         Returns:
-            Shape (B, L, W); masked places are finite and mean nothing. Those after the last valid one, which
+            Shape (B, L, W); masked positions are finite and carry no meaning. Those after the last valid one, which
             pad the batch, are not computed; there it is zero.
         """
-        within = Places(mask_BL.flip(1).cumsum(dim=1).flip(1) > 0)
+        unpadder = Unpadder(mask_BL.flip(1).cumsum(dim=1).flip(1) > 0)
         numbers_L = torch.arange(tokens_BLW.shape[1], device=tokens_BLW.device)
         buckets_LL = relative_bucket(numbers_L[None, :] - numbers_L[:, None])
         bias_HLL = self.position_bias(buckets_LL).permute(2, 0, 1)
         hidden = torch.finfo(tokens_BLW.dtype).min
         bias_BHLL = bias_HLL.masked_fill(~mask_BL[:, None, None, :], hidden)
-        x_NW = within.pack(tokens_BLW)
+        x_NW = unpadder.unpad(tokens_BLW)
         for block in self.blocks:
-            x_NW = block(x_NW, within, bias_BHLL)
-        return within.unpack(self.norm_after(x_NW))
+            x_NW = block(x_NW, unpadder, bias_BHLL)
+        return unpadder.pad(self.norm_after(x_NW))
 
 
 class TextBlock(nn.Module):
@@ -89,15 +89,15 @@ class TextBlock(nn.Module):
         for linear in (self.key, self.value):
             nn.init.normal_(linear.weight, std=config.width**-0.5)
 
-    def forward(self, x_NW: torch.Tensor, within: Places, bias_BHLL: torch.Tensor) -> torch.Tensor:
-        """Map packed tokens to the same shape; `bias_BHLL` is added to the attention scores."""
+    def forward(self, x_NW: torch.Tensor, unpadder: Unpadder, bias_BHLL: torch.Tensor) -> torch.Tensor:
+        """Map unpadded tokens to the same shape; `bias_BHLL` is added to the attention scores."""
         normed = self.norm_attention(x_NW)
         query, key, value = (
-            within.unpack(linear(normed)).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)  # (B, H, L, K)
+            unpadder.pad(linear(normed)).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)  # (B, H, L, K)
             for linear in (self.query, self.key, self.value)
         )
         mixed = torch.softmax(query @ key.mT + bias_BHLL, dim=-1) @ value
-        x_NW = x_NW + self.attention_out(within.pack(mixed.transpose(1, 2).flatten(2)))
+        x_NW = x_NW + self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2)))
         return x_NW + self.narrow(torch.relu(self.widen(self.norm_feed_forward(x_NW))))
 
 
@@ -119,7 +119,7 @@ class RmsNorm(nn.Module):
 
 
 def relative_bucket(offset: torch.Tensor) -> torch.Tensor:
-    """Bucket of a key that stands `offset` places after the query (before it, if negative).
+    """Bucket of a key that is `offset` positions after the query (before it, if negative).
 
     Distances below 8 have a bucket each, larger ones share logarithmic buckets, separately on both sides.
 

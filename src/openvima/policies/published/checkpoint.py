@@ -11,8 +11,9 @@ from typing import Any
 import torch
 
 from openvima.errors import CheckpointError
+from openvima.policies.build import outline_network
 from openvima.policies.differences import described, listed
-from openvima.policies.network import PolicyNetwork, outline_network
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.config import config_from_published
 from openvima.policies.published.names import from_published, is_dead, to_published, without_prefix
 

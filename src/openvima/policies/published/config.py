@@ -8,37 +8,19 @@ import torch
 
 from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.config import PolicyConfig
-from openvima.policies.families.common import SIZES, TUNED_T5_LAYERS, Size
-from openvima.policies.families.flamingo import flamingo
-from openvima.policies.families.gato import gato
-from openvima.policies.families.gpt import gpt
-from openvima.policies.families.vima import vima
+from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.nn.trunk import DecoderConfig, PrefixConfig
-from openvima.policies.published.names import family_of, without_prefix
-from openvima.policies.published.table import T5, Family
+from openvima.policies.published.names import adapter_of, without_prefix
+from openvima.policies.published.rules import T5, PublishedAdapter
+from openvima.policies.sizes import SIZES, TUNED_T5_LAYERS, Size
 
-# What `cfg` calls the width, the number of layers and the numbers of heads.
-_CFG_NAMES: dict[Family, tuple[str, ...]] = {
-    "vima": ("embed_dim", "xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
-    "gato": ("embed_dim", "n_layer", "n_head"),
-    "flamingo": ("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
-    "gpt": ("embed_dim", "n_layer", "n_head"),
-}
-_TRUNKS: dict[Family, str] = {
-    "vima": "xattn_gpt",
-    "gato": "transformer.lm",
-    "flamingo": "xattn_gpt",
-    "gpt": "transformer.lm",
-}
-_MEMBERS = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 _USUAL = SIZES["2m"]  # what a size is taken from where its weight is missing
 
 
 @dataclass(frozen=True, slots=True)
 class _Shapes:
-    """Shapes of weights by published name; some may be missing, which is told when they are loaded."""
+    """Shapes of weights by published name; some may be missing, which is given when they are loaded."""
 
     shapes: Mapping[str, tuple[int, ...]]
 
@@ -68,55 +50,57 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
         CheckpointError: The weights are of none of the four policies, or `cfg` lacks an entry or contradicts
             the weights.
     """
-    family = family_of(weights)
+    adapter = adapter_of(weights)
     shapes = _Shapes({name: tuple(tensor.shape) for name, tensor in without_prefix(weights).items()})
-    trunk = _trunk(family, shapes, cfg)
+    decoder = _decoder(adapter, shapes, cfg)
     vit = "obj_encoder.cropped_img_encoder.vit"
     action = "action_encoder._embed_dict.pose0_position._layer.0.weight"
     classifier = "action_decoder._decoders.pose0_position.mlps.0.0.weight"
     try:
         size = Size(
-            width=trunk.width,
-            num_layers=trunk.num_layers,
-            num_heads=trunk.num_heads if isinstance(trunk, PrefixConfig) else trunk.num_self_heads,
+            width=decoder.width,
+            num_layers=decoder.num_layers,
+            num_heads=decoder.num_heads,
             prompt=_prompt(shapes),
             image_width=shapes.length(f"{vit}.conv1.weight", 0, otherwise=_USUAL.image_width),
             image_layers=shapes.count(f"{vit}.blocks", otherwise=_USUAL.image_layers),
             hidden_width=shapes.length(classifier, 0, otherwise=_USUAL.hidden_width),
             action_width=shapes.length(action, 0, otherwise=_USUAL.action_width),
         )
-        return replace(_MEMBERS[family](size), trunk=trunk)
+        return replace(adapter.build(size), decoder=decoder)
     except ConfigError as error:
         raise CheckpointError(f"these weights make no network: {error}") from error
 
 
-def _trunk(family: Family, shapes: _Shapes, cfg: Mapping[str, object]) -> DecoderConfig | PrefixConfig:
-    told = _read_cfg(cfg, _CFG_NAMES[family])
-    width, num_layers, *heads = told.values()
-    name = _TRUNKS[family]
+def _decoder(
+    adapter: PublishedAdapter, shapes: _Shapes, cfg: Mapping[str, object]
+) -> DecoderConfig | PrefixDecoderConfig:
+    given = _read_cfg(cfg, adapter.cfg_names)
+    width, num_layers, *heads = given.values()
+    name = adapter.decoder
     found = (
         shapes.length(f"{name}.positions_embed.weight", 1, otherwise=width),
         shapes.count(f"{name}.h", otherwise=num_layers),
     )
     wrong = [
-        f"{entry} {told[entry]}, but the weights have {value}"
-        for entry, value in zip(told, found, strict=False)
-        if told[entry] != value
+        f"{entry} {given[entry]}, but the weights have {value}"
+        for entry, value in zip(given, found, strict=False)
+        if given[entry] != value
     ]
     if wrong:
         raise CheckpointError(f"cfg says {'; '.join(wrong)}. They do not belong together.")
     try:
-        kind = PrefixConfig if family in ("gato", "gpt") else DecoderConfig
+        kind = PrefixDecoderConfig if adapter.architecture in ("gato", "gpt") else DecoderConfig
         return kind(width, num_layers, *heads)
     except ConfigError as error:
-        raise CheckpointError(f"cfg is {told}: {error}") from error
+        raise CheckpointError(f"cfg is {given}: {error}") from error
 
 
 def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, int]:
-    told = {name: cfg.get(name) for name in names}
-    numbers = {name: value for name, value in told.items() if type(value) is int and value > 0}
-    if numbers.keys() != told.keys():
-        wrong = ", ".join(f"{name} {value!r}" for name, value in told.items() if name not in numbers)
+    given = {name: cfg.get(name) for name in names}
+    numbers = {name: value for name, value in given.items() if type(value) is int and value > 0}
+    if numbers.keys() != given.keys():
+        wrong = ", ".join(f"{name} {value!r}" for name, value in given.items() if name not in numbers)
         raise CheckpointError(f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers above 0.")
     return numbers
 

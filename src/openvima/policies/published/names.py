@@ -6,14 +6,18 @@ from collections.abc import Iterable, Mapping
 import torch
 
 from openvima.errors import CheckpointError
-from openvima.policies.network import PolicyNetwork
-from openvima.policies.nn.object_encoder import ObjectEncoder
-from openvima.policies.nn.trunk import MAX_PLACES, MAX_PROMPT_PLACES
-from openvima.policies.published.table import PERCEIVER, T5, Family, to_ours, to_theirs
+from openvima.policies.flamingo.published import ADAPTER as FLAMINGO
+from openvima.policies.flamingo.published import PERCEIVER
+from openvima.policies.gato.published import ADAPTER as GATO
+from openvima.policies.gpt.published import ADAPTER as GPT
+from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.published.rules import T5, PublishedAdapter, to_ours, to_theirs
+from openvima.policies.vima.published import ADAPTER as VIMA
 
 PREFIX = "policy."  # before every name in a file
 _UNUSED_VOCABULARY_SIZE = 40478  # words of the first GPT: Gato and GPT carry an embedding of them along
-_FAMILIES: dict[str, Family] = {"patches": "gato", "resampled": "flamingo", "class": "gpt"}
+ADAPTERS = {adapter.architecture: adapter for adapter in (VIMA, GATO, FLAMINGO, GPT)}
 # Counters, masks and embeddings that are in the files and that nothing looks at.
 _DEAD = re.compile(
     r"(xattn_gpt|transformer\.lm)\.(position_ids|xattn_position_ids|h\.\d+\.attn\.bias)"
@@ -33,19 +37,19 @@ def without_prefix(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     return {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
 
 
-def family_of(weights: Iterable[str]) -> Family:
-    """Tell by their published names which policy weights belong to.
+def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
+    """Recognise the architecture of weights by their published names.
 
     Raises:
         CheckpointError: To none of the four.
     """
     names = {name.removeprefix(PREFIX) for name in weights}
     if any(name.startswith("obj_encoder.bbox_mlp.") for name in names):
-        return "vima"
+        return VIMA
     if any(name.startswith(f"{PERCEIVER}.") for name in names):
-        return "flamingo"
+        return FLAMINGO
     if any(name.startswith("transformer.lm.") for name in names):
-        return "gpt" if "obj_encoder.cropped_img_encoder.vit.cls_token" in names else "gato"
+        return GPT if "obj_encoder.cropped_img_encoder.vit.cls_token" in names else GATO
     raise CheckpointError(
         "these are no weights of VIMA, VIMA-Gato, VIMA-Flamingo or VIMA-GPT: no name begins with "
         f"obj_encoder.bbox_mlp, {PERCEIVER} or transformer.lm."
@@ -53,7 +57,7 @@ def family_of(weights: Iterable[str]) -> Family:
 
 
 def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Rename published weights to what `PolicyNetwork` calls them.
+    """Rename published weights to their names in this package.
 
     Args:
         weights: Weights by published name, with or without `policy.` before it.
@@ -65,11 +69,11 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     Raises:
         CheckpointError: The names are not those of VIMA or one of its baselines.
     """
-    family = family_of(weights)
+    adapter = adapter_of(weights)
     result = {}
     for name, tensor in without_prefix(weights).items():
         if not is_dead(name):
-            ours, transposed = to_ours(family, name) or (name, False)
+            ours, transposed = to_ours(adapter.rules, name) or (name, False)
             result[ours] = _converted(tensor, transposed)
     return result
 
@@ -77,7 +81,7 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
 def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[str, torch.Tensor]:
     """Give the weights of a network their published names, without `policy.` before them.
 
-    Numbers of heads are not in the weights; a file tells those of the trunk in its `cfg`, and all image
+    Numbers of heads are not in the weights; a file gives those of the decoder in its `cfg`, and all image
     encoders have 24.
 
     Args:
@@ -90,10 +94,10 @@ def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[
     Raises:
         CheckpointError: The network has parts that no published policy has.
     """
-    family = _family(network)
+    adapter = ADAPTERS.get(network.config.architecture, VIMA)
     result, without_name = {}, []
     for ours, tensor in network.state_dict().items():
-        renamed = to_theirs(family, ours)
+        renamed = to_theirs(adapter.rules, ours)
         if renamed is None:
             without_name.append(ours)
         else:
@@ -107,28 +111,23 @@ def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[
     return {**result, **_dead_entries(network)} if dead_entries else result
 
 
-def _family(network: PolicyNetwork) -> Family:
-    images = network.images
-    return "vima" if isinstance(images, ObjectEncoder) else _FAMILIES[images.config.readout]
-
-
 def _dead_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     """Entries without effect; unused embeddings are those in use, or zero."""
     words = _converted(network.prompt.words.weight, transposed=False)
-    places = torch.arange(MAX_PLACES, device=words.device)
+    positions = torch.arange(MAX_POSITIONS, device=words.device)
     entries = {"t5_prompt_encoder.t5.shared.weight": words, f"{T5}.embed_tokens.weight": words}
-    if _family(network) in ("gato", "gpt"):
-        unused = words.new_zeros(_UNUSED_VOCABULARY_SIZE, network.trunk.width)
-        entries["transformer.lm.position_ids"] = places
+    if network.config.architecture in ("gato", "gpt"):
+        unused = words.new_zeros(_UNUSED_VOCABULARY_SIZE, network.decoder.width)
+        entries["transformer.lm.position_ids"] = positions
         entries["transformer.lm.tokens_embed.weight"] = unused
         return entries
-    prompt_places = places[:MAX_PROMPT_PLACES].clone()
-    causal = words.new_ones(1, 1, MAX_PLACES, MAX_PLACES).tril()
-    entries["xattn_gpt.position_ids"] = places
-    entries["xattn_gpt.xattn_position_ids"] = prompt_places
-    for block in range(len(network.trunk.self_blocks)):
+    prompt_positions = positions[:MAX_PROMPT_POSITIONS].clone()
+    causal = words.new_ones(1, 1, MAX_POSITIONS, MAX_POSITIONS).tril()
+    entries["xattn_gpt.position_ids"] = positions
+    entries["xattn_gpt.xattn_position_ids"] = prompt_positions
+    for block in range(len(network.decoder.self_blocks)):
         entries[f"xattn_gpt.h.{block}.attn.bias"] = causal
-        entries[f"xattn_gpt.xattns.{block}.kv_position_ids"] = prompt_places
+        entries[f"xattn_gpt.xattns.{block}.kv_position_ids"] = prompt_positions
     return entries
 
 

@@ -1,0 +1,39 @@
+"""Networks from their configs."""
+
+import torch
+
+from openvima.policies.config import PolicyConfig
+from openvima.policies.flamingo.model import Flamingo
+from openvima.policies.gato.model import Gato
+from openvima.policies.gpt.model import Gpt
+from openvima.policies.midas.model import Midas
+from openvima.policies.nn.meta_init import MetaInit
+from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.policies.pointer.model import Pointer
+from openvima.policies.vima.model import Vima
+
+MODELS: dict[str, type[PolicyNetwork]] = {
+    "vima": Vima,
+    "gato": Gato,
+    "flamingo": Flamingo,
+    "gpt": Gpt,
+    "midas": Midas,
+    "pointer": Pointer,
+}
+
+
+def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:
+    """Build a network with fresh weights that follow from the seed; global random state does not change."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return MODELS[config.architecture](config)
+
+
+def outline_network(config: PolicyConfig) -> PolicyNetwork:
+    """Build a network on the meta device: names and shapes, to count parameters or to assign weights.
+
+    It takes no time and no memory, whatever the sizes. `network.load_state_dict(weights, assign=True)` makes
+    it usable.
+    """
+    with MetaInit():
+        return MODELS[config.architecture](config)

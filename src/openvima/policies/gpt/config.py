@@ -1,0 +1,45 @@
+"""Sizes of VIMA-GPT."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from openvima.policies.input_layout import InputLayout
+from openvima.policies.nn.autoregressive import AutoregressiveConfig
+from openvima.policies.nn.bins import BinsConfig
+from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.vit import VitConfig, check_frame_encoder
+from openvima.policies.sizes import Size
+
+
+@dataclass(frozen=True, slots=True)
+class GptConfig:
+    """Sizes of VIMA-GPT.
+
+    Args:
+        frame: The encoder of whole frames; its features are as wide as the decoder.
+        prompt: The prompt encoder.
+        decoder: The decoder.
+        head: Independent or autoregressive bins.
+    """
+
+    architecture: ClassVar[str] = "gpt"
+    frame: VitConfig
+    prompt: PromptEncoderConfig
+    decoder: PrefixDecoderConfig
+    head: BinsConfig | AutoregressiveConfig
+
+    def __post_init__(self) -> None:
+        check_frame_encoder(self.frame, self.decoder.width, class_token=True)
+
+    @property
+    def inputs(self) -> InputLayout:
+        """What the processor makes of images."""
+        size = (self.frame.image_height, self.frame.image_width)
+        return InputLayout("frames", size, tokens_per_frame_pair=1)
+
+
+def gpt(of: Size) -> GptConfig:
+    """Return VIMA-GPT in a size."""
+    head = BinsConfig(of.hidden_width, of.action_width)
+    return GptConfig(of.frame_encoder(class_token=True), of.prompt, of.prefix_decoder(), head)

@@ -1,1 +1,0 @@
-"""Action heads: from the decoder's action query to an action."""

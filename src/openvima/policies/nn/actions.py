@@ -1,0 +1,110 @@
+"""Actions as vectors, their targets, and how a class is decoded from logits.
+
+Shape suffixes: B batch, T steps, N objects in view, C components of an action.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+
+from openvima.policies.nn.action_encoder import ACTION_PARTS, ACTION_WIDTH
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+
+__all__ = [
+    "ACTION_PARTS",
+    "ACTION_WIDTH",
+    "ActionTargets",
+    "DecodingStrategy",
+    "from_unit_range",
+    "greedy",
+    "masked_mean",
+    "nll",
+    "sampling",
+    "to_unit_range",
+]
+
+# Decoding strategy: logits (B, ..., classes) to class indices (B, ...).
+DecodingStrategy = Callable[[torch.Tensor], torch.Tensor]
+
+_LOW = (*WORKSPACE_LOW, -1.0, -1.0, -1.0, -1.0)
+_HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActionTargets:
+    """Demonstrated actions.
+
+    Args:
+        actions_BTC: Actions in metres and quaternions, in the order of `ACTION_PARTS`.
+        pick_BT: Slot of the picked object in view; -1 where it is not in view.
+        place_BT: Slot of the object relative to which it was placed; -1 where there is none.
+        steps_BT: Which steps exist.
+    """
+
+    actions_BTC: torch.Tensor
+    pick_BT: torch.Tensor
+    place_BT: torch.Tensor
+    steps_BT: torch.Tensor
+
+    def to(self, device: torch.device | str) -> "ActionTargets":
+        """Return the targets on another device."""
+        tensors = (self.actions_BTC, self.pick_BT, self.place_BT, self.steps_BT)
+        return ActionTargets(*(tensor.to(device) for tensor in tensors))
+
+
+def greedy(logits: torch.Tensor) -> torch.Tensor:
+    """Decode the class with the highest logit, the first one of equals."""
+    return logits.argmax(-1)
+
+
+def sampling(generators: Sequence[torch.Generator], temperature: float) -> DecodingStrategy:
+    """Make the decoding strategy that samples classes.
+
+    Args:
+        generators: One for each row of the logits. A sample takes one number of it, whatever the number of
+            classes, so that padding changes nothing.
+        temperature: Divisor of the logits.
+    """
+
+    def sample(logits: torch.Tensor) -> torch.Tensor:
+        probabilities = torch.softmax(logits.to("cpu", torch.float64) / temperature, dim=-1)
+        cumulative = probabilities.cumsum(dim=-1)
+        shape = (*logits.shape[1:-1], 1)
+        drawn = [torch.rand(shape, dtype=torch.float64, generator=generator) for generator in generators]
+        sampled = torch.searchsorted(cumulative, torch.stack(drawn) * cumulative[..., -1:], right=True)
+        return sampled.squeeze(-1).clamp(max=logits.shape[-1] - 1).to(logits.device)
+
+    return sample
+
+
+def to_unit_range(actions: torch.Tensor) -> torch.Tensor:
+    """Map actions (..., 12) from metres and quaternion components to 0 … 1."""
+    low, high = _bounds(actions.dtype, actions.device)
+    return (actions - low) / (high - low)
+
+
+def from_unit_range(values: torch.Tensor) -> torch.Tensor:
+    """Undo `to_unit_range`; values outside 0 … 1 are clipped to the bounds."""
+    low, high = _bounds(values.dtype, values.device)
+    return torch.minimum(torch.maximum(low + values * (high - low), low), high)
+
+
+def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Mean of the values where the mask is true; 0 where it is true nowhere."""
+    weights = mask.to(values.dtype)
+    return (values * weights).sum() / weights.sum().clamp(min=1)
+
+
+def nll(logits_BTN: torch.Tensor, target_BT: torch.Tensor) -> torch.Tensor:
+    """Negative log-likelihood of a class at every step, shape (B, T)."""
+    loss = torch.nn.functional.cross_entropy(logits_BTN.flatten(0, 1), target_BT.flatten(), reduction="none")
+    return loss.view_as(target_BT)
+
+
+@cache
+def _bounds(dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    with torch.inference_mode(False):  # so that those first used in acting serve for training, too
+        low = torch.tensor(_LOW + _LOW, dtype=dtype, device=device)
+        return low, torch.tensor(_HIGH + _HIGH, dtype=dtype, device=device)

@@ -1,0 +1,392 @@
+"""The two decoders of a history, given a prompt, with key-value caches.
+
+`Decoder` attends to the prompt through cross-attention (VIMA, VIMA-Flamingo, nano, small). `PrefixDecoder`
+puts the prompt before the history in one causal sequence (VIMA-Gato, VIMA-GPT, MIDAS). Training decodes a
+whole history in one call, acting one step per call: both run the same code on the same cache.
+
+Shape suffixes: B batch, T steps, Q tokens of a step, L new positions, N valid positions of all rows, S cached
+positions, P positions of the prompt, D width, H heads, K width of a head.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError, PolicyError
+from openvima.policies.nn.linear import Linear
+from openvima.policies.nn.mlp import normal_weights
+from openvima.policies.nn.unpad import Unpadder
+
+MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
+MAX_PROMPT_POSITIONS = 256
+
+KeysValues = tuple[torch.Tensor, torch.Tensor]  # (B, H, S, K) each
+
+
+@dataclass(frozen=True, slots=True)
+class DecoderConfig:
+    """Sizes of the decoder with cross-attention.
+
+    Args:
+        width: Width of its tokens.
+        num_layers: Pairs of a cross block and a self block.
+        num_self_heads: Heads of self-attention.
+        num_cross_heads: Heads of cross-attention.
+        dropout: Dropout probability in self blocks and after the position embedding.
+        initial_std: Standard deviation of fresh weights.
+    """
+
+    width: int
+    num_layers: int
+    num_self_heads: int
+    num_cross_heads: int
+    dropout: float = 0.1
+    initial_std: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check_sizes("decoder", self.width, self.num_self_heads, self.dropout)
+        _check_sizes("decoder", self.width, self.num_cross_heads, self.dropout)
+
+    @property
+    def num_heads(self) -> int:
+        """Heads of self-attention."""
+        return self.num_self_heads
+
+
+@dataclass(frozen=True, slots=True)
+class PrefixDecoderConfig:
+    """Sizes of the decoder that has the prompt as its prefix.
+
+    Args:
+        width: Width of its tokens.
+        num_layers: Self blocks.
+        num_heads: Heads of each.
+        dropout: Dropout probability in the blocks and after the position embedding.
+        initial_std: Standard deviation of fresh weights.
+    """
+
+    width: int
+    num_layers: int
+    num_heads: int
+    dropout: float = 0.1
+    initial_std: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check_sizes("prefix decoder", self.width, self.num_heads, self.dropout)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KVCache:
+    """Keys and values of everything decoded so far.
+
+    Args:
+        past: Keys and values of each self block.
+        mask_BS: Which cached positions may be attended to.
+        length_B: Number of these; the next valid token gets this position.
+        prompt: Keys and values of each cross block; empty with a prefix.
+        prompt_mask_BP: Which positions of the prompt may be attended to.
+    """
+
+    past: tuple[KeysValues, ...]
+    mask_BS: torch.Tensor
+    length_B: torch.Tensor
+    prompt: tuple[KeysValues, ...]
+    prompt_mask_BP: torch.Tensor
+
+    def select(self, rows: Sequence[int]) -> "KVCache":
+        """Return the cache of some rows of the batch."""
+        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BS.device)
+        return KVCache(
+            tuple((key[index], value[index]) for key, value in self.past),
+            self.mask_BS[index],
+            self.length_B[index],
+            tuple((key[index], value[index]) for key, value in self.prompt),
+            self.prompt_mask_BP[index],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TokenSegment:
+    """Tokens of every step that are adjacent in the sequence, such as its observation or its action.
+
+    Args:
+        tokens_BTQD: The tokens.
+        mask_BTQ: Which of them may be attended to.
+        valid_BTQ: Which of them get an output: those of the mask, and padding that the action is read from.
+    """
+
+    tokens_BTQD: torch.Tensor
+    mask_BTQ: torch.Tensor
+    valid_BTQ: torch.Tensor
+
+
+class CausalDecoder(nn.Module):
+    """What both decoders share: position embedding, self blocks, the cache."""
+
+    sequence_name = "the history"  # what the position table covers
+
+    def __init__(self, width: int, num_layers: int, num_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.width, self.num_heads = width, num_heads
+        self.positions = nn.Embedding(MAX_POSITIONS, width)
+        self.self_blocks = nn.ModuleList(SelfBlock(width, num_heads, dropout) for _ in range(num_layers))
+        self.dropout = nn.Dropout(dropout)
+
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
+        """Process the prompt; once per episode.
+
+        Args:
+            prompt_BPD: Encoded prompt.
+            mask_BP: Which of its positions are valid, bool.
+
+        Raises:
+            PolicyError: The prompt is longer than the position table.
+        """
+        raise NotImplementedError
+
+    def forward(
+        self,
+        cache: KVCache,
+        tokens_BLD: torch.Tensor,
+        mask_BL: torch.Tensor,
+        valid_BL: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, KVCache]:
+        """Decode the next tokens.
+
+        Args:
+            cache: What was decoded before.
+            tokens_BLD: Tokens in temporal order.
+            mask_BL: Which of them may be attended to, bool. Masked tokens still get an output.
+            valid_BL: Which get an output, bool, those of the mask among them; all by default.
+
+        Returns:
+            Outputs, shape (B, L, D), zero where not valid, and the cache after them. A token attends to the
+            unmasked ones before it, and to itself if unmasked. Decoding in pieces equals decoding at once up
+            to rounding.
+
+        Raises:
+            PolicyError: The history is longer than the position table.
+        """
+        length_B = cache.length_B + mask_BL.sum(dim=1)
+        if (
+            cache.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_POSITIONS
+        ):  # only then synchronise with the device
+            _check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
+        positions_BL = (cache.length_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
+        unpadder = Unpadder(torch.ones_like(mask_BL) if valid_BL is None else valid_BL)
+        x_ND = self.dropout(unpadder.unpad(tokens_BLD + self.positions(positions_BL)))
+        self_bias_B1LS = attention_bias(_causal_mask(cache.mask_BS, mask_BL)[:, None], x_ND.dtype)
+        prompt_bias_B11P = attention_bias(cache.prompt_mask_BP[:, None, None, :], x_ND.dtype)
+        past = []
+        for layer, block in enumerate(self.self_blocks):
+            x_ND = self._cross_attend(layer, x_ND, unpadder, cache, prompt_bias_B11P)
+            x_ND, keys_values = block(x_ND, unpadder, cache.past[layer], self_bias_B1LS)
+            past.append(keys_values)
+        mask_BS = torch.cat([cache.mask_BS, mask_BL], dim=1)
+        return unpadder.pad(x_ND), replace(cache, past=tuple(past), mask_BS=mask_BS, length_B=length_B)
+
+    def decode_segments(
+        self, cache: KVCache, segments: Sequence[TokenSegment]
+    ) -> tuple[tuple[torch.Tensor, ...], KVCache]:
+        """Decode steps of several segments each: all segments of a step, then those of the next.
+
+        Padding within the steps is removed before decoding.
+
+        Returns:
+            The outputs of each segment, (B, T, Q, D), zero where not valid; and the cache.
+        """
+        sizes = [segment.tokens_BTQD.shape[2] for segment in segments]
+        sequence_BLD = torch.cat([segment.tokens_BTQD for segment in segments], dim=2).flatten(1, 2)
+        mask_BL = torch.cat([segment.mask_BTQ for segment in segments], dim=2).flatten(1)
+        valid_BTQ = torch.cat([segment.valid_BTQ for segment in segments], dim=2)
+        valid_BL = valid_BTQ.flatten(1)
+        order_BP = valid_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+        order_BP = order_BP[:, : int(valid_BL.sum(dim=1).max())]
+        index_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])
+        outputs_BPD, cache = self(
+            cache,
+            sequence_BLD.gather(1, index_BPD),
+            mask_BL.gather(1, order_BP),
+            valid_BL.gather(1, order_BP),
+        )
+        outputs_BLD = outputs_BPD.new_zeros(sequence_BLD.shape).scatter(1, index_BPD, outputs_BPD)
+        return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
+
+    def _cross_attend(
+        self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
+    ) -> torch.Tensor:
+        """Attend to the prompt before a self block; only the decoder with cross-attention does."""
+        return x_ND
+
+    def _empty_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
+        batch = len(prompt_BPD)
+        empty = prompt_BPD.new_zeros(batch, self.num_heads, 0, self.width // self.num_heads)
+        return KVCache(
+            ((empty, empty),) * len(self.self_blocks),
+            mask_BP.new_zeros(batch, 0),
+            torch.zeros(batch, dtype=torch.int64, device=mask_BP.device),
+            (),
+            mask_BP,
+        )
+
+
+class Decoder(CausalDecoder):
+    """Alternates cross blocks and self blocks over the history; the prompt is not transformed."""
+
+    def __init__(self, config: DecoderConfig) -> None:
+        super().__init__(config.width, config.num_layers, config.num_self_heads, config.dropout)
+        self.prompt_positions = nn.Embedding(MAX_PROMPT_POSITIONS, config.width)
+        self.cross_blocks = nn.ModuleList(CrossBlock(config) for _ in range(config.num_layers))
+        normal_weights(self, config.initial_std)
+
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
+        """Compute the keys and values of the prompt for every cross block."""
+        _check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
+        prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP))
+        blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
+        prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
+        return replace(self._empty_cache(prompt_BPD, mask_BP), prompt=prompt)
+
+    def _cross_attend(
+        self, layer: int, x_ND: torch.Tensor, unpadder: Unpadder, cache: KVCache, bias_B11P: torch.Tensor
+    ) -> torch.Tensor:
+        return self.cross_blocks[layer](x_ND, unpadder, cache.prompt[layer], bias_B11P)
+
+
+class PrefixDecoder(CausalDecoder):
+    """One causal sequence: prompt, a learned separator, history."""
+
+    sequence_name = "the sequence of prompt and history"
+
+    def __init__(self, config: PrefixDecoderConfig) -> None:
+        super().__init__(config.width, config.num_layers, config.num_heads, config.dropout)
+        self.separator = nn.Parameter(torch.zeros(config.width))
+        normal_weights(self, config.initial_std)
+
+    def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
+        """Decode prompt and separator; the prompt is causal as well."""
+        _check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
+        separator_B1D = self.separator.expand(len(prompt_BPD), 1, -1)
+        tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
+        mask_BP = F.pad(mask_BP, (0, 1), value=True)
+        return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
+
+
+class CrossBlock(nn.Module):
+    """Pre-norm attention to the prompt and a gated feed-forward; no linear has a bias.
+
+    The gate reads the sum before its norm, as the published weights were trained.
+    """
+
+    def __init__(self, config: DecoderConfig) -> None:
+        super().__init__()
+        width = config.width
+        self.num_heads = config.num_cross_heads
+        self.norm_attention = nn.LayerNorm(width)
+        self.query = Linear(width, width, bias=False)
+        self.key_value = Linear(width, 2 * width, bias=False)
+        self.attention_out = Linear(width, width, bias=False)
+        self.norm_feed_forward = nn.LayerNorm(width)
+        self.widen = Linear(width, 4 * width, bias=False)
+        self.gate = Linear(width, 4 * width, bias=False)
+        self.narrow = Linear(4 * width, width, bias=False)
+
+    def keys_values(self, prompt_BPD: torch.Tensor) -> KeysValues:
+        """Compute keys and values of the prompt; they do not change within an episode."""
+        # (B, P, 2·D) -> (2, B, H, P, K)
+        key, value = self.key_value(prompt_BPD).unflatten(-1, (2, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
+        return key, value
+
+    def forward(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
+    ) -> torch.Tensor:
+        """Map unpadded tokens to the same shape; `bias_B11P` masks the prompt."""
+        query_BLD = unpadder.pad(self.query(self.norm_attention(x_ND)))
+        query = query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+        mixed = F.scaled_dot_product_attention(query, *prompt, attn_mask=bias_B11P)
+        attended = self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))) + x_ND
+        hidden = F.gelu(self.widen(self.norm_feed_forward(attended))) * self.gate(attended)
+        return self.narrow(hidden) + attended
+
+
+class SelfBlock(nn.Module):
+    """Post-norm causal self-attention and a gated feed-forward, as in the first GPT."""
+
+    def __init__(self, width: int, num_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.attention_dropout = dropout
+        self.query_key_value = Linear(width, 3 * width)
+        self.attention_out = Linear(width, width)
+        self.norm_attention = nn.LayerNorm(width)
+        self.widen = Linear(width, 4 * width)
+        self.gate = Linear(width, 4 * width, bias=False)
+        self.narrow = Linear(4 * width, width)
+        self.norm_feed_forward = nn.LayerNorm(width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, past: KeysValues, bias_B1LS: torch.Tensor
+    ) -> tuple[torch.Tensor, KeysValues]:
+        """Map new tokens to the same shape.
+
+        Args:
+            x_ND: New tokens, unpadded.
+            unpadder: Their positions.
+            past: Cached keys and values.
+            bias_B1LS: Masks the future and masked positions.
+
+        Returns:
+            Outputs, and the keys and values of all positions.
+        """
+        # (B, L, 3·D) -> (3, B, H, L, K)
+        padded = unpadder.pad(self.query_key_value(x_ND)).unflatten(-1, (3, self.num_heads, -1))
+        query, key, value = padded.permute(2, 0, 3, 1, 4)
+        key, value = torch.cat([past[0], key], dim=2), torch.cat([past[1], value], dim=2)
+        dropout = self.attention_dropout if self.training else 0.0
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias_B1LS, dropout_p=dropout)
+        attended = self.dropout(self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))))
+        attended = self.norm_attention(x_ND + attended)
+        hidden = self.narrow(F.gelu(self.widen(attended)) * self.gate(attended))
+        return self.norm_feed_forward(attended + self.dropout(hidden)), (key, value)
+
+
+def position_ids(mask_BL: torch.Tensor) -> torch.Tensor:
+    """Number the valid positions from 0; a masked one shares the number of the last valid one before it."""
+    return (mask_BL.cumsum(dim=-1) - 1).clamp(min=0)
+
+
+def attention_bias(visible: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Additive attention mask: 0 where visible, else the most negative finite number.
+
+    It is finite so that a row without visible keys averages over all of them instead of giving NaN.
+    """
+    return torch.zeros(visible.shape, dtype=dtype, device=visible.device).masked_fill(
+        ~visible, torch.finfo(dtype).min
+    )
+
+
+def _causal_mask(past_BS: torch.Tensor, new_BL: torch.Tensor) -> torch.Tensor:
+    """Which positions each new token attends to, shape (B, L, S + L)."""
+    length = new_BL.shape[1]
+    causal_LL = torch.ones(length, length, dtype=torch.bool, device=new_BL.device).tril()
+    return torch.cat([past_BS[:, None, :].expand(-1, length, -1), causal_LL & new_BL[:, None, :]], dim=2)
+
+
+def _check_length(length: int, limit: int, what: str) -> None:
+    if length > limit:
+        raise PolicyError(
+            f"{what} has {length} tokens; this policy takes {limit}. Give a shorter prompt, fewer objects in "
+            "view or fewer steps."
+        )
+
+
+def _check_sizes(what: str, width: int, heads: int, dropout: float) -> None:
+    if heads < 1 or width % heads:
+        raise ConfigError(f"{what}: width {width} must be a multiple of its {heads} heads.")
+    if not 0 <= dropout < 1:
+        raise ConfigError(f"{what}: dropout is {dropout}; it must lie in [0, 1).")

@@ -1,0 +1,165 @@
+"""What every policy network of the package can do, for training and for acting.
+
+Shape suffixes: B batch, T steps, L prompt positions, Q tokens of a step, K images, F width of image
+features, D width of the decoder, E width of an image token, C components of an action.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
+from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead
+from openvima.policies.nn.bins import SCORE, BinsConfig, BinsHead
+from openvima.policies.nn.decoder import CausalDecoder
+from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.processor import HistoryBatch, PromptBatch
+from openvima.scene import END_EFFECTORS
+
+NUM_END_EFFECTORS = len(END_EFFECTORS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EncodedPrompt:
+    """Encoded prompts; constant within an episode.
+
+    Args:
+        tokens_BLD: Encoded words and images.
+        mask_BL: Which positions exist.
+    """
+
+    tokens_BLD: torch.Tensor
+    mask_BL: torch.Tensor
+
+    def select(self, rows: Sequence[int]) -> "EncodedPrompt":
+        """Return the prompts of some rows of the batch."""
+        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BL.device)
+        return EncodedPrompt(self.tokens_BLD[index], self.mask_BL[index])
+
+
+class PolicyNetwork(nn.Module):
+    """Multimodal prompt and history to actions.
+
+    A model defines its parts, `encode_images`, `encode_prompt` and `observe`. Decoding, the loss and acting
+    are those of an action head over bins; the pointer models replace them.
+
+    Attributes:
+        config: All sizes.
+        score: The metric that selects the best checkpoint, a fraction of 1.
+    """
+
+    config: Any  # the config of the model
+    prompt: PromptEncoder
+    decoder: CausalDecoder
+    head: Any  # over bins; the pointer models have their own
+    end_effectors: nn.Embedding
+    observation_out: nn.Linear
+    score = SCORE
+
+    @property
+    def object_encoder(self) -> ObjectEncoder | None:
+        """The encoder of object crops; None for models of whole frames."""
+        return getattr(self, "images", None)
+
+    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
+        raise NotImplementedError
+
+    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> Any:  # Any: the model's own
+        """Encode prompts; once per episode.
+
+        Args:
+            prompts: The prompts.
+            features_KF: Encoded images, by image index.
+        """
+        raise NotImplementedError
+
+    def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
+        """Make the tokens of each observation.
+
+        Args:
+            history: Observations.
+            features_KF: Encoded images, by image index.
+        """
+        raise NotImplementedError
+
+    def init_cache(self, prompt: Any) -> Any:  # Any: the model's own
+        """Return the state of decoding after the prompt and before the first step."""
+        return self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL)
+
+    def loss(
+        self, prompt: Any, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Decode whole histories and compare with what was demonstrated.
+
+        Args:
+            prompt: Encoded prompts.
+            history: Observations.
+            features_KF: Encoded images, by image index.
+            targets: Demonstrated actions. The prediction of one depends on earlier ones alone; with an
+                autoregressive head also on its own components before.
+
+        Returns:
+            The loss, a mean over all steps, and metrics: every named part of the loss as `loss/<name>`, and
+            accuracies.
+        """
+        return self.head.loss(
+            self.decoder, self.init_cache(prompt), self.observe(history, features_KF), targets
+        )
+
+    def decode_step(
+        self,
+        prompt: Any,
+        state: Any,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+        strategy: DecodingStrategy = greedy,
+    ) -> tuple[torch.Tensor, Any]:
+        """Decode the actions of the next steps, of which the earlier ones are in the state.
+
+        Args:
+            prompt: Encoded prompts.
+            state: What `init_cache` or the last call returned.
+            history: Observations of these steps; one when acting.
+            features_KF: Encoded images, by image index.
+            previous_BTC: The action taken before each observation, metres and quaternions.
+            has_previous_BT: Whether there was one.
+            strategy: How a class is decoded from logits.
+
+        Returns:
+            Actions, shape (B, T, 12), metres and quaternions, within bounds; and the next state.
+
+        Raises:
+            PolicyError: Prompt or history is longer than the decoder takes.
+        """
+        observations = self.observe(history, features_KF)
+        return self.head.decode_step(
+            self.decoder, state, observations, previous_BTC, has_previous_BT, strategy
+        )
+
+    def add_end_effector(self, tokens_BTQE: torch.Tensor, end_effector_BT: torch.Tensor) -> torch.Tensor:
+        """Fuse image tokens with the end effector, and map them to the decoder's width, (B, T, Q, D)."""
+        effector_BT1E = self.end_effectors(end_effector_BT)[:, :, None]
+        effector_BTQE = effector_BT1E.expand(*tokens_BTQE.shape[:3], NUM_END_EFFECTORS)
+        return self.observation_out(torch.cat([tokens_BTQE, effector_BTQE], dim=-1))
+
+    def all_frames(self, tokens_BTQE: torch.Tensor, history: HistoryBatch) -> ObservationTokens:
+        """Make the observation tokens of whole frames, all of which exist; the last one is the query."""
+        tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
+        mask_BTQ = history.steps_BT[..., None].expand(tokens_BTQD.shape[:3])
+        query_BT = torch.full_like(history.num_slots_BT, tokens_BTQD.shape[2] - 1)
+        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, history.steps_BT)
+
+
+def build_bins_head(config: BinsConfig | AutoregressiveConfig, width: int) -> BinsHead | AutoregressiveHead:
+    """Build the head that a config describes."""
+    if isinstance(config, AutoregressiveConfig):
+        return AutoregressiveHead(config, width)
+    return BinsHead(config, width)

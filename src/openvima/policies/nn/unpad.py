@@ -1,0 +1,30 @@
+"""Removes the padding of a batch of sequences, so that it costs no computation.
+
+Shape suffixes: B batch, L positions, N positions of all rows that are computed, D width.
+"""
+
+import torch
+
+
+class Unpadder:
+    """Packs the valid positions of a padded batch and scatters them back.
+
+    Args:
+        valid_BL: The positions that are computed; the others are zero, and visible to attention alone.
+    """
+
+    def __init__(self, valid_BL: torch.Tensor) -> None:
+        self._shape = valid_BL.shape
+        index_N = valid_BL.flatten().nonzero().squeeze(1)
+        self._index_N = None if len(index_N) == valid_BL.numel() else index_N
+
+    def unpad(self, x_BLD: torch.Tensor) -> torch.Tensor:
+        """Return the valid rows, (N, D), or the batch unchanged if all are."""
+        return x_BLD if self._index_N is None else x_BLD.flatten(0, 1).index_select(0, self._index_N)
+
+    def pad(self, x_ND: torch.Tensor) -> torch.Tensor:
+        """Undo `unpad`, with zeros at invalid positions."""
+        if self._index_N is None:
+            return x_ND
+        zeros = x_ND.new_zeros(self._shape.numel(), x_ND.shape[-1])
+        return zeros.index_copy(0, self._index_N, x_ND).unflatten(0, self._shape)

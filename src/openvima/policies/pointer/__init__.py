@@ -1,0 +1,1 @@
+"""The pointer models: nano and small."""

@@ -1,0 +1,297 @@
+"""The head of `small`: point at an object and at a place candidate, which may be a place seen before.
+
+"Rearrange to this {scene} and then restore." asks for places where nothing is now. One of them is where the
+prompt shows the object, the other one where it was at the first step.
+
+Shape suffixes as in `inputs.py`; C candidates, E kinds of them, G geometric features, H prompt queries.
+"""
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
+from openvima.policies.nn.mlp import mlp
+from openvima.policies.pointer.candidates import (
+    KINDS,
+    NUM_GEOMETRY,
+    GridCandidates,
+    PlaceCandidates,
+    products,
+    proximity,
+)
+from openvima.policies.pointer.config import CandidateHeadConfig
+from openvima.policies.pointer.geometry import (
+    OFFSET_UNIT_M,
+    accuracy,
+    bin_to_yaw,
+    carried_to,
+    offset_loss,
+    pick_and_place,
+    pointing_metrics,
+    relative_yaw,
+    rotated,
+    yaw_to_bin,
+)
+from openvima.policies.pointer.grounding import TextGrounding, attend
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, mask_scores
+from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
+
+_ON_TOP_M = 0.04  # scale within which an object is in or on another one
+_MAX_DISTANCE = 10.0  # in units of offsets; larger distances are clipped
+_ROTATION_SCALE = 5.0  # initial logit of a rotation that is certain
+
+
+class CandidatePointerHead(nn.Module):
+    """Points at the object to pick, then at a place candidate; offset and yaw are relative to it.
+
+    Candidates, with two objects on the table and one in the only scene of the prompt:
+
+        [1 in view, 2 in view, 1 at first step, 2 at first step, 1 in the prompt, grid 1, …, grid 32]
+
+    Objects that only have to be cleared away go to a grid point: a demonstration chooses one of many places
+    that would do, whose mean would not. The centre of the picked object goes to the candidate's, plus the
+    offset. The grasp and the rotation then determine the pose of the tool, so that a wrong rotation does not
+    move the object.
+
+    Rotations are copied as well, where the model estimates those between prompt images in as many bins as the
+    head has.
+    """
+
+    def __init__(self, config: CandidateHeadConfig, width: int, rotation_bins: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.rotation_copy = RotationCopy(width) if rotation_bins == config.num_yaw_bins else None
+        self.pick = PickPointer(config, width)
+        self.place = PlacePointer(config, width)
+        self.grid = GridCandidates(width)
+        self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.relation = mlp((3 * width + 8, config.hidden_width, config.hidden_width))
+        self.offset = nn.Linear(config.hidden_width, 2)
+        self.yaw = nn.Linear(config.hidden_width, config.num_yaw_bins)
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.offset.bias)
+
+    def loss(
+        self, inputs: HeadInputs, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Cross-entropy of both pointers, also by appearance alone, and of the yaw; Huber loss of the offset.
+
+        Every candidate at the demonstrated place is right: the loss is that of their total probability. Where
+        there is none, the object that the demonstration names is, and the offset has to lead from there to
+        the place. If none is named, the nearest grid point is right; metrics leave out such a step.
+        """
+        candidates, config = self.candidates(inputs), self.config
+        has_pick, pick = targets.steps_BT & (targets.pick_BT >= 0), targets.pick_BT.clamp(min=0)
+        pick_logits, place_logits = self.pick(inputs), self.place(inputs, candidates, pick)
+        goal = self._goal(inputs, targets, pick)
+        right_BTC, has_place_BT = candidates.right(targets, goal)
+        right_BTC = right_BTC | ~has_pick[..., None]
+        right_logits = mask_scores(place_logits, right_BTC)
+        place = right_logits.argmax(-1)  # of the right ones that with the highest logit
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
+        true_offset = goal - candidates.positions_at(place)
+        yaw = yaw_to_bin(relative_yaw(targets.actions_BTC), config.num_yaw_bins)
+        place_nll = place_logits.logsumexp(-1) - right_logits.logsumexp(-1)
+        pick_appearance = self.pick.appearance_scores(inputs)
+        grounding, is_grounded_BT = self.pick.grounding_nll(inputs, pick)
+        has_other = has_pick & (targets.place_BT >= 0) & (targets.place_BT != pick)
+        place_appearance = self.place.appearance_scores(inputs, pick)
+        other = targets.place_BT.clamp(min=0)
+        appearance_weight = config.appearance_loss_weight
+        losses = {
+            "pick": masked_mean(nll(pick_logits, pick), has_pick),
+            "pick_appearance": masked_mean(nll(pick_appearance, pick), has_pick) * appearance_weight,
+            "grounding": masked_mean(grounding, has_pick & is_grounded_BT) * config.grounding_loss_weight,
+            "place_appearance": masked_mean(nll(place_appearance, other), has_other) * appearance_weight,
+            "place": masked_mean(place_nll, has_pick),
+            "offset": masked_mean(offset_loss(offset, true_offset), has_pick) * config.offset_weight,
+            "yaw": masked_mean(nll(yaw_logits, yaw), has_pick) * config.yaw_weight,
+        }
+        metrics = pointing_metrics(
+            (pick_logits, place_logits, yaw_logits),
+            (pick, place, yaw),
+            offset - true_offset,
+            has_pick,
+            has_pick & has_place_BT,
+        )
+        metrics["appearance_accuracy"] = accuracy(pick_appearance, pick, has_pick)
+        return sum_losses(losses, metrics)
+
+    def decode(self, inputs: HeadInputs, strategy: DecodingStrategy = greedy) -> torch.Tensor:
+        """Pick an object, and bring its centre to a candidate; actions (B, T, 12)."""
+        candidates = self.candidates(inputs)
+        pick = strategy(self.pick(inputs))
+        place = strategy(self.place(inputs, candidates, pick))
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
+        offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
+        yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
+        grasp, goal = at(inputs.grasps_BTN2, pick), candidates.positions_at(place) + offset
+        held = rotated(grasp - at(inputs.positions_BTN2, pick), yaw)
+        return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
+
+    def candidates(self, inputs: HeadInputs) -> PlaceCandidates:
+        """Return all place candidates."""
+        return PlaceCandidates(inputs, inputs.first_step, inputs.prompt.objects, self.grid(inputs.first_step))
+
+    def relate(
+        self, inputs: HeadInputs, candidates: PlaceCandidates, pick_BT: torch.Tensor, place_BT: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Offset from the candidate in metres, (B, T, 2), and logits of yaw bins, (B, T, bins)."""
+        grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
+        goal = candidates.positions_at(place_BT)
+        metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
+        token_BTD = candidates.tokens_at(place_BT)
+        by_kind_BTED = torch.stack([layer(token_BTD) for layer in self.values], dim=2)
+        value_BTD = at(by_kind_BTED, candidates.kinds_C[place_BT])
+        tokens = [inputs.query_BTD, at(inputs.objects_BTND, pick_BT), value_BTD]
+        metric = metric.to(inputs.query_BTD.dtype)
+        hidden = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
+        yaw_logits = self.yaw(hidden)
+        if self.rotation_copy is not None:
+            yaw_logits = yaw_logits + self.rotation_copy(inputs.query_BTD, candidates.prompt)
+        return self.offset(hidden) * OFFSET_UNIT_M, yaw_logits
+
+    def _goal(self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Where the centre of the picked object goes, or the tool that pushes it, (B, T, 2), metres."""
+        actions = targets.actions_BTC
+        centre = carried_to(actions, at(inputs.positions_BTN2, pick_BT))
+        return torch.where(inputs.has_suction_BT[..., None], centre, actions[..., 6:8])
+
+
+class PickPointer(ObjectPointer):
+    """A pointer whose keys know geometry: relative to the last pick and place, and to other objects.
+
+    "… then put the object that was previously at its {direction} into the same {container}." And an object
+    where a scene of the prompt shows another one has to be cleared away.
+    """
+
+    def __init__(self, config: CandidateHeadConfig, width: int) -> None:
+        super().__init__(width, config.num_prompt_queries)
+        self.grounding = TextGrounding(width)
+        self.geometry = mlp((10, config.hidden_width, width))
+
+    def similarity(self, inputs: HeadInputs, scale_BTH: torch.Tensor) -> torch.Tensor:
+        """Similarity to the attended prompt objects, and to what words describe, (B, T, N)."""
+        appearance_BTA = self.grounding(inputs.prompt, inputs.query_BTD)
+        described_BTN = (inputs.appearance_BTNA @ appearance_BTA[..., None]).squeeze(-1)
+        return super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
+
+    def keys(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return the keys of the objects, geometry included, (B, T, N, D)."""
+        keys_BTND, positions_BTN2 = super().keys(inputs), inputs.positions_BTN2
+        has_previous_BT11 = (inputs.previous_BTC != 0).any(dim=-1)[..., None, None]
+        relative = []
+        for start in (0, 6):
+            vector_BTN2 = positions_BTN2 - inputs.previous_BTC[..., None, start : start + 2]
+            vector_BTN2 = (vector_BTN2 / OFFSET_UNIT_M).clamp(-_MAX_DISTANCE, _MAX_DISTANCE)
+            relative += [vector_BTN2, vector_BTN2.norm(dim=-1, keepdim=True)]
+        relative_BTNG = torch.cat([*relative, torch.ones_like(relative[1])], dim=-1) * has_previous_BT11
+        prompt, num_objects = inputs.prompt.objects, positions_BTN2.shape[2]
+        is_other_NN = ~torch.eye(num_objects, dtype=torch.bool, device=positions_BTN2.device)
+        others_BTNN = inputs.masks_BTN[:, :, None] & is_other_NN
+        near = [
+            proximity(positions_BTN2, prompt.positions_BK2[:, None], prompt.masks_BK[:, None, None]),
+            proximity(positions_BTN2, positions_BTN2, others_BTNN),
+            proximity(positions_BTN2, positions_BTN2, others_BTNN, _ON_TOP_M),
+        ]
+        geometry_BTNG = torch.cat([relative_BTNG, *near], dim=-1)
+        return keys_BTND + self.geometry(geometry_BTNG.to(keys_BTND.dtype))
+
+
+class RotationCopy(nn.Module):
+    """Logits of the rotations that objects make between images of the prompt."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(width, width)
+        self.weight = nn.Linear(width, 1)
+
+    def forward(self, query_BTD: torch.Tensor, objects: ObjectSet) -> torch.Tensor:
+        """Return logits of the bins, (B, T, R)."""
+        scores_BTK = self.query(query_BTD) @ self.key(objects.tokens_BKD).mT * query_BTD.shape[-1] ** -0.5
+        has_rotation_BK = objects.masks_BK & (objects.rotations_BKR > 0).any(dim=-1)
+        weights_BTK = torch.softmax(mask_scores(scores_BTK, has_rotation_BK[:, None]), dim=-1)
+        weights_BTK = weights_BTK * has_rotation_BK[:, None]
+        return F.softplus(self.weight(query_BTD)) * _ROTATION_SCALE * (weights_BTK @ objects.rotations_BKR)
+
+
+class PlacePointer(nn.Module):
+    """Scores the place candidates for an object that was picked.
+
+    A logit sums up: query · key; similarity to the picked object, and to what the prompt asks for; the kind
+    of candidate; and geometry relative to the picked object. What the prompt asks for is a prompt object
+    that the query attends to, or words: "… into the blue object."
+    """
+
+    def __init__(self, config: CandidateHeadConfig, width: int) -> None:
+        super().__init__()
+        self.context = nn.Linear(2 * width, width)
+        self.step_embedding = nn.Embedding(config.num_index_embeddings, width)
+        self.image_embedding = nn.Embedding(config.num_index_embeddings, width)
+        self.query = nn.Linear(width, width)
+        self.keys = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
+        self.prompt_query = nn.Linear(width, width)
+        self.prompt_key = nn.Linear(width, width)
+        self.grounding = TextGrounding(width)
+        # For each kind of candidate: weights of both similarities, and a bias.
+        self.picked_scale, self.prompt_scale, self.kind_bias = (
+            nn.Linear(width, len(KINDS)) for _ in range(3)
+        )
+        self.geometry = nn.Linear(width, NUM_GEOMETRY)
+        self.same = nn.Linear(width, 1)  # logit of the place of the picked object itself
+        for layer, bias in (
+            (self.picked_scale, (0.0, 5.0, 5.0, 0.0)),
+            (self.prompt_scale, (10.0, 0.0, 0.0, 0.0)),
+        ):
+            nn.init.zeros_(layer.weight)
+            with torch.no_grad():
+                layer.bias.copy_(torch.tensor(bias))
+        for table in (self.step_embedding, self.image_embedding):
+            nn.init.normal_(table.weight, std=0.1)
+
+    def forward(self, inputs: HeadInputs, candidates: PlaceCandidates, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Return logits, (B, T, C); candidates that do not exist get the most negative number."""
+        last = self.step_embedding.num_embeddings - 1
+        context_BTD = self._context(inputs, pick_BT)
+        query_BTD = self.query(context_BTD) * inputs.query_BTD.shape[-1] ** -0.5
+        kept_BKD = candidates.keys(self.keys) + self.image_embedding(
+            candidates.image_index_BK.clamp(max=last)
+        )
+        logits_BTC = products(query_BTD, self.keys[0](inputs.objects_BTND), kept_BKD)
+        kept_BKA, kinds_C = candidates.appearance_BKA, candidates.kinds_C
+        for scale, appearance_BTA in (
+            (self.picked_scale, at(inputs.appearance_BTNA, pick_BT)),
+            (self.prompt_scale, self._prompt_appearance(inputs, context_BTD)),
+        ):
+            similarity_BTC = products(appearance_BTA, inputs.appearance_BTNA, kept_BKA)
+            logits_BTC = logits_BTC + F.softplus(scale(context_BTD))[..., kinds_C] * similarity_BTC
+        logits_BTC = logits_BTC + self.kind_bias(context_BTD)[..., kinds_C]
+        geometry_BTCG = candidates.geometry(pick_BT).to(logits_BTC.dtype)
+        logits_BTC = logits_BTC + torch.einsum("btg,btcg->btc", self.geometry(context_BTD), geometry_BTCG)
+        picked_BTC = F.one_hot(pick_BT, logits_BTC.shape[-1]).to(logits_BTC.dtype)
+        logits_BTC = logits_BTC + self.same(context_BTD) * picked_BTC
+        return mask_scores(logits_BTC, candidates.masks_BTC)
+
+    def appearance_scores(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Return logits (B, T, N) of objects in view, by similarity to what the prompt asks for alone."""
+        context_BTD = self._context(inputs, pick_BT)
+        appearance_BTA = self._prompt_appearance(inputs, context_BTD)
+        scores_BTN = (inputs.appearance_BTNA @ appearance_BTA[..., None]).squeeze(-1)
+        scores_BTN = scores_BTN * F.softplus(self.prompt_scale(context_BTD))[..., :1].detach()
+        return mask_scores(scores_BTN, inputs.masks_BTN)
+
+    def _context(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Combine the action query, the picked object and the index of the step, (B, T, D)."""
+        steps_T = inputs.steps_T.clamp(max=self.step_embedding.num_embeddings - 1)
+        picked_BTD = at(inputs.objects_BTND, pick_BT)
+        context_BTD = self.context(torch.cat([inputs.query_BTD, picked_BTD], dim=-1))
+        return torch.relu(context_BTD + self.step_embedding(steps_T))
+
+    def _prompt_appearance(self, inputs: HeadInputs, context_BTD: torch.Tensor) -> torch.Tensor:
+        """Appearance of what the prompt asks for, (B, T, A): from words, and from the attended object."""
+        prompt = inputs.prompt
+        query_BTD, key_BLD = self.prompt_query(context_BTD), self.prompt_key(prompt.masked_BLD)
+        attended_BTA = attend(query_BTD, key_BLD, prompt.object_mask_BL, prompt.appearance_BLA)
+        return self.grounding(prompt, context_BTD) + attended_BTA

@@ -1,0 +1,194 @@
+"""Place candidates: objects in view, at the first step and in the prompt, and grid points of the table.
+
+They are concatenated in this order; only those in view differ from step to step.
+
+Shape suffixes as in `inputs.py`; C candidates, G geometric features, X any features.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.policies.nn.actions import ActionTargets
+from openvima.policies.pointer.geometry import OFFSET_UNIT_M
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at
+
+KINDS = ("in view", "first step", "prompt", "grid")  # where candidates come from
+NUM_GEOMETRY = 6
+# A candidate this near to the demonstrated place is right. Boxes of rotated objects have their centres up to
+# 36 mm from where the old centre goes; in 300 demonstrations nothing else was within 50 mm of a place that
+# something was carried to.
+COPIED_WITHIN_M = 0.04
+_SAME_PLACE_M = 0.03  # scale of the "same place" feature
+_NEIGHBOURHOOD_M = 0.1  # scale of the "neighbour" features
+_GRID_X_MM, _GRID_Y_MM = (300, 700, 4), (-420, 420, 8)  # first and last line of the grid, and how many
+
+
+class GridCandidates(nn.Module):
+    """Points of a grid on the table, each with a learned token: places where nothing is or was."""
+
+    points_mm: torch.Tensor
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        lines = (np.linspace(*line) for line in (_GRID_X_MM, _GRID_Y_MM))
+        points = np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2).round().astype(np.int64)
+        # A constant has a device of its own, so that a network on the meta device has it, too; integers
+        # survive half precision.
+        self.register_buffer("points_mm", torch.tensor(points, device="cpu"), persistent=False)
+        self.tokens = nn.Parameter(torch.randn(len(points), width) * 0.1)
+
+    def forward(self, like: ObjectSet) -> ObjectSet:
+        """Return them for every episode of a batch of object sets."""
+        batch, count = len(like.masks_BK), len(self.points_mm)
+        index_BK = torch.zeros(batch, count, dtype=torch.int64, device=self.points_mm.device)
+        points_K2 = self.points_mm.to(like.positions_BK2.dtype) / 1000
+        return ObjectSet(
+            self.tokens.expand(batch, -1, -1),
+            torch.ones_like(index_BK, dtype=torch.bool),
+            like.appearance_BKA.new_zeros(batch, count, like.appearance_BKA.shape[-1]),
+            points_K2.expand(batch, -1, -1),
+            index_BK,
+            like.rotations_BKR.new_zeros(batch, count, like.rotations_BKR.shape[-1]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceCandidates:
+    """All candidates of a batch.
+
+    Args:
+        inputs: Knows the objects in view.
+        first_step: Objects in view at the first step.
+        prompt: Objects of prompt images.
+        grid: Grid points.
+    """
+
+    inputs: HeadInputs
+    first_step: ObjectSet
+    prompt: ObjectSet
+    grid: ObjectSet
+
+    @property
+    def sets(self) -> tuple[ObjectSet, ObjectSet, ObjectSet]:
+        """Those that are the same at every step, in order."""
+        return self.first_step, self.prompt, self.grid
+
+    @property
+    def masks_BTC(self) -> torch.Tensor:
+        """Which candidates exist."""
+        masks_BTN = self.inputs.masks_BTN
+        masks_BTK = torch.cat([part.masks_BK for part in self.sets], dim=1)[:, None]
+        return torch.cat([masks_BTN, masks_BTK.expand(-1, masks_BTN.shape[1], -1)], dim=2)
+
+    @property
+    def positions_BTC2(self) -> torch.Tensor:
+        """Their positions, metres."""
+        now_BTN2 = self.inputs.positions_BTN2
+        kept_BTK2 = torch.cat([part.positions_BK2 for part in self.sets], dim=1)[:, None]
+        return torch.cat([now_BTN2, kept_BTK2.expand(-1, now_BTN2.shape[1], -1, -1)], dim=2)
+
+    @property
+    def kinds_C(self) -> torch.Tensor:
+        """Where each comes from, as an index of `KINDS`, int64."""
+        masks_BTN = self.inputs.masks_BTN
+        counts = torch.tensor([masks_BTN.shape[2], *(part.masks_BK.shape[1] for part in self.sets)])
+        return torch.arange(len(counts)).repeat_interleave(counts).to(masks_BTN.device)
+
+    @property
+    def appearance_BKA(self) -> torch.Tensor:
+        """Appearance of those that are the same at every step."""
+        return torch.cat([part.appearance_BKA for part in self.sets], dim=1)
+
+    @property
+    def image_index_BK(self) -> torch.Tensor:
+        """Image index of those that are the same at every step."""
+        return torch.cat([part.image_index_BK for part in self.sets], dim=1)
+
+    def positions_at(self, place_BT: torch.Tensor) -> torch.Tensor:
+        """Position of one candidate at every step, (B, T, 2), metres."""
+        return at(self.positions_BTC2, place_BT)
+
+    def tokens_at(self, place_BT: torch.Tensor) -> torch.Tensor:
+        """Token of one candidate at every step, (B, T, D)."""
+        num_in_view = self.inputs.masks_BTN.shape[-1]
+        kept_BKD = torch.cat([part.tokens_BKD for part in self.sets], dim=1)
+        index_BTD = (place_BT - num_in_view).clamp(min=0)[..., None].expand(-1, -1, kept_BKD.shape[-1])
+        now_BTD = at(self.inputs.objects_BTND, place_BT.clamp(max=num_in_view - 1))
+        return torch.where((place_BT < num_in_view)[..., None], now_BTD, kept_BKD.gather(1, index_BTD))
+
+    def keys(self, layers: nn.ModuleList) -> torch.Tensor:
+        """Keys of those that are the same at every step, (B, K, D), each kind through its own layer."""
+        parts = zip(layers[1:], self.sets, strict=True)
+        return torch.cat([layer(part.tokens_BKD) for layer, part in parts], dim=1)
+
+    def geometry(self, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Geometric features, (B, T, C, G).
+
+        x, y and distance relative to the picked object, and whether it is there; whether another object in
+        view is near, and whether an object of the prompt is.
+        """
+        inputs, positions_BTC2 = self.inputs, self.positions_BTC2
+        relative_BTC2 = positions_BTC2 - at(inputs.positions_BTN2, pick_BT)[:, :, None]
+        distance_BTC1 = relative_BTC2.norm(dim=-1, keepdim=True)
+        same_BTC1 = torch.exp(-(distance_BTC1 / _SAME_PLACE_M).square())
+        others_BTN = inputs.masks_BTN & ~F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).bool()
+        near = [
+            proximity(positions_BTC2, inputs.positions_BTN2, others_BTN[:, :, None]),
+            proximity(
+                positions_BTC2, self.prompt.positions_BK2[:, None], self.prompt.masks_BK[:, None, None]
+            ),
+        ]
+        scaled = (relative_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M)
+        return torch.cat([*scaled, same_BTC1, *near], dim=-1)
+
+    def right(self, targets: ActionTargets, goal_BT2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Determine which candidates are right.
+
+        Args:
+            targets: Demonstrated actions.
+            goal_BT2: Where the centre of the picked object goes, metres.
+
+        Returns:
+            Which candidates are right, (B, T, C), at least one; and whether that follows from what is known,
+            (B, T): a grid point is one of many that would do.
+        """
+        masks_BTC, num_grid = self.masks_BTC, self.grid.masks_BK.shape[1]
+        distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
+        count = masks_BTC.shape[-1]
+        is_grid_C = torch.arange(count, device=masks_BTC.device) >= count - num_grid
+        near_BTC = (distance_BTC < COPIED_WITHIN_M) & masks_BTC & ~is_grid_C
+        nearest_BT = distance_BTC.masked_fill(~is_grid_C, torch.inf).argmin(-1)
+        named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, nearest_BT)
+        named_BTC = F.one_hot(named_BT, count).bool()
+        is_copied_BT = near_BTC.any(-1)
+        right_BTC = torch.where(is_copied_BT[..., None], near_BTC, named_BTC)
+        return right_BTC, is_copied_BT | (targets.place_BT >= 0)
+
+
+def products(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
+    """Dot products of a query with all candidates, (B, T, C)."""
+    now_BTN = (now_BTNX @ query_BTX[..., None]).squeeze(-1)
+    return torch.cat([now_BTN, query_BTX @ kept_BKX.mT], dim=2)
+
+
+def proximity(
+    positions_BTC2: torch.Tensor,
+    others_BTK2: torch.Tensor,
+    masks_BTCK: torch.Tensor,
+    unit_m: float = _NEIGHBOURHOOD_M,
+) -> torch.Tensor:
+    """How near the nearest other position is, (B, T, C, 1): 1 at the same place, 0 far away.
+
+    Args:
+        positions_BTC2: Positions, metres.
+        others_BTK2: Other positions, metres; here and below T may be 1.
+        masks_BTCK: Which of them count for which position; C may be 1.
+        unit_m: Scale of the distance.
+    """
+    distance_BTCK = (positions_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
+    near_BTCK = torch.exp(-(distance_BTCK / unit_m).square()) * masks_BTCK
+    return F.pad(near_BTCK, (0, 1)).amax(dim=-1, keepdim=True)  # there may be none

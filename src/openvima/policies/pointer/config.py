@@ -1,0 +1,164 @@
+"""Sizes of the pointer models, `nano` and `small`."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from openvima.errors import ConfigError
+from openvima.policies.input_layout import InputLayout
+from openvima.policies.nn.conv_encoder import ConvConfig
+from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
+from openvima.policies.sizes import size
+from openvima.policies.tokenizer import vocabulary_size
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectHeadConfig:
+    """Sizes of the head that points at objects in view, and weights of its losses.
+
+    Args:
+        hidden_width: Width of the hidden layers that predict offset and yaw.
+        num_yaw_bins: Classes of the rotation between pick and place, over a full circle; bin 0 is none.
+        offset_weight: Weight of the offset loss relative to the pointers'.
+        yaw_weight: Weight of the yaw loss.
+    """
+
+    hidden_width: int = 128
+    num_yaw_bins: int = 72
+    offset_weight: float = 2.0
+    yaw_weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.num_yaw_bins < 2 or self.hidden_width < 1:
+            raise ConfigError("object head: it needs at least 2 yaw bins and a hidden width of at least 1.")
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateHeadConfig:
+    """Sizes of the head that points at place candidates, and weights of its losses.
+
+    Args:
+        hidden_width: Width of the hidden layers that predict offset and yaw.
+        num_yaw_bins: Classes of the rotation between pick and place, over a full circle; bin 0 is none.
+        offset_weight: Weight of the offset loss relative to the pointers'.
+        yaw_weight: Weight of the yaw loss.
+        appearance_loss_weight: Weight of the losses of picking, and of placing at an object in view, by
+            appearance alone. They train the attention to the prompt and the grounding of words; known objects
+            can be found without, novel ones cannot.
+        grounding_loss_weight: Weight of the loss of attending to the prompt object most similar to the picked
+            one, where there is one.
+        num_prompt_queries: Prompt objects that the pick attends to at once.
+        num_index_embeddings: Prompt images, and steps, with an embedding of their index; later ones share the
+            last.
+    """
+
+    hidden_width: int = 128
+    num_yaw_bins: int = 72
+    offset_weight: float = 2.0
+    yaw_weight: float = 0.5
+    appearance_loss_weight: float = 0.5
+    grounding_loss_weight: float = 0.5
+    num_prompt_queries: int = 2
+    num_index_embeddings: int = 16
+
+    def __post_init__(self) -> None:
+        least = min(self.hidden_width, self.num_prompt_queries, self.num_index_embeddings)
+        if self.num_yaw_bins < 2 or least < 1:
+            raise ConfigError(
+                f"candidate head: num_yaw_bins is {self.num_yaw_bins}, hidden_width {self.hidden_width}, "
+                f"num_prompt_queries {self.num_prompt_queries} and num_index_embeddings "
+                f"{self.num_index_embeddings}; they must be at least 2, 1, 1 and 1."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class CorrespondenceConfig:
+    """Sizes of the attention between objects of two images.
+
+    Args:
+        hidden_width: Width of the hidden layer that reads the differences.
+        num_heads: Objects that each object is compared with, such as the latest and the earliest similar one.
+    """
+
+    hidden_width: int = 192
+    num_heads: int = 2
+
+    def __post_init__(self) -> None:
+        if self.hidden_width < 1 or self.num_heads < 1:
+            raise ConfigError(
+                f"correspondence: hidden_width is {self.hidden_width} and num_heads {self.num_heads}; both "
+                "must be at least 1."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class PointerConfig:
+    """Sizes of a pointer model.
+
+    Args:
+        images: The object encoder, with fused views and an appearance embedding.
+        prompt: The prompt encoder.
+        decoder: The decoder.
+        head: Where actions come from: objects in view, or place candidates.
+        action_width: Width of the features of each part of a past action.
+        correspondence: Attention between objects of different images; None for none.
+        coreference: Words attend to the images that followed the same word before: "This is a wug {image}.
+            Put the wug …"
+    """
+
+    architecture: ClassVar[str] = "pointer"
+    images: ObjectEncoderConfig
+    prompt: PromptEncoderConfig
+    decoder: DecoderConfig
+    head: ObjectHeadConfig | CandidateHeadConfig
+    action_width: int = 64
+    correspondence: CorrespondenceConfig | None = None
+    coreference: bool = False
+
+    def __post_init__(self) -> None:
+        check_widths(self.images.width, self.decoder.width)
+        if not self.images.fuse_views or not self.images.appearance_width:
+            raise ConfigError("pointer: images needs fuse_views and an appearance_width above 0.")
+
+    @property
+    def inputs(self) -> InputLayout:
+        """What the processor makes of images."""
+        return InputLayout("objects")
+
+
+def nano() -> PointerConfig:
+    """2.2 M parameters: trains on two cores within minutes."""
+    images = ObjectEncoderConfig(
+        ConvConfig(width=32, output_width=128),
+        box_width=64,
+        width=128,
+        fuse_views=True,
+        appearance_width=128,
+        crop_dropout=0.5,
+    )
+    decoder = DecoderConfig(width=128, num_layers=2, num_self_heads=4, num_cross_heads=4)
+    return PointerConfig(images, size("nano").prompt, decoder, ObjectHeadConfig())
+
+
+def small() -> PointerConfig:
+    """8.5 M parameters: place candidates, correspondence between images, coreference in the prompt."""
+    text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
+    images = ObjectEncoderConfig(
+        ConvConfig(width=48, output_width=192, place_channels=32),
+        box_width=64,
+        width=192,
+        fuse_views=True,
+        appearance_width=128,
+        crop_dropout=0.35,
+        rotation_bins=72,
+    )
+    return PointerConfig(
+        images,
+        PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size()),
+        DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
+        CandidateHeadConfig(),
+        correspondence=CorrespondenceConfig(),
+        coreference=True,
+    )

@@ -1,0 +1,341 @@
+"""The pointer models: they point at objects instead of regressing coordinates.
+
+Shape suffixes: B batch, T steps, L prompt positions, I image tokens of all prompts, S objects in all
+prompts, M objects in one prompt, V views, N objects in view, Q tokens of a step, K images, F width of image
+features, A width of appearance, D width of the decoder, C components of an action, R bins of rotations.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.policies.nn.action_encoder import ActionEncoder
+from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, to_unit_range
+from openvima.policies.nn.decoder import Decoder, KVCache, TokenSegment
+from openvima.policies.nn.history import (
+    ObservationTokens,
+    action_segment,
+    decode_observations,
+    shift_actions,
+)
+from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
+from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.pointer.candidate_head import CandidatePointerHead
+from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
+from openvima.policies.pointer.coreference import Coreference, coreference
+from openvima.policies.pointer.correspondence import (
+    Correspondence,
+    ObjectFeatures,
+    RotationBetween,
+    in_earlier_image,
+    in_same_kind_of_image,
+    is_another,
+)
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
+from openvima.policies.pointer.object_head import ObjectPointerHead
+from openvima.policies.processor import HistoryBatch, PromptBatch
+from openvima.policies.tokenizer import PADDING_ID, texture_word_ids
+from openvima.scene import END_EFFECTORS
+
+SUCTION = END_EFFECTORS.index("suction")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecodingState:
+    """What is known of the steps so far; all episodes of a batch have equally many.
+
+    Args:
+        cache: Keys and values.
+        num_steps: Number of steps.
+        first_step: Objects in view at the first of them; None before it.
+    """
+
+    cache: KVCache
+    num_steps: int = 0
+    first_step: ObjectSet | None = None
+
+    def select(self, rows: Sequence[int]) -> "DecodingState":
+        """Return the state of some rows of the batch."""
+        first_step = self.first_step.select(rows) if self.first_step else None
+        return DecodingState(self.cache.select(rows), self.num_steps, first_step)
+
+
+class Pointer(PolicyNetwork):
+    """Fused object tokens, cross-attention to the prompt, and a head that points.
+
+    "Put the {a} into the {b}." with one object in each image, two objects on the table, second step:
+
+        prompt   [put, the, A, into, the, B, ., end]
+        history  [obj, obj, query, action, obj, obj, query]
+                             |                        |
+                         1st action               2nd action
+
+    The prompt is encoded twice, once with appearance masked: that encoding tells roles. Appearance
+    embeddings, pretrained by contrast, then match prompt objects with objects in view.
+    """
+
+    score = "accuracy"
+
+    def __init__(self, config: PointerConfig) -> None:
+        super().__init__()
+        width, images, words = config.decoder.width, config.images, config.prompt.text.width
+        self.config = config
+        self.images = ObjectEncoder(images)
+        self.prompt = PromptEncoder(config.prompt, image_token_width=images.width, width=width)
+        self.coreference = Coreference(words) if config.coreference else None
+        self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
+        self.observation_out = nn.Linear(images.width + NUM_END_EFFECTORS, width)
+        self.actions = ActionEncoder(config.action_width, width)
+        self.decoder = Decoder(config.decoder)
+        self.query = nn.Parameter(torch.randn(width) * 0.02)
+        self.text_appearance: nn.Linear | None = None
+        if isinstance(config.head, CandidateHeadConfig):
+            rotation_bins = images.rotation_bins if config.correspondence else 0
+            self.head = CandidatePointerHead(config.head, width, rotation_bins)
+            self.text_appearance = nn.Linear(words, images.appearance_width, bias=False)
+            nn.init.zeros_(self.text_appearance.weight)
+        else:
+            self.head = ObjectPointerHead(config.head, width)
+        self.correspondence: Correspondence | None = None  # within the prompt, or within the view
+        self.prompt_correspondence: Correspondence | None = None  # from the view to the prompt
+        if config.correspondence:
+            self.correspondence = Correspondence(config.correspondence, images)
+            self.prompt_correspondence = Correspondence(config.correspondence, images)
+
+    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
+        return self.images.encode_images(images)
+
+    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> PointerPrompt:
+        """Encode prompts with and without appearance, and gather their objects."""
+        features_VSF = features_KF[prompts.crop_index_VS]
+        is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
+        appearance_SA = self.images.embed_appearance(features_VSF, prompts.masks_VS)
+        order_BM = _images_first(is_image_BL)
+        exists_BM = is_image_BL.gather(1, order_BM)
+        row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
+        objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
+        changes_BMD, rotations_BMR = self._changes_in_prompt(objects)
+        changes_SD = features_VSF.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
+        changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
+        weights_BLL = coreference(prompts).to(features_VSF.dtype)
+        tokens_BLD = self._encode(prompts, features_VSF, changes_SD, weights_BLL)
+        describes_BL = self._describes_appearance(prompts.word_ids_BL)
+        masked = replace(prompts, word_ids_BL=prompts.word_ids_BL.masked_fill(describes_BL, PADDING_ID))
+        masked_BLD = self._encode(masked, torch.zeros_like(features_VSF), changes_SD, weights_BLL)
+        appearance_BLA = tokens_BLD.new_zeros(*is_image_BL.shape, appearance_SA.shape[-1])
+        if len(appearance_SA):
+            appearance_BLA = appearance_SA[prompts.object_index_BL.clamp(min=0)] * is_image_BL[..., None]
+        object_mask_BL = is_image_BL
+        if self.coreference is not None:
+            appearance_BLA = appearance_BLA + weights_BLL @ appearance_BLA
+            object_mask_BL = is_image_BL | (weights_BLL > 0).any(dim=-1)
+        index_BMD = order_BM[..., None].expand(-1, -1, tokens_BLD.shape[-1])
+        object_set = ObjectSet.of(tokens_BLD.gather(1, index_BMD), objects, rotations_BMR)
+        return PointerPrompt(
+            tokens_BLD,
+            masked_BLD,
+            prompts.mask_BL,
+            object_mask_BL,
+            appearance_BLA,
+            self._described_appearance(prompts.word_ids_BL, describes_BL, appearance_BLA),
+            objects,
+            replace(object_set, image_index_BK=_scene_index(objects)),
+        )
+
+    def init_cache(self, prompt: PointerPrompt) -> DecodingState:
+        """Return the state of decoding after the prompt and before the first step."""
+        return DecodingState(self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL))
+
+    def loss(
+        self,
+        prompt: PointerPrompt,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        targets: ActionTargets,
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Decode whole histories and compare with what was demonstrated."""
+        previous = shift_actions(targets)
+        inputs, _ = self._head_inputs(prompt, self.init_cache(prompt), history, features_KF, *previous)
+        return self.head.loss(inputs, targets)
+
+    def decode_step(
+        self,
+        prompt: PointerPrompt,
+        state: DecodingState,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+        strategy: DecodingStrategy = greedy,
+    ) -> tuple[torch.Tensor, DecodingState]:
+        """Decode the actions of the next steps, of which the earlier ones are in the state."""
+        inputs, state = self._head_inputs(prompt, state, history, features_KF, previous_BTC, has_previous_BT)
+        return self.head.decode(inputs, strategy), state
+
+    def _head_inputs(
+        self,
+        prompt: PointerPrompt,
+        state: DecodingState,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+    ) -> tuple[HeadInputs, DecodingState]:
+        """Decode steps of a previous action and an observation each."""
+        features_BTVNF = features_KF[history.crop_index_BTVN]
+        appearance_BTNA = self.images.embed_appearance(features_BTVNF, history.masks_BTVN)
+        objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
+        tokens = self._observation_tokens(history, features_BTVNF, self._changes_in_view(objects, prompt))
+        previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
+        outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
+        objects_BTND = outputs_BTQD[:, :, :-1]
+        first_step, num_steps = state.first_step, history.steps_BT.shape[1]
+        if first_step is None:
+            first = objects.at_step(0)
+            no_rotations = first.appearance_NA[..., :0]
+            first_step = ObjectSet.of(objects_BTND[:, 0], first, no_rotations)
+        steps_T = torch.arange(state.num_steps, state.num_steps + num_steps, device=prompt.mask_BL.device)
+        inputs = HeadInputs(
+            query_BTD=tokens.query(outputs_BTQD),
+            objects_BTND=objects_BTND,
+            masks_BTN=history.masks_BTVN.any(dim=2),
+            appearance_BTNA=appearance_BTNA,
+            positions_BTN2=objects.positions_N2,
+            grasps_BTN2=history.grasps_BTN2.to(objects.positions_N2.dtype),
+            has_suction_BT=history.end_effector_BT == SUCTION,
+            previous_BTC=previous_BTC * has_previous_BT[..., None],
+            steps_T=steps_T,
+            first_step=first_step,
+            prompt=prompt,
+        )
+        return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
+
+    def _observation_tokens(
+        self, history: HistoryBatch, features_BTVNF: torch.Tensor, changes_BTND: torch.Tensor
+    ) -> ObservationTokens:
+        tokens_BTNE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN) + changes_BTND
+        tokens_BTND = self.add_end_effector(tokens_BTNE, history.end_effector_BT)
+        query_BT1D = self.query.expand(*tokens_BTND.shape[:2], 1, -1)
+        mask_BTQ = torch.cat([history.masks_BTVN.any(dim=2), history.steps_BT[..., None]], dim=2)
+        query_BT = torch.full_like(history.num_slots_BT, tokens_BTND.shape[2])
+        return ObservationTokens(
+            torch.cat([tokens_BTND, query_BT1D], dim=2), mask_BTQ, query_BT, history.steps_BT
+        )
+
+    def _action_segment(
+        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
+    ) -> TokenSegment:
+        unit_BTC = to_unit_range(actions_BTC.to(torch.float64)).to(dtype)
+        return action_segment(self.actions(unit_BTC)[:, :, None], exists_BT)
+
+    def _encode(
+        self,
+        prompts: PromptBatch,
+        features_VSF: torch.Tensor,
+        changes_SD: torch.Tensor,
+        weights_BLL: torch.Tensor,
+    ) -> torch.Tensor:
+        tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS) + changes_SD
+        tokens_BLW, images_BLW = self.prompt.embed(prompts, tokens_IE)
+        if self.coreference is not None:
+            tokens_BLW = self.coreference(tokens_BLW, images_BLW, weights_BLL)
+        return self.prompt.encode(tokens_BLW, images_BLW, prompts.mask_BL)
+
+    def _changes_in_prompt(self, objects: ObjectFeatures) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compare objects with those of earlier images: changes of tokens, (B, M, D), and rotations."""
+        if self.correspondence is None:
+            none_BM = objects.appearance_NA.new_zeros(*objects.image_index_N.shape, self.config.images.width)
+            return none_BM, none_BM[..., :0]
+        allowed = in_earlier_image(objects) & in_same_kind_of_image(objects)
+        return self.correspondence(objects, objects, allowed, self._rotation_between)
+
+    def _changes_in_view(self, objects: ObjectFeatures, prompt: PointerPrompt) -> torch.Tensor:
+        """Compare objects in view with each other and with those of the prompt, (B, T, N, D)."""
+        if self.correspondence is None or self.prompt_correspondence is None:
+            return objects.appearance_NA.new_zeros(())
+        shown, rotation_between = prompt.features.at_each_step(), self._rotation_between
+        within_BTND, _ = self.correspondence(objects, objects, is_another(objects), rotation_between)
+        allowed = in_earlier_image(objects, shown)
+        return within_BTND + self.prompt_correspondence(objects, shown, allowed, rotation_between)[0]
+
+    @property
+    def _rotation_between(self) -> RotationBetween | None:
+        return self.images.rotation_between if self.config.images.rotation_bins else None
+
+    def _describes_appearance(self, word_ids_BL: torch.Tensor) -> torch.Tensor:
+        """Which words describe appearance, (B, L): in our own vocabulary names of textures.
+
+        Other words have no appearance: it would be that of the objects they occurred with in training.
+        """
+        if self.text_appearance is None or self.config.prompt.tokenizer != "closed":
+            return torch.zeros_like(word_ids_BL, dtype=torch.bool)
+        return torch.isin(word_ids_BL, torch.tensor(sorted(texture_word_ids()), device=word_ids_BL.device))
+
+    def _described_appearance(
+        self, word_ids_BL: torch.Tensor, describes_BL: torch.Tensor, like_BLA: torch.Tensor
+    ) -> torch.Tensor:
+        """Appearance that words describe, (B, L, A); zero for other words."""
+        if self.text_appearance is None:
+            return torch.zeros_like(like_BLA)
+        return self.text_appearance(self.prompt.words(word_ids_BL)) * describes_BL[..., None]
+
+
+def _images_first(is_image_BL: torch.Tensor) -> torch.Tensor:
+    """Positions of the images of each prompt, in reading order, then some others, (B, M)."""
+    order_BL = is_image_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
+    return order_BL[:, : int(is_image_BL.sum(dim=1).max())]
+
+
+def _prompt_objects(
+    prompts: PromptBatch,
+    row_BM: torch.Tensor,
+    exists_BM: torch.Tensor,
+    features_VSF: torch.Tensor,
+    appearance_SA: torch.Tensor,
+) -> ObjectFeatures:
+    """Gather the objects of each prompt."""
+    metric = torch.promote_types(features_VSF.dtype, torch.float32)  # half precision is too coarse for metres
+    return ObjectFeatures(
+        features_VNF=features_VSF[:, row_BM].transpose(0, 1),
+        boxes_VN4=prompts.boxes_VS4[:, row_BM].transpose(0, 1),
+        masks_VN=(prompts.masks_VS[:, row_BM] & exists_BM).transpose(0, 1),
+        appearance_NA=appearance_SA[row_BM],
+        positions_N2=prompts.positions_S2[row_BM].to(metric),
+        in_scene_N=prompts.in_scene_S[row_BM] & exists_BM,
+        image_index_N=prompts.image_index_S[row_BM] * exists_BM,
+    )
+
+
+def _objects_in_view(
+    history: HistoryBatch,
+    features_BTVNF: torch.Tensor,
+    appearance_BTNA: torch.Tensor,
+    prompt: ObjectFeatures,
+) -> ObjectFeatures:
+    """Gather the objects in view; their image index comes after the prompt's last."""
+    exists_BTN = history.masks_BTVN.any(dim=2)
+    now_BTN = torch.zeros_like(exists_BTN, dtype=torch.int64)
+    if prompt.image_index_N.shape[1]:
+        now_BTN = now_BTN + (prompt.image_index_N.amax(dim=1) + 1)[:, None, None]
+    metric = torch.promote_types(features_BTVNF.dtype, torch.float32)
+    return ObjectFeatures(
+        features_BTVNF,
+        history.boxes_BTVN4,
+        history.masks_BTVN,
+        appearance_BTNA,
+        history.positions_BTN2.to(metric),
+        exists_BTN,
+        now_BTN,
+    )
+
+
+def _scene_index(objects: ObjectFeatures) -> torch.Tensor:
+    """Index of the scene that shows each object among the scenes of its prompt, (B, M)."""
+    image_index_BM = objects.image_index_N
+    is_next_BM = image_index_BM != F.pad(image_index_BM[:, :-1], (1, 0), value=-1)
+    return ((is_next_BM & objects.in_scene_N).cumsum(dim=1) - 1).clamp(min=0)

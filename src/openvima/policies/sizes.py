@@ -1,0 +1,131 @@
+"""The seven published sizes, and one that trains on a CPU."""
+
+from dataclasses import dataclass
+
+from openvima.errors import UnknownPolicyError, unknown_name
+from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.text_encoder import TextEncoderConfig
+from openvima.policies.nn.vit import VitConfig
+from openvima.policies.tokenizer import vocabulary_size
+
+T5_VOCABULARY_SIZE = 32128
+T5_BASE = TextEncoderConfig(width=768, num_layers=12, num_heads=12, head_width=64, hidden_width=3072)
+TUNED_T5_LAYERS = 2  # as in the paper
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """A size that every published architecture has.
+
+    Args:
+        width: Width of the decoder.
+        num_layers: Pairs of a cross block and a self block.
+        num_heads: Heads of self- and of cross-attention.
+        prompt: The prompt encoder.
+        image_width: Width of the image encoder.
+        image_layers: Layers of the image encoder.
+        image_heads: Heads of the image encoder.
+        resampler_layers: Self layers of VIMA-Flamingo's resampler, and how often they are repeated.
+        hidden_width: Hidden width of the action heads.
+        action_width: Width of the features of each part of a past action.
+        dropout: Dropout probability.
+        initial_std: Standard deviation of the decoder's fresh weights.
+    """
+
+    width: int
+    num_layers: int
+    num_heads: int
+    prompt: PromptEncoderConfig
+    image_width: int = 768
+    image_layers: int = 4
+    image_heads: int = 24
+    resampler_layers: int = 4
+    hidden_width: int = 512
+    action_width: int = 256
+    dropout: float = 0.1
+    initial_std: float = 0.02
+
+    def decoder(self) -> DecoderConfig:
+        """Return the decoder with cross-attention to the prompt."""
+        heads = self.num_heads
+        return DecoderConfig(self.width, self.num_layers, heads, heads, self.dropout, self.initial_std)
+
+    def prefix_decoder(self) -> PrefixDecoderConfig:
+        """Return the decoder with the prompt as prefix.
+
+        It has twice the layers, since a pair of blocks of the other decoder counts as one.
+        """
+        return PrefixDecoderConfig(
+            self.width, 2 * self.num_layers, self.num_heads, self.dropout, self.initial_std
+        )
+
+    def crop_encoder(self) -> VitConfig:
+        """Return the encoder of object crops: 16 × 16 patches of 32 × 32 pixels."""
+        return VitConfig(self.image_width, self.image_layers, self.image_heads, output_width=self.image_width)
+
+    def frame_encoder(self, *, class_token: bool) -> VitConfig:
+        """Return the encoder of whole frames: eight 32 × 32 patches of 64 × 128 pixels."""
+        return VitConfig(
+            self.image_width,
+            self.image_layers,
+            self.image_heads,
+            output_width=self.width,
+            patch_size=32,
+            image_height=64,
+            image_width=128,
+            class_token=class_token,
+        )
+
+
+def _published(width: int, num_layers: int) -> Size:
+    prompt = PromptEncoderConfig(
+        text=T5_BASE,
+        image_width=768,
+        vocabulary_size=T5_VOCABULARY_SIZE,
+        tokenizer="t5",
+        train_words=False,
+        trained_layers=TUNED_T5_LAYERS,
+    )
+    return Size(width, num_layers, num_heads=width // 32, prompt=prompt)
+
+
+def _nano() -> Size:
+    text = TextEncoderConfig(width=128, num_layers=2, num_heads=4, head_width=32, hidden_width=256)
+    return Size(
+        width=128,
+        num_layers=2,
+        num_heads=4,
+        prompt=PromptEncoderConfig(text, image_width=128, vocabulary_size=vocabulary_size()),
+        image_width=96,
+        image_layers=2,
+        image_heads=4,
+        resampler_layers=2,
+        hidden_width=256,
+        action_width=64,
+        initial_std=0.05,  # passes as much signal as at width 768; with 0.02 it nearly vanishes
+    )
+
+
+# Widths and layers of the paper's sizes, named after the parameters in the blocks of the decoder.
+SIZES: dict[str, Size] = {
+    "nano": _nano(),
+    "2m": _published(256, 1),
+    "4m": _published(256, 2),
+    "9m": _published(320, 3),
+    "20m": _published(384, 4),
+    "43m": _published(512, 5),
+    "92m": _published(640, 7),
+    "200m": _published(768, 11),
+}
+
+
+def size(name: str) -> Size:
+    """Return a size by name.
+
+    Raises:
+        UnknownPolicyError: There is none of that name.
+    """
+    if name not in SIZES:
+        raise UnknownPolicyError(unknown_name("size", name, SIZES))
+    return SIZES[name]
