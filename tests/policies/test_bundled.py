@@ -24,7 +24,6 @@ from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.bundled import MODEL_CARD, PACKAGED, SMALL  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
 from openvima.report import assets  # noqa: E402
 from openvima.report.assets import find_metrics  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
