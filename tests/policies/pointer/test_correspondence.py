@@ -1,0 +1,212 @@
+"""Correspondence: what attends to what, which difference it rerotations, and what makes no difference."""
+
+from dataclasses import fields, replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.policies.pointer.config import CorrespondenceConfig  # noqa: E402
+from openvima.policies.pointer.correspondence import (  # noqa: E402
+    Correspondence,
+    ObjectFeatures,
+    in_earlier_image,
+    in_same_kind_of_image,
+    is_another,
+)
+
+B, N, M, V, F, A, D = 2, 3, 4, 2, 6, 5, 8
+IMAGES = ObjectEncoderConfig(
+    ConvConfig(4, F), box_width=4, width=D, fuse_views=True, appearance_width=A, rotation_bins=8
+)
+
+
+def inputs(count: int, seed: int, **known) -> ObjectFeatures:
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    values = {
+        "features_VNF": drawn(B, V, count, F),
+        "boxes_VN4": torch.randint(10, 100, (B, V, count, 4), generator=generator),
+        "masks_VN": torch.ones(B, V, count, dtype=torch.bool),
+        "appearance_NA": torch.nn.functional.normalize(drawn(B, count, A), dim=-1),
+        "positions_N2": drawn(B, count, 2) * 0.1,
+        "in_scene_N": torch.ones(B, count, dtype=torch.bool),
+        "image_index_N": torch.zeros(B, count, dtype=torch.int64),
+    }
+    return ObjectFeatures(**{**values, **known})
+
+
+def placed(some: ObjectFeatures, order) -> ObjectFeatures:
+    """The same objects in another order."""
+    axes = {"features_VNF": -2, "boxes_VN4": -2, "positions_N2": -2, "appearance_NA": -2}
+    values = {
+        field.name: getattr(some, field.name).index_select(axes.get(field.name, -1), order)
+        for field in fields(some)
+    }
+    return ObjectFeatures(**values)
+
+
+@pytest.fixture
+def encoder() -> ObjectEncoder:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return ObjectEncoder(IMAGES).double().eval()
+
+
+@pytest.fixture
+def correspondence() -> Correspondence:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return Correspondence(CorrespondenceConfig(hidden_width=16), IMAGES).double().eval()
+
+
+ANY = torch.ones(N, M, dtype=torch.bool)
+
+
+def weights(
+    correspondence: Correspondence, own: ObjectFeatures, other: ObjectFeatures, allowed=ANY
+) -> "torch.Tensor":
+    """Attention weights, (B, H, N, M)."""
+    kept = []
+    original = correspondence._weights
+    correspondence._weights = lambda *values: kept.append(original(*values)) or kept[-1]
+    correspondence(own, other, allowed, lambda *_: torch.zeros(B, allowed.shape[-2], 8, dtype=torch.float64))
+    del correspondence._weights
+    return kept[0]
+
+
+def test_each_object_attends_to_the_most_similar_one(correspondence):
+    other = inputs(M, seed=1)
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, [2, 0, 3]])
+    attention = weights(correspondence, own, other)
+    assert (attention.argmax(-1) == torch.tensor([2, 0, 3])).all()
+    assert (attention.amax(-1) > 0.9).all()
+
+
+def test_an_object_without_a_similar_one_attends_to_nothing(correspondence):
+    other = inputs(M, seed=1, appearance_NA=torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A))
+    lonely = torch.eye(A, dtype=torch.float64)[M:].expand(B, N, A)
+    assert weights(correspondence, inputs(N, seed=2, appearance_NA=lonely), other).sum(-1).max() < 0.01
+
+
+def test_of_similar_images_one_head_takes_the_latest_and_one_the_earliest(correspondence):
+    same = torch.nn.functional.normalize(torch.ones(B, 4, A, dtype=torch.float64), dim=-1)
+    frames = inputs(4, seed=1, appearance_NA=same, image_index_N=torch.arange(4).expand(B, 4))
+    attention = weights(correspondence, frames, frames, in_earlier_image(frames))
+    assert (attention[:, 0, 3].argmax(-1) == 2).all()
+    assert (attention[:, 1, 3].argmax(-1) == 0).all()
+    assert (attention[:, :, 0] == 0).all()  # nothing is earlier than the first image
+    assert (attention.diagonal(dim1=-2, dim2=-1) == 0).all()
+
+
+def test_all_objects_are_another_but_the_object_itself():
+    assert torch.equal(is_another(inputs(3, seed=0)), ~torch.eye(3, dtype=torch.bool))
+
+
+def test_objects_of_scenes_and_objects_alone_are_kept_apart():
+    on_table = torch.tensor([[False, True, True]]).expand(B, -1)
+    same = in_same_kind_of_image(inputs(3, seed=0, in_scene_N=on_table))
+    assert same[0].tolist() == [[True, False, False], [False, True, True], [False, True, True]]
+
+
+def test_only_the_displacement_is_returned_if_all_else_is_equal(correspondence):
+    before = inputs(N, seed=1)
+    way = torch.tensor([0.05, -0.02], dtype=torch.float64)
+    after = replace(before, positions_N2=before.positions_N2 + way)
+    returned = []
+    correspondence.difference.register_forward_pre_hook(lambda _, arguments: returned.append(arguments[0]))
+    match = torch.eye(N, dtype=torch.bool)
+    correspondence(after, before, match, lambda *_: torch.zeros(B, N, 8, dtype=torch.float64))
+    per_head = returned[0][..., :-8].unflatten(-1, (2, -1))
+    found, likeness, lying, near, along, across = per_head[..., :6].unbind(-1)
+    assert (found > 0.999).all()
+    torch.testing.assert_close(likeness, found)
+    torch.testing.assert_close(lying, found)
+    assert ((near > 0.01) & (near < 0.1)).all()
+    torch.testing.assert_close(along, found * 0.5)
+    torch.testing.assert_close(across, found * -0.2)
+    torch.testing.assert_close(per_head[..., 6:], torch.zeros_like(per_head[..., 6:]), atol=1e-9, rtol=0)
+
+
+def test_positions_of_objects_alone_have_no_effect(correspondence, encoder):
+    other = inputs(M, seed=1, in_scene_N=torch.zeros(B, M, dtype=torch.bool))
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, :N])
+    moved = replace(other, positions_N2=other.positions_N2 + 0.3)
+    rotations = encoder.rotation_between
+    assert torch.equal(
+        correspondence(own, other, ANY, rotations)[0], correspondence(own, moved, ANY, rotations)[0]
+    )
+
+
+def test_neither_order_nor_what_does_not_exist_matters(correspondence, encoder):
+    masks = torch.ones(B, V, M, dtype=torch.bool)
+    masks[:, :, 3] = False
+    other = inputs(M, seed=1, masks_VN=masks)
+    own = inputs(N, seed=2, appearance_NA=other.appearance_NA[:, [3, 1, 0]])
+    returned, rotations = correspondence(own, other, ANY, encoder.rotation_between)
+    order, own_order = torch.tensor([1, 3, 0, 2]), torch.tensor([2, 0, 1])
+    mixed, mixed_rotations = correspondence(
+        placed(own, own_order), placed(other, order), ANY, encoder.rotation_between
+    )
+    torch.testing.assert_close(mixed, returned[:, own_order])
+    torch.testing.assert_close(mixed_rotations, rotations[:, own_order])
+    features = other.features_VNF.clone()
+    features[:, :, 3] = 9.0
+    changed = replace(other, features_VNF=features)
+    assert torch.equal(correspondence(own, changed, ANY, encoder.rotation_between)[0], returned)
+    fewer = placed(other, torch.arange(3))
+    torch.testing.assert_close(correspondence(own, fewer, ANY[:, :3], encoder.rotation_between)[0], returned)
+
+
+def test_there_may_be_nothing_to_attend_to(correspondence, encoder):
+    own, none = inputs(N, seed=1), inputs(0, seed=2)
+    returned, rotations = correspondence(own, none, ANY[:, :0], encoder.rotation_between)
+    assert returned.shape == (B, N, D)
+    assert returned.isfinite().all()
+    assert not rotations.any()
+
+
+def test_rotations_are_those_from_the_attended_object(correspondence, encoder):
+    """Attention to a single image returns its features unchanged."""
+    before = inputs(N, seed=1)
+    after = replace(inputs(N, seed=2), appearance_NA=before.appearance_NA)
+    _, rotations = correspondence(after, before, torch.eye(N, dtype=torch.bool), encoder.rotation_between)
+    asked = encoder.rotation_between(before.features_VNF, after.features_VNF, before.masks_VN, after.masks_VN)
+    torch.testing.assert_close(rotations, asked, atol=1e-6, rtol=1e-4)
+
+
+def test_crops_are_dropped_in_training(encoder):
+    images = replace(IMAGES, crop_dropout=0.5)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        module = Correspondence(CorrespondenceConfig(hidden_width=16), images).double()
+        before = inputs(N, seed=1)
+        own = inputs(N, seed=2, appearance_NA=before.appearance_NA)
+        seen = []
+        module.difference.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
+        match = torch.eye(N, dtype=torch.bool)
+        for _ in range(20):
+            module(own, before, match, encoder.rotation_between)
+    front = torch.stack(seen)[..., 6 : 6 + F]
+    left_out = (front == 0).all(-1).double().mean()
+    assert 0.3 < left_out < 0.7
+
+
+@pytest.mark.parametrize("sizes", [{"hidden_width": 0}, {"num_heads": 0}])
+def test_sizes_that_make_no_sense_are_refused(sizes):
+    with pytest.raises(ConfigError, match="correspondence"):
+        CorrespondenceConfig(**sizes)
+
+
+@pytest.mark.parametrize("change", [{"appearance_width": 0, "rotation_bins": 0}, {"fuse_views": False}])
+def test_a_pointer_model_needs_fused_views_and_appearance(change):
+    sizes = preset("small")
+    with pytest.raises(ConfigError, match="fuse_views"):
+        replace(sizes, images=replace(sizes.images, **change))
