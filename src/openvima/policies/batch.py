@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import torch
 
-from openvima.policies.heads.base import ActionTargets
+from openvima.policies.nn.actions import ActionTargets
 
 WORD = -1  # object index at a position that holds a word
 

@@ -14,8 +14,8 @@ from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
 from openvima.policies.base import Policy, prompt_number
 from openvima.policies.devices import usable_device
-from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, Choose, likeliest
-from openvima.policies.build import HistoryState, Memory, PolicyNetwork
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
@@ -32,8 +32,8 @@ class _Episodes:
         places: Where in the batch each one stands.
         num_slots: Their numbers of slots for objects, see `Processor.encode_observations`.
         generators: Generators of their draws.
-        memory: Their prompts.
-        state: What has been read of them.
+        prompt: Their encoded prompts.
+        state: Their decoding state.
         actions_BC: Their last actions, metres and quaternions, float32; None before the first.
         margins_B: How far the best class of their last action lay above the next, in its tightest choice;
             None before the first.
@@ -43,8 +43,8 @@ class _Episodes:
     places: tuple[int, ...]
     num_slots: tuple[int, ...]
     generators: tuple[torch.Generator, ...]
-    memory: Memory
-    state: HistoryState
+    prompt: Any  # the model's own record
+    state: Any  # likewise
     actions_BC: torch.Tensor | None
     margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]
@@ -58,7 +58,7 @@ class _Episodes:
             tuple(places),
             tuple(self.num_slots[row] for row in rows),
             tuple(self.generators[row] for row in rows),
-            self.memory.select(rows),
+            self.prompt.select(rows),
             self.state.select(rows),
             None if self.actions_BC is None else self.actions_BC[rows],
             None if self.margins_B is None else self.margins_B[rows],
@@ -70,7 +70,7 @@ class NetworkPolicy(Policy):
     """Plays several episodes at once; what the others do does not change an episode's actions.
 
     The prompt is encoded once, and keys and values of all that was read are kept, so that a step costs what
-    its own tokens cost. On a processor it computes in float64 unless told otherwise: the rounding of sums,
+    its own tokens cost. On a CPU it computes in float64 by default: the rounding of sums,
     which varies with the shape of a batch, then stays far below the float32 in which actions are sent, and
     the same episode gets the same actions in any batch. In float32 and bfloat16 that holds but for near ties.
     Large networks are several times faster in float32 and bfloat16.
@@ -82,7 +82,7 @@ class NetworkPolicy(Policy):
         tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
         extractor: Finds the objects in images; by default by the simulator's segmentation.
         device: Where to compute, such as "cpu" or "cuda".
-        dtype: Precision; by default float64 on a processor and float32 elsewhere.
+        dtype: Precision; by default float64 on a CPU and float32 elsewhere.
         temperature: 0 takes the likeliest action. Above 0 actions are drawn, with scores divided by it.
         generator: Needed to draw. Its seed and the prompt decide an episode's draws, so that they do not
             depend on the other episodes; the generator itself is left as it is.
@@ -134,14 +134,14 @@ class NetworkPolicy(Policy):
             raise PolicyError("reset got no prompts; give one for each episode.")
         batch, stack = self.processor.encode_prompts(prompts)
         features_KF, features = self._encode(stack, {})
-        memory = self.network.encode_prompt(batch.to(self.device), features_KF)
+        prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
         seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
         self._episodes = _Episodes(
             places=tuple(range(len(prompts))),
             num_slots=(0,) * len(prompts),
             generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
-            memory=memory,
-            state=self.network.begin(memory),
+            prompt=prompt,
+            state=self.network.init_cache(prompt),
             actions_BC=None,
             margins_B=None,
             features=features,
@@ -240,18 +240,22 @@ class NetworkPolicy(Policy):
         previous_BC = episodes.actions_BC
         if previous_BC is None:
             previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)
-        inputs, state = self.network.extend(
-            episodes.memory, episodes.state, history, features_KF, previous_BC[:, None], has_previous_B1
-        )
-        choose = drawing(episodes.generators, self._temperature) if self._temperature else likeliest
+        strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
         margins: list[torch.Tensor] = []
-        # The history holds actions as they are sent.
-        actions_BC = self.network.decide(inputs, state, _noting(choose, margins))[:, 0].to(torch.float32)
+        actions_B1C, state = self.network.decode_step(
+            episodes.prompt,
+            episodes.state,
+            history,
+            features_KF,
+            previous_BC[:, None],
+            has_previous_B1,
+            _recording_margins(strategy, margins),
+        )
         return replace(
             episodes,
             num_slots=tuple(batch.num_slots_BT[:, 0].tolist()),
             state=state,
-            actions_BC=actions_BC,
+            actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as they are sent
             margins_B=torch.stack(margins).amin(0) if margins else None,
             features=features,
         )
@@ -274,33 +278,13 @@ class NetworkPolicy(Policy):
         return features, dict(zip(keys, features, strict=True))
 
 
-def _noting(choose: Choose, margins: list[torch.Tensor]) -> Choose:
-    """Make the same choice, and note how far the best class of each row lies above the next, shape (B,)."""
+def _recording_margins(strategy: DecodingStrategy, margins: list[torch.Tensor]) -> DecodingStrategy:
+    """Decode likewise, and record by how much the best class of each row leads, shape (B,)."""
 
-    def noted(scores: torch.Tensor) -> torch.Tensor:
-        if scores.shape[-1] > 1:
-            best, second = scores.topk(2).values.unbind(-1)
+    def recorded(logits: torch.Tensor) -> torch.Tensor:
+        if logits.shape[-1] > 1:
+            best, second = logits.topk(2).values.unbind(-1)
             margins.append((best - second).flatten(1).amin(1))
-        return choose(scores)
+        return strategy(logits)
 
-    return noted
-
-
-def drawing(generators: Sequence[torch.Generator], temperature: float) -> Choose:
-    """Make the choice that draws classes instead of taking the likeliest.
-
-    Args:
-        generators: One for each row of the scores. A draw takes one number of it, however many classes there
-            are, so that padding changes nothing.
-        temperature: Scores are divided by it.
-    """
-
-    def draw(scores: torch.Tensor) -> torch.Tensor:
-        chances = torch.softmax(scores.to("cpu", torch.float64) / temperature, dim=-1)
-        sums = chances.cumsum(dim=-1)
-        shape = (*scores.shape[1:-1], 1)
-        drawn = [torch.rand(shape, dtype=torch.float64, generator=generator) for generator in generators]
-        chosen = torch.searchsorted(sums, torch.stack(drawn) * sums[..., -1:], right=True)
-        return chosen.squeeze(-1).clamp(max=scores.shape[-1] - 1).to(scores.device)
-
-    return draw
+    return recorded

@@ -28,9 +28,8 @@ from openvima.perception.preprocessing import (
     split_prompt,
 )
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
+from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.actions import ActionTargets
-from openvima.policies.nn.frame_encoder import FrameEncoderConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
@@ -66,17 +65,18 @@ class Processor:
 
     @staticmethod
     def of(
-        images: ObjectEncoderConfig | FrameEncoderConfig,
+        inputs: InputLayout,
         tokenizer: Tokenizer | None = None,
         extractor: ObjectExtractor | None = None,
     ) -> "Processor":
-        """Make the processor for a network whose images are encoded in this way."""
-        tokenizer = tokenizer or CLOSED_TOKENIZER
-        if isinstance(images, FrameEncoderConfig):
-            size = (images.frame.image_height, images.frame.image_width)
-            return Processor("frames", size, images.num_tokens, tokenizer)
-        layout = "objects" if images.fuse_views else "views"
-        return Processor(layout, tokenizer=tokenizer, extractor=extractor)
+        """Make the processor for a network that takes such inputs."""
+        return Processor(
+            inputs.tokens,
+            inputs.image_size,
+            inputs.tokens_per_frame_pair,
+            tokenizer or CLOSED_TOKENIZER,
+            extractor,
+        )
 
     @property
     def input_kind(self) -> InputKind:

@@ -16,6 +16,7 @@ from openvima.perception.preprocessing import InputKind
 from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
+from openvima.policies.config import config_to_dict
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.training.augment import augmented
@@ -99,7 +100,7 @@ class PolicyLearner(Learner):
         self.network = network
         self.processor = processor
         self.input_kind = processor.input_kind
-        self.score = network.head.score
+        self.score = network.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
         self._spurious_probability, self._retelling = spurious_probability, retelling
 
@@ -133,7 +134,7 @@ class PolicyLearner(Learner):
 
     def description(self) -> dict[str, Any]:  # Any: plain YAML values
         """Return all sizes of the network."""
-        return self.network.config.to_dict()
+        return config_to_dict(self.network.config)
 
 
 class PolicyCollate:

@@ -8,8 +8,8 @@ from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.errors import DatasetError, PolicyError
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.nn.actions import ACTION_WIDTH
-from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.training.inverse_dynamics import as_motion, motion_text

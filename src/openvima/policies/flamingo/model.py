@@ -6,6 +6,7 @@ Shape suffixes as in `nn/policy_network.py`; V views, P patches of a frame, N fr
 import torch
 from torch import nn
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.flamingo.config import FlamingoConfig
 from openvima.policies.nn.decoder import Decoder
 from openvima.policies.nn.history import ObservationTokens
@@ -18,7 +19,6 @@ from openvima.policies.nn.policy_network import (
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.resampler import Resampler
 from openvima.policies.nn.vit import VisionTransformer, encode_frames
-from openvima.policies.processor import HistoryBatch, PromptBatch
 
 
 class Flamingo(PolicyNetwork):

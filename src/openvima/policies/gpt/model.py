@@ -6,9 +6,11 @@ Shape suffixes as in `nn/policy_network.py`; V views, N frame pairs.
 import torch
 from torch import nn
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.gpt.config import GptConfig
 from openvima.policies.nn.decoder import PrefixDecoder
 from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.nn.object_encoder import NUM_VIEWS
 from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
@@ -17,7 +19,6 @@ from openvima.policies.nn.policy_network import (
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.vit import VisionTransformer, encode_frames
-from openvima.policies.processor import NUM_VIEWS, HistoryBatch, PromptBatch
 
 
 class Gpt(PolicyNetwork):

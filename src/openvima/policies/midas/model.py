@@ -6,6 +6,7 @@ Shape suffixes as in `nn/policy_network.py`; I image tokens of all prompts.
 import torch
 from torch import nn
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.decoder import PrefixDecoder
 from openvima.policies.nn.history import ObservationTokens
@@ -17,7 +18,6 @@ from openvima.policies.nn.policy_network import (
     build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.processor import HistoryBatch, PromptBatch
 
 
 class Midas(PolicyNetwork):

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
 from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead
 from openvima.policies.nn.bins import SCORE, BinsConfig, BinsHead
@@ -18,7 +19,6 @@ from openvima.policies.nn.decoder import CausalDecoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.processor import HistoryBatch, PromptBatch
 from openvima.scene import END_EFFECTORS
 
 NUM_END_EFFECTORS = len(END_EFFECTORS)

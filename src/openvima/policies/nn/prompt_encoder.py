@@ -11,9 +11,9 @@ import torch
 from torch import nn
 
 from openvima.errors import ConfigError
+from openvima.policies.batch import PromptBatch
 from openvima.policies.nn.mlp import mlp
 from openvima.policies.nn.text_encoder import TextEncoder, TextEncoderConfig
-from openvima.policies.processor import PromptBatch
 
 
 @dataclass(frozen=True, slots=True)

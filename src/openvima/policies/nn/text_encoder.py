@@ -54,8 +54,8 @@ class TextEncoder(nn.Module):
             mask_BL: Which positions are valid, shape (B, L), bool.
 
         Returns:
-            Shape (B, L, W); masked positions are finite and carry no meaning. Those after the last valid one, which
-            pad the batch, are not computed; there it is zero.
+            Shape (B, L, W); masked positions are finite and carry no meaning. Those after the last valid
+            one, which pad the batch, are not computed; there it is zero.
         """
         unpadder = Unpadder(mask_BL.flip(1).cumsum(dim=1).flip(1) > 0)
         numbers_L = torch.arange(tokens_BLW.shape[1], device=tokens_BLW.device)

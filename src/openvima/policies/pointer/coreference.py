@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.policies.processor import PromptBatch
+from openvima.policies.batch import PromptBatch
 
 
 class Coreference(nn.Module):

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.decoder import Decoder, KVCache, TokenSegment
@@ -37,7 +38,6 @@ from openvima.policies.pointer.correspondence import (
 )
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
 from openvima.policies.pointer.object_head import ObjectPointerHead
-from openvima.policies.processor import HistoryBatch, PromptBatch
 from openvima.policies.tokenizer import PADDING_ID, texture_word_ids
 from openvima.scene import END_EFFECTORS
 

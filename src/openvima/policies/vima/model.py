@@ -6,6 +6,7 @@ Shape suffixes as in `nn/policy_network.py`; I image tokens of all prompts.
 import torch
 from torch import nn
 
+from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.decoder import Decoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
@@ -16,7 +17,6 @@ from openvima.policies.nn.policy_network import (
     build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.processor import HistoryBatch, PromptBatch
 from openvima.policies.vima.config import VimaConfig
 
 
