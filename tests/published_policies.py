@@ -3,19 +3,18 @@
 from pathlib import Path
 
 import torch
-from openvima.policies.families.vima import vima
 
-from openvima.policies.config import PolicyConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.published import to_published
+from openvima.policies.published.names import to_published
 from openvima.policies.sizes import Size
+from openvima.policies.vima.config import VimaConfig, vima
 
 VOCABULARY_SIZE = 160
 
 
-def small_vima() -> PolicyConfig:
+def small_vima() -> VimaConfig:
     """VIMA as published, with few and narrow layers."""
     text = TextEncoderConfig(width=32, num_layers=2, num_heads=2, head_width=8, hidden_width=16)
     prompt = PromptEncoderConfig(

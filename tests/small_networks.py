@@ -2,11 +2,10 @@
 
 from dataclasses import replace
 
-from openvima.policies.nn.comparison import ComparisonConfig
-
 from openvima.policies import preset
 from openvima.policies.config import PolicyConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
+from openvima.policies.pointer.config import CorrespondenceConfig
 
 
 def narrow_small(width: int = 32, crop_width: int = 4) -> PolicyConfig:
@@ -18,7 +17,7 @@ def narrow_small(width: int = 32, crop_width: int = 4) -> PolicyConfig:
         sizes,
         images=replace(sizes.images, crop=crop, box_width=16, width=width),
         prompt=replace(sizes.prompt, text=text, image_width=width),
-        trunk=replace(sizes.trunk, width=width, num_layers=1, num_self_heads=2, num_cross_heads=2),
+        decoder=replace(sizes.decoder, width=width, num_layers=1, num_self_heads=2, num_cross_heads=2),
         head=replace(sizes.head, hidden_width=32),
-        comparison=ComparisonConfig(hidden_width=32),
+        correspondence=CorrespondenceConfig(hidden_width=32),
     )

@@ -28,7 +28,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def starts() -> list[tuple[TabletopEnv, dict]]:
-    """Environments at their start, and what they show; not to be stepped."""
+    """Environments after reset, with their observations; not to be stepped."""
     envs = [TabletopEnv(task) for task in TASKS]
     return [(env, env.reset(seed=seed)[0]) for seed, env in enumerate(envs)]
 
@@ -58,5 +58,5 @@ def small_sizes():
         sizes,
         images=replace(sizes.images, crop=ConvConfig(width=8, output_width=32), width=64),
         prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
-        trunk=replace(sizes.trunk, width=64, num_layers=1),
+        decoder=replace(sizes.decoder, width=64, num_layers=1),
     )

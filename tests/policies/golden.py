@@ -1,9 +1,9 @@
-"""Golden recordings of the published networks: their files, their inputs, and what ours makes of them.
+"""Golden recordings of the published networks: files, inputs, and what this package computes from them.
 
 A recording is a file of arrays by name: inputs (`in.…`) and what the published code computed from them, with
-two prompts and three steps of two environments. Everything about sizes is read from the files.
+two prompts and three steps of two environments. All sizes are read from the files.
 
-Shape suffixes: B batch, T steps, L places, Q slots of a step, D width, C components of an action.
+Shape suffixes: B batch, T steps, D width, C components of an action.
 """
 
 import json
@@ -20,6 +20,13 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.policies.build import outline_network
+from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
+from openvima.policies.nn.bins import BinsHead, decode_bins
+from openvima.policies.nn.history import shift_actions
+from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
 from naive_inputs import (
     WORD,
     HistoryBatch,
@@ -29,12 +36,8 @@ from naive_inputs import (
     batch_histories,
     batch_prompts,
 )
-from openvima.perception.image_stack import ImageStack
-from openvima.perception.objects import ObjectViews, see_nothing
-from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, from_unit_range, to_unit_range
-from openvima.policies.nn.bins import BinsHead, decode_bins
-from openvima.policies.build import Memory, PolicyNetwork, outline_network
-from openvima.policies.published import config_from_published, from_published
+from openvima.policies.published.config import config_from_published
+from openvima.policies.published.names import from_published
 from openvima.policies.tokenizer import PADDING_ID
 from openvima.render.camera import VIEWS
 
@@ -47,19 +50,19 @@ Arrays = dict[str, np.ndarray]
 
 
 class Recording(Arrays):
-    """The arrays of a recording by name, with a note of those that were looked at."""
+    """The arrays of a recording by name, and which of them were read."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
         super().__init__(arrays)
-        self.looked_at: set[str] = set()
+        self.was_read: set[str] = set()
 
     def __getitem__(self, name: str) -> np.ndarray:
-        self.looked_at.add(name)
+        self.was_read.add(name)
         return super().__getitem__(name)
 
     def unused_inputs(self) -> list[str]:
-        """Return the names of inputs that nothing has looked at."""
-        return [name for name in self if name.startswith("in.") and name not in self.looked_at]
+        """Return the names of inputs that nothing has read."""
+        return [name for name in self if name.startswith("in.") and name not in self.was_read]
 
 
 def needs(name: str) -> pytest.MarkDecorator:
@@ -139,7 +142,7 @@ def step_of(recorded: Arrays, kind: str, index: tuple[int, ...], end_effector: i
     return StepInput(objects, nowhere, nowhere, end_effector)
 
 
-def encode_prompts(network: PolicyNetwork, prompts: Sequence[PromptInput]) -> Memory:
+def encode_prompts(network: PolicyNetwork, prompts: Sequence[PromptInput]) -> EncodedPrompt:
     """Encode prompts as a policy does."""
     stack = _stack(network)
     numbers = [stack.add(prompt.objects.crops) for prompt in prompts]
@@ -155,26 +158,46 @@ def read_histories(
     return batch_histories(histories, numbers), _features(network, stack)
 
 
-def decide_step_by_step(network: PolicyNetwork, memory: Memory, inputs: Inputs) -> torch.Tensor:
-    """Read one step at a time, keys and values kept; return the predictions, (B, T, D)."""
-    state, queries = network.begin(memory), []
-    for t in range(len(inputs.histories[0])):
-        history, features = read_histories(network, [steps[t : t + 1] for steps in inputs.histories])
-        previous_B1C = inputs.actions_BTC[:, max(t - 1, 0), None]
-        has_previous_B1 = torch.full(previous_B1C.shape[:2], t > 0)
-        read, state = network.extend(memory, state, history, features, previous_B1C, has_previous_B1)
-        queries.append(read.query_BTD)
-    return torch.cat(queries, dim=1)
+def targets_of(history: HistoryBatch, actions_BTC: torch.Tensor) -> ActionTargets:
+    """Return actions as targets, without slots of objects."""
+    no_slots_BT = torch.full_like(history.num_slots_BT, -1)
+    return ActionTargets(actions_BTC, no_slots_BT, no_slots_BT, history.steps_BT)
 
 
-def predictions(network: PolicyNetwork, read: HeadInputs) -> Arrays:
-    """Return `pred_tokens`, and scores, bins and decoded values of each part, time first."""
+def decode_at_once(
+    network: PolicyNetwork,
+    prompt: EncodedPrompt,
+    history: HistoryBatch,
+    features: torch.Tensor,
+    actions_BTC: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Decode whole histories in one call; return the action queries, (B, T, D), and the actions."""
+    previous = shift_actions(targets_of(history, actions_BTC))
+    with watched(network) as calls:
+        decoded_BTC, _ = network.decode_step(prompt, network.init_cache(prompt), history, features, *previous)
+    return query_of(calls), decoded_BTC
+
+
+def decode_step_by_step(network: PolicyNetwork, prompt: EncodedPrompt, inputs: Inputs) -> torch.Tensor:
+    """Decode one step at a time with a key-value cache; return the action queries, (B, T, D)."""
+    state = network.init_cache(prompt)
+    with watched(network) as calls:
+        for t in range(len(inputs.histories[0])):
+            history, features = read_histories(network, [steps[t : t + 1] for steps in inputs.histories])
+            previous_B1C = inputs.actions_BTC[:, max(t - 1, 0), None]
+            has_previous_B1 = torch.full(previous_B1C.shape[:2], t > 0)
+            _, state = network.decode_step(prompt, state, history, features, previous_B1C, has_previous_B1)
+    return query_of(calls)
+
+
+def predictions(network: PolicyNetwork, query_BTD: torch.Tensor, actions_BTC: torch.Tensor) -> Arrays:
+    """Return `pred_tokens`, and logits, bins and decoded values of each part, time first."""
     head = network.head
     assert isinstance(head, BinsHead)
-    logits = head.logits(read.query_BTD)
-    bins_BTC = torch.stack([scores.argmax(-1) for scores in logits], dim=-1)
-    unit_BTC = to_unit_range(head.decide(read).double())
-    result = {"pred_tokens": time_first(read.query_BTD)}
+    logits = head.logits(query_BTD)
+    bins_BTC = torch.stack([of_component.argmax(-1) for of_component in logits], dim=-1)
+    unit_BTC = to_unit_range(actions_BTC.double())
+    result = {"pred_tokens": time_first(query_BTD)}
     for key, part in ACTION_PARTS.items():
         result[f"logits.{key}"] = time_first(torch.cat(logits[part], dim=-1))
         result[f"bins.{key}"] = time_first(bins_BTC[..., part])
@@ -214,36 +237,41 @@ def assert_close_to_golden(actual: np.ndarray, expected: np.ndarray, tolerance: 
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class Calls:
     """First argument and first result of every call of every module, by the module's name."""
 
     inputs: dict[str, list[torch.Tensor]] = field(default_factory=dict)
     outputs: dict[str, list[torch.Tensor]] = field(default_factory=dict)
 
     def input(self, name: str) -> torch.Tensor:
-        """Return what a module was given; several calls one after the other along the second axis."""
+        """Return the inputs of a module; several calls are concatenated along the second axis."""
         return torch.cat(self.inputs[name], dim=1)
 
     def output(self, name: str) -> torch.Tensor:
-        """Return what a module gave; several calls one after the other along the second axis."""
+        """Return the outputs of a module; several calls are concatenated along the second axis."""
         return torch.cat(self.outputs[name], dim=1)
 
 
 @contextmanager
-def watched(network: nn.Module) -> Iterator[Seen]:
-    """Note what the modules of a network take and give."""
-    seen = Seen()
+def watched(network: nn.Module) -> Iterator[Calls]:
+    """Record inputs and outputs of all modules of a network."""
+    calls = Calls()
 
     def note(name: str, _: nn.Module, arguments: tuple, result: torch.Tensor | tuple) -> None:
-        seen.inputs.setdefault(name, []).append(arguments[0])
-        seen.outputs.setdefault(name, []).append(result[0] if isinstance(result, tuple) else result)
+        calls.inputs.setdefault(name, []).append(arguments[0])
+        calls.outputs.setdefault(name, []).append(result[0] if isinstance(result, tuple) else result)
 
     hooks = [module.register_forward_hook(partial(note, name)) for name, module in network.named_modules()]
     try:
-        yield seen
+        yield calls
     finally:
         for hook in hooks:
             hook.remove()
+
+
+def query_of(calls: Calls) -> torch.Tensor:
+    """Return the decoder's outputs at the action queries, from which all components are classified."""
+    return calls.input("head.classifiers.0")
 
 
 def _file(name: str) -> Path:
@@ -278,8 +306,7 @@ def _prompts(network: PolicyNetwork, recorded: Arrays) -> list[PromptInput]:
             ]
         words, entries, parts, mask = (np.array(column) for column in zip(*places, strict=True))
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
-        in_scene = np.zeros(len(numbers), np.bool_)
-        objects = ObjectViews.concatenated(images)
+        objects, in_scene = ObjectViews.concatenated(images), np.zeros(len(numbers), dtype=bool)
         prompts.append(PromptInput(words, entries, parts, mask, objects, numbers, in_scene))
     return prompts
 

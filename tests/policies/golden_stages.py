@@ -1,6 +1,6 @@
-"""Every stage of a network, under the names and in the order of axes in which recordings have it.
+"""Every stage of a network, by its name in recordings and with their order of axes.
 
-Shape suffixes: B batch, T steps, L places, Q slots of a step, N slots of a view, V views, D width, C
+Shape suffixes: B batch, T steps, L positions, Q slots of a step, N slots of a view, V views, D width, C
 components of an action.
 """
 
@@ -13,23 +13,27 @@ import pytest
 import torch
 from tests.policies.golden import (
     Arrays,
+    Calls,
     Inputs,
-    Seen,
+    decode_at_once,
     encode_prompts,
     inputs_of,
     only,
     predictions,
+    query_of,
     read_histories,
     step_of,
     time_first,
     watched,
 )
 
-from naive_inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
-from openvima.policies.build import Memory, PolicyNetwork
-from openvima.policies.nn.places import Places
-from openvima.policies.nn.decoder import Decoder, PrefixTrunk
+from openvima.policies.nn.bins import decode_bins, encode_bins
+from openvima.policies.nn.decoder import Decoder, PrefixDecoder
+from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
+from openvima.policies.nn.unpad import Unpadder
+from naive_inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.render.camera import VIEWS
 
 
@@ -37,86 +41,91 @@ from openvima.render.camera import VIEWS
 def stages(network: PolicyNetwork, recorded: Arrays) -> Arrays:
     """Compute what a recording has of its batch of two environments, from the first image to the actions."""
     inputs = inputs_of(network, recorded)
-    with watched(network) as seen:
-        memory = encode_prompts(network, inputs.prompts)
-    result = _prompt_stages(network, seen, memory, inputs)
-    result |= _prompt_image_stages(network, recorded, seen)
+    with watched(network) as calls:
+        prompt = encode_prompts(network, inputs.prompts)
+    result = _prompt_stages(network, calls, prompt, inputs)
+    result |= _prompt_image_stages(network, recorded, calls)
 
     history, features = read_histories(network, inputs.histories)
-    with watched(network) as seen:
-        slots_BTQD, mask_BTQ, _ = network.observe(history, features[history.crop_index_BTVN])
-        unit_BTC = network.head.as_history(to_unit_range(inputs.actions_BTC[:, :-1])).float()
-        actions_BTD = network.actions(unit_BTC)
-    result |= _step_image_stages(network, recorded, seen)
-    result["obs.tokens"] = _without_token_axis(time_first(slots_BTQD))
-    result["obs.mask"] = time_first(mask_BTQ)
-    result["action.concat"] = time_first(seen.inputs["actions.out"][0])
+    with watched(network) as calls:
+        observed = network.observe(history, features)
+        query_BTD, decoded_BTC = decode_at_once(network, prompt, history, features, inputs.actions_BTC)
+    actions_BTD = calls.outputs["head.actions"][0][:, 1:]  # none before the first step
+    result |= _step_image_stages(network, recorded, calls)
+    result["obs.tokens"] = _without_token_axis(time_first(observed.tokens_BTQD))
+    result["obs.mask"] = time_first(observed.mask_BTQ)
+    result["action.concat"] = time_first(calls.inputs["head.actions.out"][0][:, 1:])
     result["action.tokens"] = time_first(actions_BTD)
 
-    tokens_BLD = _interleaved(slots_BTQD, actions_BTD)
-    mask_BL = _interleaved(mask_BTQ, torch.ones_like(mask_BTQ[:, 1:, 0]))
-    result |= _sequence_stages(network, memory, tokens_BLD, mask_BL, inputs)
-    read = network(memory, history, features, inputs.actions_BTC)
-    return result | {f"out.{name}": value for name, value in predictions(network, read).items()}
+    tokens_BLD = _interleaved(observed.tokens_BTQD, actions_BTD)
+    mask_BL = _interleaved(observed.mask_BTQ, torch.ones_like(observed.mask_BTQ[:, 1:, 0]))
+    result |= _sequence_stages(network, prompt, tokens_BLD, mask_BL, inputs)
+    predicted = predictions(network, query_BTD, decoded_BTC)
+    return result | {f"out.{name}": value for name, value in predicted.items()}
 
 
 @torch.inference_mode()
 def closed_loop(network: PolicyNetwork, recorded: Arrays) -> Arrays:
-    """Play the first environment with the network's own actions, keys and values kept between steps.
+    """Run the first environment with the network's own actions and a key-value cache.
 
-    The published code fills steps of fewer objects up with zero vectors, also when it has read them already,
-    and acts from the last. So its second reading of the first step, which has no effect, acts from a zero
-    vector, and the third step does. The `pred_tokens` of a step hold such repeated readings of all before it.
+    The published code pads steps of fewer objects with zero vectors, also earlier steps when it decodes them
+    again, and acts from the last slot. So its second decoding of the first step, which has no effect, acts
+    from a zero vector, and the third step does. The `pred_tokens` of a step hold all steps before it, decoded
+    again in this way.
     """
-    memory = encode_prompts(network, inputs_of(network, recorded).prompts[:1])
-    result = {"roll.prompt.tokens": time_first(memory.tokens_BLD), "roll.prompt.mask": memory.mask_BL.numpy()}
-    state = network.begin(memory)
+    prompt = encode_prompts(network, inputs_of(network, recorded).prompts[:1])
+    result = {"roll.prompt.tokens": time_first(prompt.tokens_BLD), "roll.prompt.mask": prompt.mask_BL.numpy()}
+    state = network.init_cache(prompt)
     steps: list[StepInput] = []
     actions_B1C = [torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.float64)]  # none before the first step
     for t, end_effector in enumerate(recorded["in.ee"][:, 0]):
         steps.append(step_of(recorded, f"roll.step{t}", (), int(end_effector)))
         history, features = read_histories(network, [steps[-1:]])
-        slots_BTQD, _, _ = network.observe(history, features[history.crop_index_BTVN])
+        observed = network.observe(history, features)
 
         filled, counts = _filled(steps)
         with _zero_vectors_beyond(network, counts[-1:]):
             batch = read_histories(network, [filled[-1:]])
-            read, state = network.extend(memory, state, *batch, actions_B1C[-1], torch.tensor([[t > 0]]))
-        action_B1C = network.head.decide(read).double()
-        actions_B1C.append(action_B1C)
-        token = network.actions(network.head.as_history(to_unit_range(action_B1C)).float())
+            has_previous_B1 = torch.tensor([[t > 0]])
+            with watched(network) as calls:
+                action_B1C, state = network.decode_step(
+                    prompt, state, *batch, actions_B1C[-1], has_previous_B1
+                )
+        actions_B1C.append(action_B1C.double())
+        unit_B1C = decode_bins(encode_bins(to_unit_range(actions_B1C[-1])), torch.float64)
+        token = network.head.actions(unit_B1C.float())
         with _zero_vectors_beyond(network, counts):
             batch = read_histories(network, [filled])
-            all_read = network(memory, *batch, torch.cat(actions_B1C[1:], dim=1))
+            query_BTD, _ = decode_at_once(network, prompt, *batch, torch.cat(actions_B1C[1:], dim=1))
 
-        step = predictions(network, read)
-        step |= {"obs_tokens": slots_BTQD[0, 0].numpy(), "action_token": token[0, 0].numpy()}
-        step["pred_tokens"] = all_read.query_BTD[0].numpy()
-        step["pred_token"] = read.query_BTD[0, 0].numpy()
+        step = predictions(network, query_of(calls), action_B1C)
+        step |= {"obs_tokens": observed.tokens_BTQD[0, 0].numpy(), "action_token": token[0, 0].numpy()}
+        step["pred_tokens"] = query_BTD[0].numpy()
+        step["pred_token"] = query_of(calls)[0, 0].numpy()
         for key, part in ACTION_PARTS.items():
             step[f"env_action.{key}"] = action_B1C[0, 0, part].float().numpy()
         result |= {f"roll.step{t}.{name}": value for name, value in step.items()}
     return result
 
 
-def _prompt_stages(network: PolicyNetwork, seen: Seen, memory: Memory, inputs: Inputs) -> Arrays:
-    within_BL = _within_prompts(memory, inputs)
-    rows = zip(seen.outputs["prompt.words"][0], inputs.prompts, strict=True)
-    words = [row[: len(prompt.words)][torch.from_numpy(prompt.entries == WORD)] for row, prompt in rows]
+def _prompt_stages(network: PolicyNetwork, calls: Calls, prompt: EncodedPrompt, inputs: Inputs) -> Arrays:
+    within_BL = _within_prompts(prompt, inputs)
+    rows = zip(calls.outputs["prompt.words"][0], inputs.prompts, strict=True)
+    words = [row[: len(of.words)][torch.from_numpy(of.entries == WORD)] for row, of in rows]
     result = {
         "prompt.word_emb": torch.cat(words).numpy(),
-        "prompt.assembled": only(seen.inputs["prompt.text"][0].numpy(), within_BL),
-        "prompt.t5_out": only(time_first(seen.outputs["prompt.text"][0]), within_BL.T),
-        "prompt.tokens": only(time_first(memory.tokens_BLD), within_BL.T),
-        "prompt.mask": memory.mask_BL.numpy(),
+        "prompt.assembled": only(calls.inputs["prompt.text"][0].numpy(), within_BL),
+        "prompt.t5_out": only(time_first(calls.outputs["prompt.text"][0]), within_BL.T),
+        "prompt.tokens": only(time_first(prompt.tokens_BLD), within_BL.T),
+        "prompt.mask": prompt.mask_BL.numpy(),
     }
     for block in range(len(network.prompt.text.blocks)):
-        tokens_BLW = Places(within_BL).unpack(seen.outputs[f"prompt.text.blocks.{block}"][0])
+        tokens_BLW = Unpadder(within_BL).pad(calls.outputs[f"prompt.text.blocks.{block}"][0])
         result[f"prompt.t5_block{block}"] = only(tokens_BLW.numpy(), within_BL)
     return result
 
 
-def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -> Arrays:
+def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, calls: Calls) -> Arrays:
     """Features of the images of prompts, and the tokens made of them; one row for each image."""
     frames, images = _images(recorded, "prompt")
     result = {}
@@ -132,53 +141,57 @@ def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -
         rows = [part_END[:, :count] for part_END, count in zip(parts, counts, strict=True)]
         return _without_token_axis(torch.cat(rows, dim=1).numpy())
 
-    result[f"prompt.{'img' if frames else 'obj'}_feat"] = by_image(seen.outputs["images"][0])
-    result["prompt.obj_tokens"] = by_image(seen.outputs["prompt.images"][0])
+    result[f"prompt.{'img' if frames else 'obj'}_feat"] = by_image(calls.inputs["prompt.images"][0])
+    result["prompt.obj_tokens"] = by_image(calls.outputs["prompt.images"][0])
     if not frames:
         for view, name in enumerate(VIEWS):
-            boxes_END = seen.outputs[f"images.box_encoders.{view}"][0].unflatten(0, (entries, -1))
+            boxes_END = calls.outputs[f"images.box_encoders.{view}"][0].unflatten(0, (entries, -1))
             result[f"prompt.bbox_feat.{name}"] = boxes_END[:, : counts[view]].numpy()
     return result
 
 
-def _step_image_stages(network: PolicyNetwork, recorded: Arrays, seen: Seen) -> Arrays:
+def _step_image_stages(network: PolicyNetwork, recorded: Arrays, calls: Calls) -> Arrays:
     """The same of observations; one row for each step of each environment."""
     frames, images = _images(recorded, "obs")
-    tokens_TBQD = time_first(seen.outputs["images"][0])
+    tokens_TBQD = time_first(calls.inputs["observation_out"][0][..., :-NUM_END_EFFECTORS])
     result = {f"obs.{'img' if frames else 'obj'}_feat": _without_token_axis(_rows(tokens_TBQD))}
     for view, name in enumerate(VIEWS):
         result[f"obs.vit.{name}"] = _rows(network.encode_images(torch.from_numpy(images[view])).numpy())
         if not frames:
-            boxes_BTND = seen.outputs[f"images.box_encoders.{view}"][0]
+            boxes_BTND = calls.outputs[f"images.box_encoders.{view}"][0]
             result[f"obs.bbox_feat.{name}"] = _rows(time_first(boxes_BTND))
     return result
 
 
 def _sequence_stages(
-    network: PolicyNetwork, memory: Memory, tokens_BLD: torch.Tensor, mask_BL: torch.Tensor, inputs: Inputs
+    network: PolicyNetwork,
+    prompt: EncodedPrompt,
+    tokens_BLD: torch.Tensor,
+    mask_BL: torch.Tensor,
+    inputs: Inputs,
 ) -> Arrays:
-    """Read the whole sequence with its masked places, which the network itself leaves out."""
-    trunk = network.trunk
-    with watched(network) as seen:
-        _, state = trunk.extend(network.begin(memory).trunk, tokens_BLD, mask_BL)
-    known_BL, mask = torch.ones_like(mask_BL), state.mask_BS.numpy()
-    if isinstance(trunk, PrefixTrunk):
-        separator_B1D = trunk.separator.expand(len(tokens_BLD), 1, -1)
-        tokens_BLD = torch.cat([memory.tokens_BLD, separator_B1D, tokens_BLD], dim=1)
-        known_BL = torch.cat([_within_prompts(memory, inputs), known_BL[:, :1], known_BL], dim=1)
+    """Decode the whole sequence with its masked positions, which the network itself leaves out."""
+    decoder = network.decoder
+    with watched(network) as calls:
+        _, cache = decoder(network.init_cache(prompt), tokens_BLD, mask_BL)
+    known_BL, mask = torch.ones_like(mask_BL), cache.mask_BS.numpy()
+    if isinstance(decoder, PrefixDecoder):
+        separator_B1D = decoder.separator.expand(len(tokens_BLD), 1, -1)
+        tokens_BLD = torch.cat([prompt.tokens_BLD, separator_B1D, tokens_BLD], dim=1)
+        known_BL = torch.cat([_within_prompts(prompt, inputs), known_BL[:, :1], known_BL], dim=1)
         mask = mask[:, None]
     result = {
         "seq.tokens": only(time_first(tokens_BLD), known_BL.T),
         "seq.mask": mask,
-        "seq.position_ids": seen.input("trunk.positions").numpy(),
+        "seq.position_ids": calls.input("decoder.positions").numpy(),
     }
-    for layer in range(len(trunk.self_blocks)):
-        outputs_BLD = seen.output(f"trunk.self_blocks.{layer}").numpy()
+    for layer in range(len(decoder.self_blocks)):
+        outputs_BLD = calls.output(f"decoder.self_blocks.{layer}").numpy()
         result[f"seq.block{layer}_out"] = only(outputs_BLD, known_BL)
-    if isinstance(trunk, Decoder):
-        result["seq.prompt_position_ids"] = seen.input("trunk.prompt_positions").numpy()
-        for layer in range(len(trunk.cross_blocks)):
-            result[f"seq.xattn{layer}_out"] = seen.output(f"trunk.cross_blocks.{layer}").numpy()
+    if isinstance(decoder, Decoder):
+        result["seq.prompt_position_ids"] = calls.input("decoder.prompt_positions").numpy()
+        for layer in range(len(decoder.cross_blocks)):
+            result[f"seq.xattn{layer}_out"] = calls.output(f"decoder.cross_blocks.{layer}").numpy()
     return result
 
 
@@ -190,10 +203,10 @@ def _interleaved(slots: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
     return torch.cat(pieces, dim=1)
 
 
-def _within_prompts(memory: Memory, inputs: Inputs) -> torch.Tensor:
-    """Which places lie within their prompt, (B, L); what padding behind a prompt holds means nothing."""
-    lengths = torch.tensor([len(prompt.words) for prompt in inputs.prompts])
-    return torch.arange(memory.mask_BL.shape[1]) < lengths[:, None]
+def _within_prompts(prompt: EncodedPrompt, inputs: Inputs) -> torch.Tensor:
+    """Which positions are within their prompt, (B, L); padding behind it has no meaning."""
+    lengths = torch.tensor([len(of.words) for of in inputs.prompts])
+    return torch.arange(prompt.mask_BL.shape[1]) < lengths[:, None]
 
 
 def _images(recorded: Arrays, kind: str) -> tuple[bool, list[np.ndarray]]:
@@ -228,13 +241,11 @@ def _zero_vectors_beyond(network: PolicyNetwork, counts: Sequence[int]) -> Itera
     """Let the slots beyond each step's own be zero vectors, where the network encodes black crops."""
     observe = network.observe
 
-    def observe_and_clear(
-        history: HistoryBatch, *others: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        slots_BTQD, mask_BTQ, read_BT = observe(history, *others)
+    def observe_and_clear(history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
+        observed = observe(history, features_KF)
         own_TN = torch.arange(history.masks_BTVN.shape[-1]) < torch.tensor(counts)[:, None]
         own_TQ = own_TN.repeat(1, len(VIEWS))
-        return slots_BTQD * own_TQ[..., None], mask_BTQ, read_BT
+        return replace(observed, tokens_BTQD=observed.tokens_BTQD * own_TQ[..., None])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network, "observe", observe_and_clear)

@@ -30,7 +30,8 @@ from tests.policies.golden_stages import closed_loop, stages
 
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig
-from openvima.policies.published import config_from_published, to_published
+from openvima.policies.published.config import config_from_published
+from openvima.policies.published.names import to_published
 
 pytestmark = [pytest.mark.slow, needs("fulldims")]
 
@@ -39,7 +40,7 @@ TABLES = re.compile(
     r"|lm\.tokens_embed\.weight|end_effector_encoder\.weight)"
 )
 NORM = re.compile(r".*(\bln|norm)\w*\.weight")  # ln_1, ln_pre, ln, layernorm, layer_norm, final_layer_norm
-TRUNK = re.compile(r".*\.(positions_embed|h|xattns)\..*")
+DECODER = re.compile(r".*\.(positions_embed|h|xattns)\..*")
 IN_OUT = re.compile(r".*(vit\.projection|(xattn_gpt|lm)\.h\.\d+\.(attn|mlp)\.c_\w+\.weight)")
 
 
@@ -102,7 +103,7 @@ def make_weights(model: str, about: Mapping, made: dict[str, torch.Tensor]) -> d
 
 
 def config_of(model: str, cfg: Mapping[str, int]) -> PolicyConfig:
-    """Sizes of the trunk from `cfg`, all others from the shapes that are listed for a model of this kind."""
+    """Sizes of the decoder from `cfg`, all others from the shapes listed for a model of this kind."""
     listed = json.loads((FOLDER / "state_dict_shapes.json").read_text())
     kind = model.split("_")[0]
     tensors = next(
@@ -111,7 +112,7 @@ def config_of(model: str, cfg: Mapping[str, int]) -> PolicyConfig:
     shapes = {
         name: torch.empty(shape, device="meta")
         for name, (shape, _) in tensors.items()
-        if not TRUNK.fullmatch(name)
+        if not DECODER.fullmatch(name)
     }
     return config_from_published(shapes, cfg)
 

@@ -13,13 +13,10 @@ from safetensors.torch import load_file  # noqa: E402
 
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import outline_network  # noqa: E402
-from openvima.policies.nn.decoder import PrefixConfig  # noqa: E402
-from openvima.policies.published import (  # noqa: E402
-    config_from_published,
-    from_published,
-    load_published,
-    to_published,
-)
+from openvima.policies.nn.decoder import PrefixDecoderConfig  # noqa: E402
+from openvima.policies.published.checkpoint import load_published  # noqa: E402
+from openvima.policies.published.config import config_from_published  # noqa: E402
+from openvima.policies.published.names import from_published, to_published  # noqa: E402
 
 FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "model"
 SHAPES = FOLDER / "state_dict_shapes.json"
@@ -32,8 +29,9 @@ def recorded_network(name: str):
     """The preset that a recorded entry, such as "vima_2M" or "gato_256_1layer", was made with; no weights."""
     family, size, *_ = name.lower().split("_")
     config = preset(f"{family}-{'2m' if size == '256' else size}")
-    if isinstance(config.trunk, PrefixConfig):  # one layer there; our presets have as many as VIMA has blocks
-        config = replace(config, trunk=replace(config.trunk, num_layers=RECORDED[name]["cfg"]["n_layer"]))
+    if isinstance(config.decoder, PrefixDecoderConfig):
+        # One layer there; our presets have as many as VIMA has blocks.
+        config = replace(config, decoder=replace(config.decoder, num_layers=RECORDED[name]["cfg"]["n_layer"]))
     return outline_network(config)
 
 

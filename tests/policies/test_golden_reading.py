@@ -12,14 +12,17 @@ from tests.policies.golden import (
     Arrays,
     Inputs,
     assert_close_to_golden,
-    decide_step_by_step,
+    decode_step_by_step,
     encode_prompts,
     inputs_of,
     needs,
+    query_of,
     read_histories,
     recording,
+    targets_of,
     time_first,
     tiny_network,
+    watched,
 )
 
 from naive_inputs import PromptInput, StepInput
@@ -45,10 +48,13 @@ def inputs(network: PolicyNetwork, recorded: Arrays) -> Inputs:
 
 
 @torch.inference_mode()
-def read_at_once(network: PolicyNetwork, inputs: Inputs) -> torch.Tensor:
-    """Predictions, (B, T, D)."""
-    memory = encode_prompts(network, inputs.prompts)
-    return network(memory, *read_histories(network, inputs.histories), inputs.actions_BTC).query_BTD
+def decode_at_once(network: PolicyNetwork, inputs: Inputs) -> torch.Tensor:
+    """Decode whole histories as in training; return the action queries, (B, T, D)."""
+    prompt = encode_prompts(network, inputs.prompts)
+    history, features = read_histories(network, inputs.histories)
+    with watched(network) as calls:
+        network.loss(prompt, history, features, targets_of(history, inputs.actions_BTC))
+    return query_of(calls)
 
 
 def longer_companion(inputs: Inputs) -> Inputs:
@@ -84,7 +90,7 @@ def with_objects_twice(step: StepInput) -> StepInput:
 
 def test_golden_steps_read_one_by_one_give_the_recorded_predictions(network, inputs, recorded):
     with torch.inference_mode():
-        queries = decide_step_by_step(network, encode_prompts(network, inputs.prompts), inputs)
+        queries = decode_step_by_step(network, encode_prompts(network, inputs.prompts), inputs)
     assert_close_to_golden(time_first(queries), recorded["out.pred_tokens"])
 
 
@@ -92,15 +98,15 @@ def test_golden_steps_read_one_by_one_give_the_recorded_predictions(network, inp
 def test_golden_episodes_read_alone_give_the_recorded_predictions(network, inputs, recorded, row):
     only = slice(row, row + 1)
     alone = Inputs(inputs.prompts[only], inputs.histories[only], inputs.actions_BTC[only])
-    assert_close_to_golden(read_at_once(network, alone)[0].numpy(), recorded["out.pred_tokens"][:, row])
+    assert_close_to_golden(decode_at_once(network, alone)[0].numpy(), recorded["out.pred_tokens"][:, row])
 
 
 def test_golden_padding_for_a_longer_episode_keeps_the_recorded_predictions(network, inputs, recorded):
     steps = len(recorded["in.ee"])
-    queries = read_at_once(network, longer_companion(inputs))[[0, 2], :steps]
+    queries = decode_at_once(network, longer_companion(inputs))[[0, 2], :steps]
     assert_close_to_golden(time_first(queries), recorded["out.pred_tokens"])
 
 
 def test_golden_predictions_do_not_depend_on_the_order_of_episodes(network, inputs, recorded):
     reverse = Inputs(inputs.prompts[::-1], inputs.histories[::-1], inputs.actions_BTC.flip(0))
-    assert_close_to_golden(time_first(read_at_once(network, reverse).flip(0)), recorded["out.pred_tokens"])
+    assert_close_to_golden(time_first(decode_at_once(network, reverse).flip(0)), recorded["out.pred_tokens"])

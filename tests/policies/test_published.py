@@ -24,12 +24,9 @@ from openvima.policies.nn.policy_network import PolicyNetwork, outline_network  
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
-from openvima.policies.published import (  # noqa: E402
-    config_from_published,
-    from_published,
-    load_published,
-    to_published,
-)
+from openvima.policies.published.checkpoint import load_published  # noqa: E402
+from openvima.policies.published.config import config_from_published  # noqa: E402
+from openvima.policies.published.names import from_published, to_published  # noqa: E402
 from openvima.policies.sizes import Size  # noqa: E402
 
 MEMBERS = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}

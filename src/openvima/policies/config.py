@@ -57,9 +57,9 @@ def with_autoregression(config: PolicyConfig, wanted: bool = True) -> PolicyConf
         raise ConfigError("the pointer models have no autoregressive head; take nano-bins or another preset.")
     head = config.head
     if wanted:
-        head = AutoregressiveConfig(head.hidden_width, token_std=config.decoder.initial_std)
+        head = AutoregressiveConfig(head.hidden_width, config.decoder.initial_std, head.action_width)
     elif isinstance(head, AutoregressiveConfig):
-        head = BinsConfig(head.hidden_width)
+        head = BinsConfig(head.hidden_width, head.action_width)
     return replace(config, head=head)
 
 

@@ -44,5 +44,5 @@ def midas(of: Size) -> MidasConfig:
         ObjectEncoderConfig(of.crop_encoder(), of.image_width, of.width),
         replace(of.prompt, visual_residual=True),
         of.prefix_decoder(),
-        AutoregressiveConfig(of.hidden_width, token_std=of.initial_std),
+        AutoregressiveConfig(of.hidden_width, of.initial_std, of.action_width),
     )

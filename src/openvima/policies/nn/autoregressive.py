@@ -32,10 +32,12 @@ class AutoregressiveConfig:
     Args:
         hidden_width: Width of the two hidden layers of each component's classifier.
         token_std: Standard deviation of the fresh vectors of the bins.
+        action_width: `BinsConfig.action_width` of the same network with independent bins; unused here.
     """
 
     hidden_width: int = 512
     token_std: float = 0.02
+    action_width: int = 256
 
     def __post_init__(self) -> None:
         if self.token_std <= 0:
