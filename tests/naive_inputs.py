@@ -25,8 +25,7 @@ from openvima.perception.objects import (
     whole_frames,
 )
 from openvima.policies.batch import WORD, HistoryBatch, PromptBatch
-from openvima.policies.nn.frame_encoder import FrameEncoderConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.decoder import MAX_POSITIONS
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import VIEWS
@@ -95,22 +94,16 @@ class Reader:
 
     @staticmethod
     def of(
-        images: ObjectEncoderConfig | FrameEncoderConfig,
+        inputs: InputLayout,
         tokenizer: Tokenizer | None = None,
         extractor: ObjectExtractor | None = None,
     ) -> "Reader":
-        """Make the reader for a network whose images are encoded in this way.
-
-        Objects are found by segmentation unless an extractor is given: in the order of their ids for a token
-        in each view, as the published policies know them, and from left to right otherwise.
-        """
+        """Make the reader for a network that takes such inputs."""
         tokenizer = tokenizer or CLOSED_TOKENIZER
-        if isinstance(images, FrameEncoderConfig):
-            size = (images.frame.image_height, images.frame.image_width)
-            return Reader("frames", size, images.num_tokens, tokenizer)
-        if images.fuse_views:
-            return Reader("objects", tokenizer=tokenizer, extractor=extractor or GROUND_TRUTH)
-        return Reader("views", tokenizer=tokenizer, extractor=extractor or PUBLISHED_ORDER)
+        order = PUBLISHED_ORDER if inputs.tokens == "views" else GROUND_TRUTH
+        return Reader(
+            inputs.tokens, inputs.image_size, inputs.tokens_per_frame_pair, tokenizer, extractor or order
+        )
 
     def read_prompt(self, prompt: RenderedPrompt) -> PromptInput:
         """Turn a prompt into words and images.

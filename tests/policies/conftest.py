@@ -49,11 +49,22 @@ def demonstrations() -> list[Demonstration]:
 @pytest.fixture(scope="session")
 def small_sizes():
     """A nano network that is narrower and shallower."""
+    return _narrow("nano")
+
+
+@pytest.fixture(scope="session")
+def small_bins_sizes():
+    """The same with the bins head."""
+    sizes = _narrow("nano-bins")
+    return replace(sizes, head=replace(sizes.head, hidden_width=32))
+
+
+def _narrow(name: str):
     pytest.importorskip("torch")
     from openvima.policies import preset
     from openvima.policies.nn.conv_encoder import ConvConfig
 
-    sizes = preset("nano")
+    sizes = preset(name)
     return replace(
         sizes,
         images=replace(sizes.images, crop=ConvConfig(width=8, output_width=32), width=64),

@@ -20,13 +20,6 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from openvima.perception.image_stack import ImageStack
-from openvima.perception.objects import ObjectViews, see_nothing
-from openvima.policies.build import outline_network
-from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
-from openvima.policies.nn.bins import BinsHead, decode_bins
-from openvima.policies.nn.history import shift_actions
-from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
 from naive_inputs import (
     WORD,
     HistoryBatch,
@@ -36,6 +29,13 @@ from naive_inputs import (
     batch_histories,
     batch_prompts,
 )
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.objects import ObjectViews, see_nothing
+from openvima.policies.build import outline_network
+from openvima.policies.nn.actions import ACTION_PARTS, ActionTargets, from_unit_range, to_unit_range
+from openvima.policies.nn.bins import BinsHead, decode_bins
+from openvima.policies.nn.history import shift_actions
+from openvima.policies.nn.policy_network import EncodedPrompt, PolicyNetwork
 from openvima.policies.published.config import config_from_published
 from openvima.policies.published.names import from_published
 from openvima.policies.tokenizer import PADDING_ID

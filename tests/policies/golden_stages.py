@@ -27,13 +27,13 @@ from tests.policies.golden import (
     watched,
 )
 
+from naive_inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, to_unit_range
 from openvima.policies.nn.bins import decode_bins, encode_bins
 from openvima.policies.nn.decoder import Decoder, PrefixDecoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
 from openvima.policies.nn.unpad import Unpadder
-from naive_inputs import WORD, HistoryBatch, Reader, StepInput
 from openvima.render.camera import VIEWS
 
 

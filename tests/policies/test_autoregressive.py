@@ -1,4 +1,4 @@
-"""Actions told component by component: the chain rule, caches, causality, and the visual residual."""
+"""Autoregressive decoding: the chain rule, caches, causality; and the visual residual."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,26 +8,34 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import ConfigError, PolicyError  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.config import with_autoregression, with_visual_residual  # noqa: E402
-from openvima.policies.nn.autoregressive import AutoregressiveConfig, ComponentTokens  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.config import (  # noqa: E402
+    PolicyConfig,
+    with_autoregression,
+    with_visual_residual,
+)
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ACTION_WIDTH,
+    ActionTargets,
     from_unit_range,
     to_unit_range,
 )
-from openvima.policies.nn.bins import NUM_BINS, BinsHead, decode_bins, encode_bins  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.autoregressive import (  # noqa: E402
+    AutoregressiveConfig,
+    AutoregressiveHead,
+    ComponentTokens,
+)
+from openvima.policies.nn.bins import NUM_BINS, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
-# One decoder, and cross-attention with the last slot, or with a query of its own, as the place to read from.
+# One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {
     "midas": preset("midas-nano"),
     "vima": with_autoregression(with_visual_residual(preset("vima-nano"))),
@@ -57,13 +65,30 @@ def read(network: PolicyNetwork, demonstrations) -> tuple[Batch, "torch.Tensor"]
     return collate_examples(processor, examples), network.encode_images(images)
 
 
+def forward(network: PolicyNetwork, prompt, history, features, targets: ActionTargets):
+    """Loss and metrics of whole histories, and the logits of all components, each (B, T, bins)."""
+    logits = {}
+
+    def record(component: int):
+        return lambda _, __, result: logits.setdefault(component, result)
+
+    hooks = [
+        classifier.register_forward_hook(record(component))
+        for component, classifier in enumerate(network.head.classifiers)
+    ]
+    loss, metrics = network.loss(prompt, history, features, targets)
+    for hook in hooks:
+        hook.remove()
+    return loss, metrics, [logits[component] for component in range(ACTION_WIDTH)]
+
+
 @torch.no_grad()
-def told(network: PolicyNetwork, demonstrations, actions: "torch.Tensor | None" = None):
-    """Scores of all components of all actions, each (B, T, bins), and the batch."""
+def teacher_forced(network: PolicyNetwork, demonstrations, actions: "torch.Tensor | None" = None):
+    """Logits of all components of all actions, each (B, T, bins), and the batch."""
     batch, features = read(network, demonstrations)
-    actions = batch.targets.actions_BTC if actions is None else actions
-    inputs = network(network.encode_prompt(batch.prompts, features), batch.history, features, actions)
-    return network.head.scores(inputs), batch
+    targets = batch.targets if actions is None else replace(batch.targets, actions_BTC=actions)
+    prompt = network.encode_prompt(batch.prompts, features)
+    return forward(network, prompt, batch.history, features, targets)[2], batch
 
 
 def step_of(record, step: int):
@@ -75,82 +100,91 @@ def step_of(record, step: int):
 @torch.no_grad()
 @pytest.mark.slow
 def test_incremental_log_probabilities_sum_to_the_teacher_forced_likelihood(network, demonstrations) -> None:
-    scores, batch = told(network, demonstrations)
+    logits, batch = teacher_forced(network, demonstrations)
     bins_BTC = encode_bins(to_unit_range(batch.targets.actions_BTC))
     steps_BT = batch.targets.steps_BT
     assert steps_BT.sum() > len(steps_BT)  # padded, with more than one step somewhere
     forced = sum(
-        score.log_softmax(-1).gather(-1, bins_BTC[..., c, None]).squeeze(-1) for c, score in enumerate(scores)
+        score.log_softmax(-1).gather(-1, bins_BTC[..., c, None]).squeeze(-1) for c, score in enumerate(logits)
     )
 
     _, features = read(network, demonstrations)
-    memory = network.encode_prompt(batch.prompts, features)
-    state, previous = network.begin(memory), torch.zeros_like(batch.targets.actions_BTC[:, :1])
+    prompt = network.encode_prompt(batch.prompts, features)
+    state, previous = network.init_cache(prompt), torch.zeros_like(batch.targets.actions_BTC[:, :1])
     for step in range(steps_BT.shape[1]):
         has_previous = torch.full_like(steps_BT[:, :1], step > 0)
         history = step_of(batch.history, step)
-        inputs, state = network.extend(memory, state, history, features, previous, has_previous)
-        total, unread = torch.zeros(len(steps_BT), dtype=torch.float64), iter(range(ACTION_WIDTH))
+        total, undecoded = torch.zeros(len(steps_BT), dtype=torch.float64), iter(range(ACTION_WIDTH))
 
-        def as_demonstrated(scores_B1K, bins_B1C=bins_BTC[:, step : step + 1], unread=unread, total=total):
-            chosen_B1 = bins_B1C[..., next(unread)]
-            total += scores_B1K.log_softmax(-1).gather(-1, chosen_B1[..., None])[:, 0, 0]
+        def as_demonstrated(
+            logits_B1K, bins_B1C=bins_BTC[:, step : step + 1], undecoded=undecoded, total=total
+        ):
+            chosen_B1 = bins_B1C[..., next(undecoded)]
+            total += logits_B1K.log_softmax(-1).gather(-1, chosen_B1[..., None])[:, 0, 0]
             return chosen_B1
 
-        network.decide(inputs, state, as_demonstrated)
+        _, state = network.decode_step(
+            prompt, state, history, features, previous, has_previous, as_demonstrated
+        )
         exists = steps_BT[:, step]
         torch.testing.assert_close(total[exists], forced[exists, step], rtol=0, atol=1e-5)
         previous = batch.targets.actions_BTC[:, step : step + 1]
 
 
 @pytest.mark.slow
-def test_a_component_is_told_by_those_before_it_alone(network, demonstrations) -> None:
-    scores, batch = told(network, demonstrations)
+def test_a_component_depends_only_on_those_before_it(network, demonstrations) -> None:
+    logits, batch = teacher_forced(network, demonstrations)
     for component in range(ACTION_WIDTH):
         changed = batch.targets.actions_BTC.clone()
-        last = batch.targets.steps_BT.sum(1) - 1  # whatever follows has no say in what comes before
+        last = batch.targets.steps_BT.sum(1) - 1  # later tokens do not change earlier outputs
         rows = torch.arange(len(last))
         moved = to_unit_range(changed[rows, last].double())
         moved[:, component] = (moved[:, component] + 0.5) % 1
         changed[rows, last] = from_unit_range(moved).to(changed.dtype)
-        others, _ = told(network, demonstrations, changed)
+        others, _ = teacher_forced(network, demonstrations, changed)
         differs = [
-            not torch.equal(old[rows, last], new[rows, last]) for old, new in zip(scores, others, strict=True)
+            not torch.equal(old[rows, last], new[rows, last]) for old, new in zip(logits, others, strict=True)
         ]
         assert differs == [later > component for later in range(ACTION_WIDTH)], component
 
 
-def test_the_loss_is_that_of_the_published_head_on_these_scores(network, demonstrations) -> None:
+def test_the_loss_is_that_of_the_published_head_on_these_logits(network, demonstrations) -> None:
     batch, features = read(network, demonstrations)
     actions = batch.targets.actions_BTC
-    inputs = network(network.encode_prompt(batch.prompts, features), batch.history, features, actions)
-    loss, metrics = network.head.loss(inputs, batch.targets)
+    prompt = network.encode_prompt(batch.prompts, features)
+    loss, metrics, logits = forward(network, prompt, batch.history, features, batch.targets)
     bins_BTC, exists = encode_bins(to_unit_range(actions)), batch.targets.steps_BT
     parts = torch.zeros((), dtype=torch.float64)
     for part in ACTION_PARTS.values():
         for c in range(part.start, part.stop):
-            chances = network.head.scores(inputs)[c].softmax(-1).gather(-1, bins_BTC[..., c, None])
+            chances = logits[c].softmax(-1).gather(-1, bins_BTC[..., c, None])
             parts = parts - chances[exists].log().mean() / (part.stop - part.start)
     torch.testing.assert_close(loss, parts)
-    assert isinstance(network.head, BinsHead) and metrics.keys() >= {"accuracy", "component_accuracy"}
+    assert isinstance(network.head, AutoregressiveHead) and metrics.keys() >= {
+        "accuracy",
+        "component_accuracy",
+    }
 
 
 def uncached(policy: NetworkPolicy, prompts: Sequence, seen: Sequence[Sequence[dict]]) -> list[np.ndarray]:
-    """The actions of one episode after the other, reading all anew for every component."""
+    """The actions of one episode after the other, decoded from scratch for every component."""
     network, actions = policy.network, []
     for prompt, observations in zip(prompts, seen, strict=True):
         taken = np.zeros((1, len(observations), ACTION_WIDTH))
-        asked, stack = policy.processor.encode_prompts([prompt])
+        prompt_batch, stack = policy.processor.encode_prompts([prompt])
         policy.processor.encode_observations([observations], stack=stack)
         features = network.encode_images(torch.from_numpy(stack.images()))
-        memory = network.encode_prompts(asked, features)
+        encoded = network.encode_prompt(prompt_batch, features)
         for t in range(len(observations)):
             history, _ = policy.processor.encode_observations([observations[: t + 1]], stack=stack)
             bins = torch.zeros(1, 1, ACTION_WIDTH, dtype=torch.int64)
+            no_slot = torch.full_like(history.num_slots_BT, -1)
             for component in range(ACTION_WIDTH):
                 taken[:, t] = from_unit_range(decode_bins(bins, torch.float64))[0].numpy()
-                inputs = network(memory, history, features, torch.from_numpy(taken[:, : t + 1]))
-                bins[0, 0, component] = network.head.scores(inputs)[component][0, t].argmax()
+                actions_BTC = torch.from_numpy(taken[:, : t + 1])
+                targets = ActionTargets(actions_BTC, no_slot, no_slot, history.steps_BT)
+                _, _, logits = forward(network, encoded, history, features, targets)
+                bins[0, 0, component] = logits[component][0, t].argmax()
             chosen = from_unit_range(decode_bins(bins, torch.float64)).float()
             taken[:, t] = chosen[0].numpy()
         actions.append(taken[0].astype(np.float32))
@@ -201,16 +235,8 @@ def test_actions_as_they_are_sent_come_back_as_the_same_tokens(component: int) -
     sent = from_unit_range(decode_bins(bins)).to(torch.float32)
     tokens = ComponentTokens(4, std=1.0)
     back = tokens(to_unit_range(sent.double()))
-    assert torch.equal(back[:, component], tokens.of(component, torch.arange(NUM_BINS[component])))
+    assert torch.equal(back[:, component], tokens.embed(component, torch.arange(NUM_BINS[component])))
     assert len(back[:, component].unique(dim=0)) == NUM_BINS[component]
-
-
-def test_the_head_alone_cannot_decide(network, demonstrations) -> None:
-    batch, features = read(network, demonstrations)
-    memory = network.encode_prompt(batch.prompts, features)
-    inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
-    with pytest.raises(PolicyError, match=r"call PolicyNetwork\.decide"):
-        network.head.decide(inputs)
 
 
 def test_half_precision_gives_actions_on_bins(demonstrations) -> None:
@@ -226,12 +252,12 @@ def test_half_precision_gives_actions_on_bins(demonstrations) -> None:
 @torch.no_grad()
 def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonstrations) -> None:
     on = network_of(with_visual_residual(preset("vima-nano")))
-    off = PolicyNetwork(preset("vima-nano")).double().eval()
+    off = build_network(preset("vima-nano"), seed=0).double().eval()
     off.load_state_dict(on.state_dict())
     batch, features = read(on, demonstrations)
     prompts = batch.prompts
-    memory, plain = (network.encode_prompts(prompts, features) for network in (on, off))
-    added_BLD = memory.tokens_BLD - plain.tokens_BLD
+    residual, plain = (network.encode_prompt(prompts, features) for network in (on, off))
+    added_BLD = residual.tokens_BLD - plain.tokens_BLD
     is_image_BL = prompts.object_index_BL >= 0
     assert not added_BLD[~is_image_BL].any()
     tokens_IE = on.images(features[prompts.crop_index_VS], prompts.boxes_VS4, prompts.masks_VS)
@@ -245,7 +271,8 @@ def test_switches_change_nothing_else_and_can_be_undone() -> None:
     both = with_visual_residual(with_autoregression(plain))
     assert replace(both, head=plain.head, prompt=plain.prompt) == plain
     assert with_visual_residual(with_autoregression(both, False), False) == plain
-    assert replace(both, trunk=preset("midas-nano").trunk) == preset("midas-nano")
+    midas = preset("midas-nano")
+    assert (both.images, both.prompt, both.head) == (midas.images, midas.prompt, midas.head)
 
 
 @pytest.mark.parametrize("name", ["nano", "vima-nano"])
@@ -258,32 +285,37 @@ def test_vectors_without_spread_are_refused() -> None:
         AutoregressiveConfig(token_std=0)
 
 
+def test_a_pointer_model_has_no_bins_to_decode_one_by_one() -> None:
+    with pytest.raises(ConfigError, match="take nano-bins"):
+        with_autoregression(preset("nano"))
+
+
 def chance_of_either(config: PolicyConfig, demonstration) -> float:
-    """Train on one situation that was answered in two ways; return how likely either is then told."""
+    """Train on one situation with two demonstrated actions; return the probability of either."""
     network = build_network(config, seed=0).eval()
     batch, _ = read(network, [demonstration] * 2)
     actions = batch.targets.actions_BTC.clone()
     actions[1, :, [0, 1, 6]] = actions[1, :, [1, 0, 7]] + 0.3  # another place to pick from, and one to put
     targets, prompts, history = replace(batch.targets, actions_BTC=actions), batch.prompts, batch.history
-    _, images = examples_of([demonstration] * 2, Processor.of(config.images))
+    _, images = examples_of([demonstration] * 2, Processor.of(config.inputs))
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=0.0)
     for _ in range(50):
         features = network.encode_images(images)
-        inputs = network(network.encode_prompts(prompts, features), history, features, actions)
         optimizer.zero_grad()
-        network.head.loss(inputs, targets)[0].backward()
+        network.loss(network.encode_prompt(prompts, features), history, features, targets)[0].backward()
         optimizer.step()
+    with torch.no_grad():
+        _, _, logits = forward(network, network.encode_prompt(prompts, features), history, features, targets)
     bins_BTC = encode_bins(to_unit_range(actions))
     chances = [
-        score.softmax(-1).gather(-1, bins_BTC[..., c, None])[:, 0, 0]
-        for c, score in enumerate(network.head.scores(inputs))
+        score.softmax(-1).gather(-1, bins_BTC[..., c, None])[:, 0, 0] for c, score in enumerate(logits)
     ]
     return torch.stack(chances).prod(0).sum().item()
 
 
 @pytest.mark.slow
 def test_two_right_answers_are_not_mixed(demonstrations) -> None:
-    """Three components differ: told independently, one of the two actions comes out once in four times."""
+    """Three components differ: decoded independently, one of the two actions comes out once in four times."""
     single = next(demo for demo in demonstrations if demo.num_steps == 1)
     plain = preset("vima-nano")
     assert chance_of_either(with_autoregression(plain), single) > 0.9

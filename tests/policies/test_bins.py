@@ -1,7 +1,7 @@
-"""The bins of the published policies: which bin a value falls into and what a bin means."""
+"""The bins head: encoding, decoding, loss and metrics."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 
@@ -13,7 +13,6 @@ from hypothesis import strategies as st  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ActionTargets,
-    HeadInputs,
     from_unit_range,
     to_unit_range,
 )
@@ -24,6 +23,7 @@ from openvima.policies.nn.bins import (  # noqa: E402
     decode_bins,
     encode_bins,
 )
+from openvima.policies.nn.history import ObservationTokens  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 
 
@@ -32,10 +32,22 @@ def slow_bin(value: float, count: int) -> int:
     return min(sum(k / (count - 1) < value for k in range(count)), count - 1)
 
 
-def inputs(query) -> HeadInputs:
-    """The query, and nothing else: the head looks at nothing else."""
-    nothing = torch.zeros(*query.shape[:2], 0)
-    return HeadInputs(**{**{field.name: nothing for field in fields(HeadInputs)}, "query_BTD": query})
+class Identity:
+    """Stands in for a decoder; its outputs are its tokens, and it has no cache."""
+
+    def decode_segments(self, cache, segments):
+        return tuple(segment.tokens_BTQD for segment in segments), cache
+
+
+def observations(query) -> ObservationTokens:
+    """One token per step, the action query."""
+    exists = torch.ones(query.shape[:2], dtype=torch.bool)
+    return ObservationTokens(query[:, :, None], exists[..., None], exists.long() - 1, exists)
+
+
+def loss_of(network: BinsHead, query, targets: ActionTargets):
+    """Loss and metrics given the decoder's outputs at the action queries."""
+    return network.loss(Identity(), None, observations(query), targets)
 
 
 def head(width: int = 6) -> BinsHead:
@@ -68,7 +80,7 @@ def test_values_at_and_beyond_the_ends_go_to_the_end_bins(value, of_50, of_100):
     assert (bins[..., 1] == of_100).all()
 
 
-def test_a_bin_means_its_share_of_the_number_of_bins():
+def test_bin_k_of_n_decodes_to_k_over_n():
     last = decode_bins(torch.tensor([count - 1 for count in NUM_BINS]), torch.float64)
     assert last.tolist() == [0.98, 0.99, 0.98, 0.98, 0.98, 0.98] * 2
     assert decode_bins(torch.zeros(12, dtype=torch.int64)).tolist() == [0.0] * 12
@@ -90,10 +102,12 @@ def test_a_component_of_zero_comes_back_exactly_and_the_identity_a_little_short(
     torch.testing.assert_close(back[:6], torch.tensor([0.5, 0, 0, 0, 0, 0.96], dtype=torch.float64))
 
 
-def test_the_head_takes_the_likeliest_bin_and_stays_within_bounds():
+def test_greedy_decoding_takes_the_highest_logit_and_stays_within_bounds():
     network = head()
     query = 50 * torch.randn(3, 4, 6, generator=torch.Generator().manual_seed(1))
-    decided = network.decide(inputs(query)).detach()
+    no_action = torch.zeros(3, 4, 12), torch.zeros(3, 4, dtype=torch.bool)
+    decided, _ = network.decode_step(Identity(), None, observations(query), *no_action)
+    decided = decided.detach()
     assert decided.shape == (3, 4, 12)
     for component, scores in enumerate(network.logits(query)):
         value = to_unit_range(decided)[..., component] * NUM_BINS[component]
@@ -109,7 +123,7 @@ def test_the_loss_of_evenly_likely_bins_is_the_logarithm_of_their_number():
     actions = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0] * 2).expand(2, 3, 12)
     exists = torch.ones(2, 3, dtype=torch.bool)
     slots = torch.zeros(2, 3, dtype=torch.int64)
-    loss, _ = network.loss(inputs(torch.zeros(2, 3, 6)), ActionTargets(actions, slots, slots, exists))
+    loss, _ = loss_of(network, torch.zeros(2, 3, 6), ActionTargets(actions, slots, slots, exists))
     position = (math.log(50) + math.log(100)) / 2
     assert loss.item() == pytest.approx(2 * position + 2 * math.log(50), rel=1e-5)
 
@@ -120,9 +134,9 @@ def test_steps_that_do_not_exist_have_no_loss():
     query, actions = torch.randn(1, 3, 6, generator=generator), torch.rand(1, 3, 12, generator=generator)
     slots = torch.zeros(1, 3, dtype=torch.int64)
     targets = ActionTargets(actions, slots, slots, torch.tensor([[True, True, False]]))
-    loss, metrics = network.loss(inputs(query), targets)
+    loss, metrics = loss_of(network, query, targets)
     query[0, 2], actions[0, 2] = 7.0, 0.7
-    changed, changed_metrics = network.loss(inputs(query), replace(targets, actions_BTC=actions))
+    changed, changed_metrics = loss_of(network, query, replace(targets, actions_BTC=actions))
     assert changed == loss
     assert changed_metrics == metrics
 
@@ -132,7 +146,7 @@ def test_a_position_counts_as_much_as_a_rotation_of_twice_its_length():
     query = torch.randn(1, 2, 6, generator=torch.Generator().manual_seed(3))
     actions = torch.tensor([0.6, 0.1, 0.0, 0.0, 0.6, 0.8, 0.4, -0.2, 0.0, 0.0, -0.6, 0.8]).expand(1, 2, 12)
     exists, slots = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.int64)
-    loss, _ = network.loss(inputs(query), ActionTargets(actions, slots, slots, exists))
+    loss, metrics = loss_of(network, query, ActionTargets(actions, slots, slots, exists))
     bins = encode_bins(to_unit_range(actions))
     surprises = []
     for component, scores in enumerate(network.logits(query)):
@@ -140,6 +154,7 @@ def test_a_position_counts_as_much_as_a_rotation_of_twice_its_length():
         surprises.append(-sum(chances[0, t, bins[0, t, component]].item() for t in range(2)) / 2)
     expected = sum(sum(surprises[part]) / len(surprises[part]) for part in ACTION_PARTS.values())
     assert loss.item() == pytest.approx(expected, rel=1e-5)
+    assert sum(metrics[f"loss/{name}"] for name in ACTION_PARTS).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_accuracies_count_whole_actions_parts_and_components():
@@ -155,7 +170,7 @@ def test_accuracies_count_whole_actions_parts_and_components():
     actions[0, 2, 8:] = torch.tensor([0.0, 0.0, 1.0, 0.0])  # two of the last rotation
     actions[0, 3] = 0.3  # does not exist
     exists, slots = torch.tensor([[True, True, True, False]]), torch.zeros(1, 4, dtype=torch.int64)
-    _, metrics = network.loss(inputs(torch.zeros(1, 4, 6)), ActionTargets(actions, slots, slots, exists))
+    _, metrics = loss_of(network, torch.zeros(1, 4, 6), ActionTargets(actions, slots, slots, exists))
     expected = {
         "accuracy": 1 / 3,
         "component_accuracy": 33 / 36,
@@ -164,4 +179,5 @@ def test_accuracies_count_whole_actions_parts_and_components():
         "pose1_position_accuracy": 1,
         "pose1_rotation_accuracy": 2 / 3,
     }
-    assert {name: value.item() for name, value in metrics.items()} == pytest.approx(expected)
+    shares = {name: value.item() for name, value in metrics.items() if not name.startswith("loss/")}
+    assert shares == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""Checkpoints: equal weights come back, damage is told in one message, and folders are found."""
+"""Checkpoints: round trips, errors for damaged files, and folders of runs."""
 
 from dataclasses import replace
 
@@ -20,6 +20,7 @@ from openvima.policies.checkpoint import (  # noqa: E402
     load_weights,
     save_checkpoint,
 )
+from openvima.policies.config import config_to_dict  # noqa: E402
 
 
 @pytest.fixture
@@ -185,24 +186,22 @@ def test_a_file_is_no_folder_to_save_in(small_sizes, tmp_path) -> None:
 
 
 def test_weights_of_another_size_are_named_as_such(saved, small_sizes) -> None:
-    trunk = replace(small_sizes.trunk, width=128, num_layers=2)
-    larger = replace(small_sizes, trunk=trunk, images=replace(small_sizes.images, width=128))
+    decoder = replace(small_sizes.decoder, width=128, num_layers=2)
+    larger = replace(small_sizes, decoder=decoder, images=replace(small_sizes.images, width=128))
     values = yaml.safe_load((saved / CONFIG_FILE).read_text())
-    values["config"] = larger.to_dict()
+    values["config"] = config_to_dict(larger)
     (saved / CONFIG_FILE).write_text(yaml.safe_dump(values))
     size = "it is of another size: layers 1, where the config says 2, width 64, where the config says 128;"
     with pytest.raises(CheckpointError, match=size) as caught:
         load_checkpoint(saved)
-    assert "missing: trunk.self_blocks.1" in str(caught.value)
+    assert "missing: decoder.self_blocks.1" in str(caught.value)
 
 
-def test_weights_of_another_member_of_the_family_are_refused(tmp_path) -> None:
+def test_weights_of_another_architecture_are_refused(tmp_path) -> None:
     for name in ("vima", "gato"):
         save_checkpoint(build_network(preset(f"{name}-nano"), seed=0), tmp_path / name)
     (tmp_path / "gato" / CONFIG_FILE).replace(tmp_path / "vima" / CONFIG_FILE)
-    with pytest.raises(
-        CheckpointError, match=r"missing: images\.frame_encoder.*unexpected: images\.box_encoders"
-    ):
+    with pytest.raises(CheckpointError, match=r"missing: frame_encoder.*unexpected: images\.box_encoders"):
         load_checkpoint(tmp_path / "vima")
 
 

@@ -1,7 +1,5 @@
 """The loss of real demonstrations moves every parameter that it is meant to move, and no other."""
 
-from dataclasses import replace
-
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -9,24 +7,24 @@ torch = pytest.importorskip("torch")
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.sizes import Size  # noqa: E402
-from openvima.policies.families.flamingo import flamingo  # noqa: E402
-from openvima.policies.families.gato import gato  # noqa: E402
-from openvima.policies.families.gpt import gpt  # noqa: E402
-from openvima.policies.families.midas import midas  # noqa: E402
-from openvima.policies.families.vima import vima  # noqa: E402
-from openvima.policies.nn.bins import BinsConfig  # noqa: E402
+from openvima.policies.batch import PromptBatch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.flamingo.config import flamingo  # noqa: E402
+from openvima.policies.gato.config import gato  # noqa: E402
+from openvima.policies.gpt.config import gpt  # noqa: E402
+from openvima.policies.midas.config import midas  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
+from openvima.policies.sizes import Size  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
+from openvima.policies.vima.config import vima  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
-FAMILIES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
+PUBLISHED = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt, "midas": midas}
 NUM_LAYERS = 3  # of the text encoder
 IN_A_BLOCK = (
     "norm_attention",
@@ -62,10 +60,10 @@ def prompt_sizes(trained_layers: int | None, *, train_words: bool = False) -> Pr
     )
 
 
-def published_layout(family: str, prompt: PromptEncoderConfig) -> PolicyConfig:
+def published_layout(architecture: str, prompt: PromptEncoderConfig) -> PolicyConfig:
     """A policy laid out as the published ones, in small."""
     sizes = {"image_width": 48, "image_layers": 2, "image_heads": 4, "hidden_width": 32, "action_width": 16}
-    return FAMILIES[family](Size(width=64, num_layers=2, num_heads=2, prompt=prompt, **sizes))
+    return PUBLISHED[architecture](Size(width=64, num_layers=2, num_heads=2, prompt=prompt, **sizes))
 
 
 def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str]]:
@@ -79,9 +77,8 @@ def reached(sizes: PolicyConfig, demonstrations) -> tuple[PolicyNetwork, set[str
     examples, images = examples_of(demonstrations, processor)
     batch = collate_examples(processor, examples)
     features = model.encode_images(images)
-    memory = model.encode_prompt(batch.prompts, features)
-    inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
-    model.head.loss(inputs, batch.targets)[0].backward()
+    prompt = model.encode_prompt(batch.prompts, features)
+    model.loss(prompt, batch.history, features, batch.targets)[0].backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
     return model, {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
 
@@ -105,32 +102,32 @@ def test_the_pointing_loss_reaches_every_parameter(demonstrations, small_sizes) 
     assert names(model) - moved == set()
 
 
-def test_the_copying_loss_reaches_every_parameter(long_and_short) -> None:
+def test_the_candidate_loss_reaches_every_parameter(long_and_short) -> None:
     """With prompts that show changes: other ones leave nothing to compare."""
     model, moved = reached(narrow_small(), long_and_short)
     assert names(model) - moved == set()
 
 
 def test_the_bins_loss_reaches_every_parameter_but_the_appearance_that_pointing_needs(
-    demonstrations, small_sizes
+    demonstrations, small_bins_sizes
 ) -> None:
-    model, moved = reached(replace(small_sizes, head=BinsConfig(hidden_width=32)), demonstrations)
+    model, moved = reached(small_bins_sizes, demonstrations)
     assert names(model) - moved == {"images.appearance.weight", "images.appearance.bias"}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("architecture", PUBLISHED)
 @pytest.mark.slow
-def test_the_loss_reaches_every_parameter_of_the_nano_presets(family, demonstrations) -> None:
-    model, moved = reached(preset(f"{family}-nano"), demonstrations)
+def test_the_loss_reaches_every_parameter_of_the_nano_presets(architecture, demonstrations) -> None:
+    model, moved = reached(preset(f"{architecture}-nano"), demonstrations)
     assert names(model) - moved == set()
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("architecture", PUBLISHED)
 @pytest.mark.parametrize("trained_layers", FROZEN)
 def test_the_loss_reaches_every_parameter_that_is_not_frozen_and_no_frozen_one(
-    family, trained_layers, demonstrations
+    architecture, trained_layers, demonstrations
 ) -> None:
-    model, moved = reached(published_layout(family, prompt_sizes(trained_layers)), demonstrations)
+    model, moved = reached(published_layout(architecture, prompt_sizes(trained_layers)), demonstrations)
     assert names(model) - moved == FROZEN[trained_layers]
     assert {name for name, p in model.named_parameters() if p.grad is None} == FROZEN[trained_layers]
     assert {name for name, p in model.named_parameters() if not p.requires_grad} == FROZEN[trained_layers]
@@ -141,9 +138,9 @@ def test_words_can_be_trained_with_a_frozen_text_encoder(demonstrations) -> None
     assert names(model) - moved == FROZEN[0] - {"prompt.words.weight"}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_the_published_presets_freeze_the_words_and_all_but_two_layers_of_t5(family) -> None:
-    prompt = preset(f"{family}-2m").prompt
+@pytest.mark.parametrize("architecture", PUBLISHED)
+def test_the_published_presets_freeze_the_words_and_all_but_two_layers_of_t5(architecture) -> None:
+    prompt = preset(f"{architecture}-2m").prompt
     assert (prompt.train_words, prompt.trained_layers, prompt.text.num_layers) == (False, 2, 12)
 
 
@@ -157,7 +154,8 @@ def encoded(encoder: PromptEncoder, images_IE):
     word_ids_BL = torch.arange(20).view(2, 10)
     object_index_BL = torch.full_like(word_ids_BL, -1)
     object_index_BL[:, 3 : 3 + len(images_IE) // 2] = torch.arange(len(images_IE)).view(2, -1)
-    return encoder(word_ids_BL, object_index_BL, torch.ones_like(word_ids_BL, dtype=torch.bool), images_IE)
+    mask_BL, no_objects = torch.ones_like(word_ids_BL, dtype=torch.bool), torch.zeros(0)
+    return encoder(PromptBatch(word_ids_BL, object_index_BL, mask_BL, *[no_objects] * 6), images_IE)
 
 
 def test_gradients_reach_images_through_a_frozen_text_encoder() -> None:

@@ -1,4 +1,4 @@
-"""Acting with what was read before gives what reading everything anew gives, whatever the batch."""
+"""Acting with caches equals decoding everything from scratch, whatever the batch."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,11 +12,17 @@ torch = pytest.importorskip("torch")
 from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, HeadInputs  # noqa: E402
-from openvima.policies.inference import NetworkPolicy, drawing  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.actions import (  # noqa: E402
+    ACTION_PARTS,
+    ACTION_WIDTH,
+    ActionTargets,
+    sampling,
+)
 from openvima.policies.nn.decoder import MAX_POSITIONS  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
+from openvima.policies.pointer.model import Pointer  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
@@ -70,36 +76,45 @@ def vector(action: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([action[key] for key in ACTION_PARTS])
 
 
+def first_of_head(network: PolicyNetwork) -> torch.nn.Module:
+    """The module of the head that is called first, once per call of the network."""
+    return network.head.pick if isinstance(network, Pointer) else network.head.classifiers[0]
+
+
 @contextmanager
-def recorded_heads(policy: NetworkPolicy) -> Iterator[list[HeadInputs]]:
-    """Collect what the head is given at each step."""
-    head, given = policy.network.head, []
-    decide = head.decide
-    head.decide = lambda inputs, *choose: (given.append(inputs), decide(inputs, *choose))[1]
+def recorded_queries(network: PolicyNetwork) -> Iterator[list["torch.Tensor"]]:
+    """Collect the decoder's outputs at the action queries, (B, T, D), of each call."""
+    queries = []
+
+    def record(_, arguments):
+        (given,) = arguments
+        queries.append(given.query_BTD if isinstance(network, Pointer) else given)
+
+    hook = first_of_head(network).register_forward_pre_hook(record)
     try:
-        yield given
+        yield queries
     finally:
-        del head.decide
+        hook.remove()
 
 
 def played(policy: NetworkPolicy, prompts, pool, rows: Sequence[int] = (0, 1, 2, 3)) -> dict:
     """Play episodes together; return (row, step) -> action and query, both as vectors."""
     policy.reset([prompts[row] for row in rows])
     result = {}
-    with recorded_heads(policy) as given:
+    with recorded_queries(policy.network) as queries:
         for step in range(max(LENGTHS[row] for row in rows)):
             actions = policy.act(batch_at(step, rows, pool))
             running = [row for row in rows if step < LENGTHS[row]]
             assert [row for row, action in zip(rows, actions, strict=True) if action is not None] == running
             for place, row in enumerate(running):
                 action = actions[rows.index(row)]
-                result[row, step] = (vector(action), given[-1].query_BTD[place, 0].double().numpy())
+                result[row, step] = (vector(action), queries[-1][place, 0].double().numpy())
     return result
 
 
 @torch.no_grad()
 def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
-    """For every step of every episode read prompt and history from scratch; return (row, step) -> query."""
+    """For every step of every episode decode prompt and history from scratch; return (row, step) -> query."""
     network, processor = policy.network, policy.processor
     result = {}
     for step in range(max(LENGTHS)):
@@ -108,13 +123,16 @@ def recomputed(policy: NetworkPolicy, prompts, pool, actions: dict) -> dict:
         observations = [[seen_by(row, t, pool) for t in range(step + 1)] for row in rows]
         history, stack = processor.encode_observations(observations, stack=stack)
         features = network.encode_images(torch.from_numpy(stack.images()))
-        memory = network.encode_prompt(batch, features)
+        prompt = network.encode_prompt(batch, features)
         taken = np.zeros((len(rows), step + 1, ACTION_WIDTH))
         for place, row in enumerate(rows):
             taken[place, :-1] = [actions[row, t][0] for t in range(step)] or taken[place, :-1]
-        heads = network(memory, history, features, torch.from_numpy(taken))
+        no_slots = torch.full_like(history.num_slots_BT, -1)
+        targets = ActionTargets(torch.from_numpy(taken), no_slots, no_slots, history.steps_BT)
+        with recorded_queries(network) as queries:
+            network.loss(prompt, history, features, targets)
         for place, row in enumerate(rows):
-            result[row, step] = heads.query_BTD[place, step].double().numpy()
+            result[row, step] = queries[0][place, step].double().numpy()
     return result
 
 
@@ -128,7 +146,7 @@ def assert_same_actions(some: dict, others: dict) -> None:
         np.testing.assert_array_equal(action, others[key][0], err_msg=f"episode and step {key}")
 
 
-def test_keeping_what_was_read_changes_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
+def test_caches_change_nothing_in_a_ragged_batch(policy, prompts, pool) -> None:
     steps = played(policy, prompts, pool)
     assert len(set(policy.processor.encode_prompts(prompts)[0].mask_BL.sum(1).tolist())) > 2
     assert largest_difference(steps, recomputed(policy, prompts, pool, steps)) < 1e-9
@@ -151,10 +169,10 @@ def test_neither_company_nor_order_changes_an_action(policy, prompts, pool) -> N
 def test_history_and_prompt_change_the_action(policy, prompts, pool) -> None:
     """Without this the tests above could pass for a network that looks at nothing."""
     policy.reset([prompts[0], prompts[1], prompts[0]])
-    with recorded_heads(policy) as given:
+    with recorded_queries(policy.network) as queries:
         policy.act([pool[0], pool[0], pool[3]])
         policy.act([pool[5]] * 3)
-    first, other_prompt, other_past = given[-1].query_BTD[:, 0]
+    first, other_prompt, other_past = queries[-1][:, 0]
     assert (first - other_prompt).abs().max() > 1e-3
     assert (first - other_past).abs().max() > 1e-3
 
@@ -213,7 +231,9 @@ def test_an_error_leaves_the_policy_as_it_was(policy, prompts, pool) -> None:
             policy.reset([prompts[1], RenderedPrompt("", {})])
         with pytest.MonkeyPatch.context() as patch, pytest.raises(RuntimeError, match="no luck"):
             patch.setattr(
-                policy.network.head, "decide", lambda *_: (_ for _ in ()).throw(RuntimeError("no luck"))
+                first_of_head(policy.network),
+                "forward",
+                lambda *_: (_ for _ in ()).throw(RuntimeError("no luck")),
             )
             policy.act([None, None, None, pool[2]] if seen[3] is not None else [None] * 4)
         for row, action in enumerate(policy.act(seen)):
@@ -272,12 +292,12 @@ def test_a_low_temperature_gives_the_likeliest_actions(policy, prompts, pool) ->
     assert_same_actions(played(cold, prompts, pool), played(policy, prompts, pool))
 
 
-def test_draws_have_the_distribution_of_the_scores() -> None:
+def test_samples_have_the_distribution_of_the_logits() -> None:
     """Chi-square over 4000 draws from five classes and a hidden one, at temperature 2."""
     scores = torch.tensor([0.0, 3.0, 1.0, torch.finfo(torch.float32).min, 2.0, 4.0])
     chances = torch.softmax(scores.double() / 2, dim=-1).numpy()
     generators = [torch.Generator().manual_seed(seed) for seed in range(4000)]
-    drawn = drawing(generators, 2.0)(scores.expand(4000, 1, 6)).flatten()
+    drawn = sampling(generators, 2.0)(scores.expand(4000, 1, 6)).flatten()
     counts = np.bincount(drawn.numpy(), minlength=6)
     assert counts[3] == 0
     shown = chances > 0

@@ -1,4 +1,4 @@
-"""Policies say which of their decisions rounding may have made."""
+"""Policies report which of their actions rounding may have changed."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from small_networks import narrow_small  # noqa: E402

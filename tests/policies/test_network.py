@@ -1,4 +1,4 @@
-"""Building networks, and the ranges in which actions are spoken of."""
+"""Building networks, and the ranges of actions."""
 
 from dataclasses import replace
 
@@ -8,11 +8,14 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
-from openvima.policies.heads.pointing import yaw_bin  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.nn.actions import from_unit_range, to_unit_range  # noqa: E402
+from openvima.policies.pointer.geometry import yaw_to_bin  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from training_examples import collate_examples, examples_of  # noqa: E402
+from training_examples import (
+    collate_examples,
+    examples_of,
+)
 
 
 def test_fresh_weights_follow_from_the_seed_and_leave_global_state_alone(small_sizes):
@@ -34,14 +37,14 @@ def test_unit_range_undoes_itself_and_clips():
 
 
 def test_yaw_bins_are_centred_on_whole_steps():
-    turns = torch.deg2rad(torch.tensor([0.0, 2.4, 2.6, -2.6, 180.0, -180.0, 357.6]))
-    assert yaw_bin(turns, 72).tolist() == [0, 0, 1, 71, 36, 36, 0]
+    yaws = torch.deg2rad(torch.tensor([0.0, 2.4, 2.6, -2.6, 180.0, -180.0, 357.6]))
+    assert yaw_to_bin(yaws, 72).tolist() == [0, 0, 1, 71, 36, 36, 0]
 
 
-def test_images_and_trunk_of_different_widths_are_refused():
+def test_images_and_decoder_of_different_widths_are_refused():
     sizes = preset("nano")
     with pytest.raises(ConfigError, match="make them equal"):
-        replace(sizes, trunk=replace(sizes.trunk, width=64))
+        replace(sizes, decoder=replace(sizes.decoder, width=64))
 
 
 @pytest.mark.parametrize(
@@ -56,9 +59,8 @@ def test_mixed_precision_gives_nearly_the_same_loss_and_finite_gradients(name, d
 
     def loss() -> torch.Tensor:
         features = network.encode_images(images)
-        memory = network.encode_prompt(batch.prompts, features)
-        inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
-        return network.head.loss(inputs, batch.targets)[0]
+        prompt = network.encode_prompt(batch.prompts, features)
+        return network.loss(prompt, batch.history, features, batch.targets)[0]
 
     with torch.autocast("cpu", torch.bfloat16):
         mixed = loss()

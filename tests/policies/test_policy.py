@@ -1,4 +1,4 @@
-"""What every policy promises: valid actions for the running episodes, whatever the other episodes do."""
+"""The contract of policies: valid actions for running episodes, whatever the other episodes do."""
 
 from dataclasses import replace
 
@@ -12,32 +12,27 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import UnknownPolicyError  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.base import Policy  # noqa: E402
-from openvima.policies.nn.bins import BinsConfig  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.actions import ActionTargets  # noqa: E402
+from openvima.policies.nn.history import shift_actions  # noqa: E402
 from openvima.scene import ACTION_SHAPES, WORKSPACE_HIGH, WORKSPACE_LOW  # noqa: E402
 
 
-def small_policy(small_sizes, *, bins: bool = False, fuse_views: bool = True) -> NetworkPolicy:
-    sizes = small_sizes
-    if bins:
-        sizes = replace(sizes, head=BinsConfig(hidden_width=32))
-    if not fuse_views:  # as the published policies
-        objects = replace(sizes.images, fuse_views=False, appearance_width=0)
-        sizes = replace(sizes, images=objects, query_token=False)
-    model = build_network(sizes, seed=2)
-    if not bins:  # offsets start at zero and would hide differences
-        torch.nn.init.constant_(model.head.offset.weight, 0.02)
-    return NetworkPolicy(model)
-
-
-@pytest.fixture(params=["random", "pointing", "bins", "published"])
-def policy(request, small_sizes) -> Policy:
+@pytest.fixture(params=["random", "pointer", "bins", "published"])
+def policy(request, small_sizes, small_bins_sizes) -> Policy:
     if request.param == "random":
         return RandomPolicy(seed=1)
-    return small_policy(
-        small_sizes, bins=request.param != "pointing", fuse_views=request.param != "published"
-    )
+    if request.param == "pointer":
+        network = build_network(small_sizes, seed=2)
+        # Offsets start at zero and would hide differences.
+        torch.nn.init.constant_(network.head.offset.weight, 0.02)
+        return NetworkPolicy(network)
+    sizes = small_bins_sizes
+    if request.param == "published":
+        objects = replace(sizes.images, fuse_views=False, appearance_width=0)
+        sizes = replace(sizes, images=objects, query_token=False)
+    return NetworkPolicy(build_network(sizes, seed=2))
 
 
 def played(policy: Policy, episodes, rows, num_steps: int = 3) -> dict[int, list]:
@@ -129,7 +124,7 @@ def read_episode(reader: Reader, demo) -> list:
 
 
 def test_padding_changes_nothing(small_sizes, demonstrations) -> None:
-    """The same prompt and steps, alone and beside longer ones, give the head the same tokens."""
+    """The same prompt and steps, alone and beside longer ones, give the head the same inputs."""
     model = build_network(small_sizes, seed=4).double().eval()
     chosen = [demonstrations[0], demonstrations[-1]]
     reader = Reader.of(small_sizes.inputs)
@@ -148,18 +143,25 @@ def test_padding_changes_nothing(small_sizes, demonstrations) -> None:
                 crops.append(step.objects.crops.reshape(-1, 3, 32, 32))
                 first += len(crops[-1])
         features = model.encode_images(torch.from_numpy(np.concatenate(crops)))
-        memory = model.encode_prompt(batch_prompts([prompts[row] for row in rows], numbers), features)
+        prompt = model.encode_prompt(batch_prompts([prompts[row] for row in rows], numbers), features)
         history = batch_histories([steps[row] for row in rows], histories)
         actions = torch.full((*history.steps_BT.shape, 12), 0.3, dtype=torch.float64)
-        return memory, model(memory, history, features, actions)
+        no_slots = torch.full_like(history.num_slots_BT, -1)
+        previous = shift_actions(ActionTargets(actions, no_slots, no_slots, history.steps_BT))
+        given = []
+        hook = model.head.pick.register_forward_pre_hook(lambda _, arguments: given.extend(arguments))
+        model.decode_step(prompt, model.init_cache(prompt), history, features, *previous)
+        hook.remove()
+        (inputs,) = given
+        return prompt, inputs
 
     with torch.no_grad():
-        memories, padded = run([0, 1])
+        both, padded = run([0, 1])
         for row in (0, 1):
-            memory, alone = run([row])
+            prompt, alone = run([row])
             length, count = len(prompts[row].words), alone.masks_BTN.shape[2]
-            torch.testing.assert_close(memories.tokens_BLD[row, :length], memory.tokens_BLD[0])
-            assert not memories.mask_BL[row, length:].any()
+            torch.testing.assert_close(both.tokens_BLD[row, :length], prompt.tokens_BLD[0])
+            assert not both.mask_BL[row, length:].any()
             exists = alone.masks_BTN[0]
             num_steps = len(steps[row])
             torch.testing.assert_close(padded.query_BTD[row, :num_steps], alone.query_BTD[0])

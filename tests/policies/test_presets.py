@@ -1,4 +1,4 @@
-"""Named sizes: how large they are, that they survive files, and that nonsense is refused by name."""
+"""Presets: their sizes, configs in files, and errors that name a wrong field."""
 
 from dataclasses import replace
 
@@ -11,11 +11,11 @@ import yaml  # noqa: E402
 from openvima.errors import ConfigError, OpenVimaError, UnknownPolicyError  # noqa: E402
 from openvima.policies import PRESETS, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.config import config_from_dict, config_to_dict  # noqa: E402
 from openvima.policies.nn.bins import NUM_BINS  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.vit import VitConfig  # noqa: E402
-from openvima.policies.presets import FAMILIES, SIZE_NAMES  # noqa: E402
+from openvima.policies.presets import PUBLISHED, SIZE_NAMES  # noqa: E402
 from openvima.policies.sizes import SIZES  # noqa: E402
 from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
 
@@ -40,20 +40,20 @@ def test_the_bins_preset_classifies_over_the_published_bins() -> None:
 def test_either_crop_encoder_survives_its_file(crop) -> None:
     sizes = preset("nano")
     sizes = replace(sizes, images=replace(sizes.images, crop=crop))
-    text = yaml.safe_dump(sizes.to_dict())
-    assert PolicyConfig.from_dict(yaml.safe_load(text)) == sizes
+    text = yaml.safe_dump(config_to_dict(sizes))
+    assert config_from_dict(yaml.safe_load(text)) == sizes
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_survives_its_file(name: str) -> None:
-    text = yaml.safe_dump(preset(name).to_dict())
-    assert PolicyConfig.from_dict(yaml.safe_load(text)) == preset(name)
+    text = yaml.safe_dump(config_to_dict(preset(name)))
+    assert config_from_dict(yaml.safe_load(text)) == preset(name)
 
 
-def test_every_size_of_every_family_is_a_preset() -> None:
+def test_every_size_of_every_published_architecture_is_a_preset() -> None:
     assert tuple(SIZES) == SIZE_NAMES
-    members = {f"{family}-{size}" for family in FAMILIES for size in SIZES}
-    assert set(PRESETS) == {"nano", "nano-bins", "small"} | members
+    published = {f"{name}-{size}" for name in PUBLISHED for size in SIZES}
+    assert set(PRESETS) == {"nano", "nano-bins", "small"} | published
 
 
 def test_an_unknown_preset_gets_a_suggestion() -> None:
@@ -61,10 +61,10 @@ def test_an_unknown_preset_gets_a_suggestion() -> None:
         preset("nanno")
 
 
-def test_the_pointing_head_needs_one_token_for_each_object_and_its_appearance() -> None:
+def test_a_pointer_model_needs_fused_views_and_an_appearance_embedding() -> None:
     sizes = preset("nano")
     without = replace(sizes.images, appearance_width=0)
-    with pytest.raises(ConfigError, match="pointing head needs objects with fuse_views, an appearance width"):
+    with pytest.raises(ConfigError, match="images needs fuse_views and an appearance_width above 0"):
         replace(sizes, images=without)
     with pytest.raises(ConfigError, match="fuse_views"):
         replace(sizes.images, fuse_views=False)
@@ -82,23 +82,23 @@ def test_a_crop_width_that_groups_do_not_divide_is_named(width: int) -> None:
         ConvConfig(width, 32)
 
 
-@pytest.mark.parametrize("name", PRESETS["nano"]().to_dict())
+@pytest.mark.parametrize("name", config_to_dict(PRESETS["nano"]()))
 def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -> None:
-    values = preset("nano").to_dict()
+    values = config_to_dict(preset("nano"))
     if isinstance(values[name], dict):
         with pytest.raises(OpenVimaError, match=rf"policy\.{name} is 3"):
-            PolicyConfig.from_dict({**values, name: 3})
-    if name not in ("query_token", "comparison"):  # these have defaults
+            config_from_dict({**values, name: 3})
+    if name not in ("action_width", "correspondence", "coreference"):  # these have defaults
         del values[name]
         with pytest.raises(OpenVimaError, match=name):
-            PolicyConfig.from_dict(values)
+            config_from_dict(values)
 
 
 def test_a_file_with_a_field_too_many_names_it_and_those_allowed() -> None:
     with pytest.raises(ConfigError, match=r"policy has unknown fields depth; allowed: images, prompt"):
-        PolicyConfig.from_dict({**preset("nano").to_dict(), "depth": 3})
+        config_from_dict({**config_to_dict(preset("nano")), "depth": 3})
 
 
 def test_a_file_that_is_no_mapping_is_refused() -> None:
     with pytest.raises(ConfigError, match="must be a mapping"):
-        PolicyConfig.from_dict([])  # type: ignore[arg-type]
+        config_from_dict([])  # type: ignore[arg-type]

@@ -10,17 +10,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.policies.families.flamingo import flamingo  # noqa: E402
-from openvima.policies.families.gato import gato  # noqa: E402
-from openvima.policies.families.gpt import gpt  # noqa: E402
-from openvima.policies.families.vima import vima  # noqa: E402
-
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.build import build_network
+from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.nn.decoder import DecoderConfig, PrefixConfig  # noqa: E402
-from openvima.policies.nn.policy_network import PolicyNetwork, outline_network  # noqa: E402
+from openvima.policies.flamingo.config import flamingo  # noqa: E402
+from openvima.policies.gato.config import gato  # noqa: E402
+from openvima.policies.gpt.config import gpt  # noqa: E402
+from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.presets import SIZE_NAMES  # noqa: E402
@@ -28,34 +26,35 @@ from openvima.policies.published.checkpoint import load_published  # noqa: E402
 from openvima.policies.published.config import config_from_published  # noqa: E402
 from openvima.policies.published.names import from_published, to_published  # noqa: E402
 from openvima.policies.sizes import Size  # noqa: E402
+from openvima.policies.vima.config import vima  # noqa: E402
 
-MEMBERS = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
+ARCHITECTURES = {"vima": vima, "gato": gato, "flamingo": flamingo, "gpt": gpt}
 DECODER_NAMES = {
     "vima": ("xf_n_layers", "sattn_n_heads", "xattn_n_heads"),
     "flamingo": ("dt_n_layers", "dt_n_heads", "xattn_n_heads"),
 }
 
 
-def small(family: str) -> PolicyConfig:
-    """A member of the published architecture with few and narrow layers; every width is another."""
+def small(architecture: str) -> PolicyConfig:
+    """A published architecture with few and narrow layers; all widths differ."""
     text = TextEncoderConfig(width=40, num_layers=3, num_heads=2, head_width=6, hidden_width=20)
     prompt = PromptEncoderConfig(
         text, 28, vocabulary_size=30, tokenizer="t5", train_words=False, trained_layers=2
     )
     size = Size(32, 2, 4, prompt, image_width=48, image_layers=2, hidden_width=12, action_width=10)
-    config = MEMBERS[family](size)
-    if isinstance(config.trunk, DecoderConfig):
-        return replace(config, trunk=replace(config.trunk, num_cross_heads=2))
+    config = ARCHITECTURES[architecture](size)
+    if isinstance(config.decoder, DecoderConfig):
+        return replace(config, decoder=replace(config.decoder, num_cross_heads=2))
     return config
 
 
-def cfg_of(config: PolicyConfig, family: str) -> dict[str, int]:
+def cfg_of(config: PolicyConfig, architecture: str) -> dict[str, int]:
     """What a published file says about a network beside its weights."""
-    trunk = config.trunk
-    if isinstance(trunk, PrefixConfig):
-        return {"embed_dim": trunk.width, "n_layer": trunk.num_layers, "n_head": trunk.num_heads}
-    numbers = (trunk.num_layers, trunk.num_self_heads, trunk.num_cross_heads)
-    return {"embed_dim": trunk.width, **dict(zip(DECODER_NAMES[family], numbers, strict=True))}
+    decoder = config.decoder
+    if isinstance(decoder, PrefixDecoderConfig):
+        return {"embed_dim": decoder.width, "n_layer": decoder.num_layers, "n_head": decoder.num_heads}
+    numbers = (decoder.num_layers, decoder.num_self_heads, decoder.num_cross_heads)
+    return {"embed_dim": decoder.width, **dict(zip(DECODER_NAMES[architecture], numbers, strict=True))}
 
 
 def assert_same(actual: dict, expected: dict) -> None:
@@ -64,15 +63,15 @@ def assert_same(actual: dict, expected: dict) -> None:
     assert different == []
 
 
-@pytest.fixture(params=MEMBERS)
-def family(request) -> str:
+@pytest.fixture(params=ARCHITECTURES)
+def architecture(request) -> str:
     return request.param
 
 
 @pytest.fixture
-def network(family) -> PolicyNetwork:
+def network(architecture) -> PolicyNetwork:
     """A network of random numbers, so that no weight is like another; fresh norms and biases all are."""
-    network = build_network(small(family), seed=5)
+    network = build_network(small(architecture), seed=5)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -80,11 +79,11 @@ def network(family) -> PolicyNetwork:
     return network
 
 
-def contents(network: PolicyNetwork, family: str, *, dead_entries: bool = True) -> dict:
+def contents(network: PolicyNetwork, architecture: str, *, dead_entries: bool = True) -> dict:
     weights = to_published(network, dead_entries=dead_entries)
     return {
         "state_dict": {f"policy.{name}": tensor for name, tensor in weights.items()},
-        "cfg": cfg_of(network.config, family),
+        "cfg": cfg_of(network.config, architecture),
     }
 
 
@@ -105,15 +104,15 @@ def test_names_go_to_published_ones_and_back(network) -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "published", "ours"),
+    ("architecture", "published", "ours"),
     [
-        ("vima", "xattn_gpt.h.1.ln_1.bias", "trunk.self_blocks.1.norm_attention.bias"),
-        ("gato", "transformer.lm.h.1.ln_2.bias", "trunk.self_blocks.1.norm_feed_forward.bias"),
-        ("vima", "xattn_gpt.xattns.1.layernorm.weight", "trunk.cross_blocks.1.norm_attention.weight"),
-        ("vima", "xattn_gpt.xattns.1.ln.weight", "trunk.cross_blocks.1.norm_feed_forward.weight"),
-        ("vima", "xattn_gpt.xattns.1.linear1.weight", "trunk.cross_blocks.1.widen.weight"),
-        ("flamingo", "xattn_gpt.xattns.0.gated_layer.weight", "trunk.cross_blocks.0.gate.weight"),
-        ("vima", "xattn_gpt.xattns.0.attention_out.weight", "trunk.cross_blocks.0.attention_out.weight"),
+        ("vima", "xattn_gpt.h.1.ln_1.bias", "decoder.self_blocks.1.norm_attention.bias"),
+        ("gato", "transformer.lm.h.1.ln_2.bias", "decoder.self_blocks.1.norm_feed_forward.bias"),
+        ("vima", "xattn_gpt.xattns.1.layernorm.weight", "decoder.cross_blocks.1.norm_attention.weight"),
+        ("vima", "xattn_gpt.xattns.1.ln.weight", "decoder.cross_blocks.1.norm_feed_forward.weight"),
+        ("vima", "xattn_gpt.xattns.1.linear1.weight", "decoder.cross_blocks.1.widen.weight"),
+        ("flamingo", "xattn_gpt.xattns.0.gated_layer.weight", "decoder.cross_blocks.0.gate.weight"),
+        ("vima", "xattn_gpt.xattns.0.attention_out.weight", "decoder.cross_blocks.0.attention_out.weight"),
         ("vima", "obj_encoder.bbox_mlp.top.3.weight", "images.box_encoders.1.2.weight"),
         ("vima", "obj_encoder.pre_transformer_layer.front.bias", "images.fusion.0.bias"),
         (
@@ -121,21 +120,21 @@ def test_names_go_to_published_ones_and_back(network) -> None:
             "obj_encoder.cropped_img_encoder.vit.blocks.1.ln_2.weight",
             "images.crop_encoder.blocks.1.norm_mlp.weight",
         ),
-        ("gpt", "obj_encoder.cropped_img_encoder.vit.ln_pre.bias", "images.frame_encoder.norm_before.bias"),
+        ("gpt", "obj_encoder.cropped_img_encoder.vit.ln_pre.bias", "frame_encoder.norm_before.bias"),
         (
             "flamingo",
             "obj_encoder.peceiver.model.encoder.self_attends.3.attention.self.value.bias",
-            "images.resampler.self_layers.3.value.bias",
+            "resampler.self_layers.3.value.bias",
         ),
         (
             "flamingo",
             "obj_encoder.peceiver.model.encoder.cross_attention.attention.self.layernorm2.weight",
-            "images.resampler.cross_layer.norm_source.weight",
+            "resampler.cross_layer.norm_source.weight",
         ),
         (
             "flamingo",
             "obj_encoder.peceiver.model.encoder.cross_attention.mlp.dense1.weight",
-            "images.resampler.cross_layer.hidden.weight",
+            "resampler.cross_layer.hidden.weight",
         ),
         (
             "vima",
@@ -148,12 +147,12 @@ def test_names_go_to_published_ones_and_back(network) -> None:
             "prompt.text.blocks.2.norm_feed_forward.weight",
         ),
         ("vima", "prompt_obj_post_layer.6.bias", "prompt.images.4.bias"),
-        ("vima", "action_encoder._embed_dict.pose1_position._layer.3.bias", "actions.parts.2.2.bias"),
+        ("vima", "action_encoder._embed_dict.pose1_position._layer.3.bias", "head.actions.parts.2.2.bias"),
         ("vima", "action_decoder._decoders.pose0_rotation.mlps.3.6.bias", "head.classifiers.5.4.bias"),
         ("vima", "action_decoder._decoders.pose1_position.mlps.1.0.bias", "head.classifiers.7.0.bias"),
     ],
 )
-def test_weights_of_equal_shapes_are_told_apart(network, family, published, ours) -> None:
+def test_weights_of_equal_shapes_are_told_apart(network, architecture, published, ours) -> None:
     weight = to_published(network)[published]
     assert torch.equal(weight, network.state_dict()[ours])
 
@@ -166,18 +165,18 @@ def test_a_prefix_is_stripped_from_the_beginning_only(network) -> None:
     assert_same(renamed, network.state_dict())
 
 
-def test_matrices_of_the_trunk_are_published_the_other_way_round(network, family) -> None:
-    trunk = "xattn_gpt" if family in DECODER_NAMES else "transformer.lm"
-    block, published = network.trunk.self_blocks[1], to_published(network)
+def test_matrices_of_the_decoder_are_published_transposed(network, architecture) -> None:
+    prefix = "xattn_gpt" if architecture in DECODER_NAMES else "transformer.lm"
+    block, published = network.decoder.self_blocks[1], to_published(network)
     for name, ours in (
         ("attn.c_attn", block.query_key_value),
         ("attn.c_proj", block.attention_out),
         ("mlp.c_fc", block.widen),
         ("mlp.c_proj", block.narrow),
     ):
-        assert torch.equal(published[f"{trunk}.h.1.{name}.weight"], ours.weight.T)
-    assert torch.equal(published[f"{trunk}.h.1.mlp.gated_layer.weight"], block.gate.weight)
-    vit = network.images.crop_encoder if family == "vima" else network.images.frame_encoder
+        assert torch.equal(published[f"{prefix}.h.1.{name}.weight"], ours.weight.T)
+    assert torch.equal(published[f"{prefix}.h.1.mlp.gated_layer.weight"], block.gate.weight)
+    vit = network.images.crop_encoder if architecture == "vima" else network.frame_encoder
     name = "obj_encoder.cropped_img_encoder.vit.projection"
     assert torch.equal(published[name], vit.projection.weight.T)
 
@@ -201,24 +200,24 @@ def test_weights_of_something_else_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "size"),
-    [("vima", size) for size in SIZE_NAMES[1:]] + [(name, "9m") for name in MEMBERS if name != "vima"],
+    ("architecture", "size"),
+    [("vima", size) for size in SIZE_NAMES[1:]] + [(name, "9m") for name in ARCHITECTURES if name != "vima"],
 )
-def test_sizes_of_every_published_network_follow_from_its_weights(family, size) -> None:
-    config = preset(f"{family}-{size}")
+def test_sizes_of_every_published_network_follow_from_its_weights(architecture, size) -> None:
+    config = preset(f"{architecture}-{size}")
     weights = to_published(outline_network(config), dead_entries=True)
-    assert config_from_published(weights, cfg_of(config, family)) == config
+    assert config_from_published(weights, cfg_of(config, architecture)) == config
 
 
-def test_sizes_of_small_networks_follow_from_their_weights(network, family) -> None:
+def test_sizes_of_small_networks_follow_from_their_weights(network, architecture) -> None:
     config = network.config
-    assert config_from_published(to_published(network), cfg_of(config, family)) == config
+    assert config_from_published(to_published(network), cfg_of(config, architecture)) == config
 
 
 def test_heads_are_taken_from_cfg(vima_contents) -> None:
     cfg = vima_contents["cfg"] | {"sattn_n_heads": 16, "xattn_n_heads": 8}
-    trunk = config_from_published(vima_contents["state_dict"], cfg).trunk
-    assert trunk == DecoderConfig(width=32, num_layers=2, num_self_heads=16, num_cross_heads=8)
+    decoder = config_from_published(vima_contents["state_dict"], cfg).decoder
+    assert decoder == DecoderConfig(width=32, num_layers=2, num_self_heads=16, num_cross_heads=8)
 
 
 @pytest.mark.parametrize(
@@ -241,9 +240,9 @@ def test_a_cfg_that_does_not_fit_is_refused(vima_contents, tmp_path, change, mes
 
 @pytest.mark.parametrize("dead_entries", [True, False])
 def test_a_file_becomes_the_network_with_or_without_dead_entries(
-    network, family, tmp_path, dead_entries
+    network, architecture, tmp_path, dead_entries
 ) -> None:
-    loaded = load_published(saved(contents(network, family, dead_entries=dead_entries), tmp_path))
+    loaded = load_published(saved(contents(network, architecture, dead_entries=dead_entries), tmp_path))
     assert loaded.config == network.config
     assert not loaded.training
     assert_same(loaded.state_dict(), network.state_dict())
@@ -252,10 +251,10 @@ def test_a_file_becomes_the_network_with_or_without_dead_entries(
     assert {name: parameter.requires_grad for name, parameter in loaded.named_parameters()} == trained
 
 
-def test_masks_that_some_versions_store_may_be_there_in_every_family(network, family, tmp_path) -> None:
-    values = contents(network, family)
-    trunk = "xattn_gpt" if family in DECODER_NAMES else "transformer.lm"
-    values["state_dict"][f"policy.{trunk}.h.0.attn.bias"] = torch.ones(1, 1, 512, 512).tril()
+def test_masks_that_some_versions_store_may_be_in_every_file(network, architecture, tmp_path) -> None:
+    values = contents(network, architecture)
+    prefix = "xattn_gpt" if architecture in DECODER_NAMES else "transformer.lm"
+    values["state_dict"][f"policy.{prefix}.h.0.attn.bias"] = torch.ones(1, 1, 512, 512).tril()
     assert_same(load_published(saved(values, tmp_path)).state_dict(), network.state_dict())
 
 
@@ -269,7 +268,7 @@ def test_all_that_is_missing_too_much_or_misshapen_is_told_at_once(vima_contents
     weights = vima_contents["state_dict"]
     del weights["policy.end_effector_encoder.weight"], weights["policy.xattn_gpt.positions_embed.weight"]
     weights["policy.surplus.weight"] = torch.zeros(1)
-    weights["policy.trunk.positions.weight"] = torch.zeros(512, 32)  # our name, not the published one
+    weights["policy.decoder.positions.weight"] = torch.zeros(512, 32)  # our name, not the published one
     weights["policy.obs_fusion_layer.bias"] = torch.zeros(3)
     weights["policy.obs_fusion_layer.weight"] = torch.zeros(32, 34, dtype=torch.int64)
     with pytest.raises(CheckpointError) as caught:
@@ -279,7 +278,7 @@ def test_all_that_is_missing_too_much_or_misshapen_is_told_at_once(vima_contents
         "missing: ",
         "end_effector_encoder.weight",
         "xattn_gpt.positions_embed.weight",
-        "unexpected: surplus.weight, trunk.positions.weight; ",
+        "unexpected: surplus.weight, decoder.positions.weight; ",
         "wrong: ",
         "obs_fusion_layer.bias is float32 (3,) instead of float32 (32,)",
         "obs_fusion_layer.weight is int64 (32, 34) instead of float32 (32, 34)",

@@ -7,10 +7,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.policies.nn.referents import referents  # noqa: E402
+
 from naive_inputs import Reader, batch_prompts  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.nn.referents import referents  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 WORD = -1

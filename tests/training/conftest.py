@@ -37,12 +37,12 @@ def settings(data: Path, tmp_path: Path, monkeypatch) -> dict:
     from openvima.policies.nn.conv_encoder import ConvConfig
 
     def tiny():
-        sizes = presets.nano()
+        sizes = presets.preset("nano")
         return replace(
             sizes,
             images=replace(sizes.images, crop=ConvConfig(width=4, output_width=16), width=32),
             prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
-            trunk=replace(sizes.trunk, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
+            decoder=replace(sizes.decoder, width=32, num_layers=1, num_self_heads=2, num_cross_heads=2),
         )
 
     monkeypatch.setitem(presets.PRESETS, "tiny", tiny)

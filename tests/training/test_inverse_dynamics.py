@@ -26,7 +26,7 @@ from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 PROCESSORS = {
-    name: Processor.of(preset(name).images) for name in ("nano", "midas-nano", "gpt-nano")
+    name: Processor.of(preset(name).inputs) for name in ("nano", "midas-nano", "gpt-nano")
 }  # objects, views, frames
 
 
@@ -189,14 +189,14 @@ def test_what_has_matched_looks_need_not_do_so_again(finetune, settings, tmp_pat
     before, after = last_weights(first), last_weights(tmp_path / "on")
     kept = {name for name in before if torch.equal(before[name], after[name])}
     crops = {name for name in before if name.startswith("images.crop_encoder")}
-    assert crops and "trunk.positions.weight" not in kept
+    assert crops and "decoder.positions.weight" not in kept
     assert crops <= kept if not finetune else not crops <= kept
 
 
 @pytest.mark.slow
 def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
     first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
-    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano-bins", init_from=str(first))
+    other = TrainingConfig(data=data, out=tmp_path / "other", preset="nano", init_from=str(first))
     with pytest.raises(ConfigError, match=r"of other sizes: images\.crop\.width is 4 there and 32 here"):
         train(other)
     assert not other.out.exists()
@@ -228,6 +228,7 @@ def test_parts_of_midas_can_be_switched_on_and_off(data, tmp_path) -> None:
     plain = preset("vima-nano")
     midas = preset("midas-nano")
     both = {"autoregressive": True, "visual_residual": True}
-    assert replace(sizes("vima-nano", **both), trunk=midas.trunk) == midas
+    on = sizes("vima-nano", **both)
+    assert replace(midas, images=on.images, prompt=on.prompt, head=on.head) == midas
     off = sizes("midas-nano", autoregressive=False, visual_residual=False)
-    assert replace(off, trunk=plain.trunk) == plain
+    assert replace(plain, images=off.images, prompt=off.prompt, head=off.head) == plain

@@ -13,19 +13,20 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file  # noqa: E402
 
 from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 
 TRAIN = """
 import json, sys
 from pathlib import Path
 from openvima.policies import presets
-from openvima.policies.config import PolicyConfig
+from openvima.policies.config import config_from_dict
 from openvima.training import TrainingConfig, train
 
 pytestmark = pytest.mark.slow
 
 sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS["tiny"] = lambda: PolicyConfig.from_dict(sizes)
+presets.PRESETS["tiny"] = lambda: config_from_dict(sizes)
 settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
 train(TrainingConfig.of(settings), lambda done, total, note: print(note, flush=True))
 """
@@ -78,7 +79,7 @@ def test_a_run_stopped_by_the_keyboard_goes_on_as_if_it_had_not_been(config, who
 def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(config, settings, whole) -> None:
     plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
     plain["schedule.checkpoint_every"] = 1
-    argument = json.dumps([presets.PRESETS["tiny"]().to_dict(), plain])
+    argument = json.dumps([config_to_dict(presets.PRESETS["tiny"]()), plain])
     for stage in ("1-pretraining", "2-cloning"):
         process = subprocess.Popen([sys.executable, "-c", TRAIN, argument], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None

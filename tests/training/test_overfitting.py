@@ -7,14 +7,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.policies.heads.base import ACTION_PARTS, to_unit_range  # noqa: E402
+from openvima.policies.heads.bins import encode_bins  # noqa: E402
+from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
+
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
-from openvima.policies.heads.base import ACTION_PARTS, to_unit_range  # noqa: E402
-from openvima.policies.heads.bins import encode_bins  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402

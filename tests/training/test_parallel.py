@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 from noisy_extractor import HOOK  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.parallel import joined  # noqa: E402
 
@@ -21,13 +22,13 @@ TRAIN = """
 import json, os, sys
 from pathlib import Path
 from openvima.policies import presets
-from openvima.policies.config import PolicyConfig
+from openvima.policies.config import config_from_dict
 from openvima.training import TrainingConfig, train
 
 pytestmark = pytest.mark.slow
 
 sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS["tiny-bins"] = lambda: PolicyConfig.from_dict(sizes)
+presets.PRESETS["tiny-bins"] = lambda: config_from_dict(sizes)
 kill_at = settings.pop("kill_at", None)
 settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
 train(TrainingConfig.of(settings), lambda done, total, note: done == kill_at and os._exit(9))
@@ -40,10 +41,10 @@ def bins(settings, monkeypatch) -> dict:
 
     def tiny():
         sizes = presets.preset("vima-nano")
-        trunk = replace(sizes.trunk, width=32, num_layers=1, dropout=0.0)
+        decoder = replace(sizes.decoder, width=32, num_layers=1, dropout=0.0)
         images = replace(sizes.images, width=32)
         text = replace(sizes.prompt.text, num_layers=1)
-        return replace(sizes, trunk=trunk, images=images, prompt=replace(sizes.prompt, text=text))
+        return replace(sizes, decoder=decoder, images=images, prompt=replace(sizes.prompt, text=text))
 
     monkeypatch.setitem(presets.PRESETS, "tiny-bins", tiny)
     changes = {
@@ -59,7 +60,7 @@ def bins(settings, monkeypatch) -> dict:
 def run_in_processes(count: int, settings: dict) -> Path:
     """Train in so many processes, as `torchrun` starts them; with "kill_at" the first one dies then."""
     plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
-    argument = json.dumps([presets.PRESETS["tiny-bins"]().to_dict(), plain])
+    argument = json.dumps([config_to_dict(presets.PRESETS["tiny-bins"]()), plain])
     port = str(29_000 + os.getpid() % 5000)
     processes = [
         subprocess.Popen(

@@ -10,7 +10,7 @@ from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.nn import trunk  # noqa: E402
+from openvima.policies.nn import decoder  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
@@ -56,7 +56,7 @@ def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
     cache, network, processor = case
     tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, as_motion))
     limit = max(motions) - 1
-    for module in (sequence_lengths, trunk):
+    for module in (sequence_lengths, decoder):
         monkeypatch.setattr(module, "MAX_PROMPT_POSITIONS", limit)
     with pytest.raises(DatasetError, match=r"^episode \d+ of \w+ read as a motion is too long to learn from"):
         sequence_lengths.check_lengths(cache, network, processor, motion_share=1.0)
@@ -67,7 +67,7 @@ def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
 
 
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
-    for module in (sequence_lengths, trunk):
+    for module in (sequence_lengths, decoder):
         monkeypatch.setattr(module, "MAX_POSITIONS", 30)
     config = TrainingConfig.of(
         {**settings, "preset": "midas-nano", "pretraining.steps": 0, "schedule.checkpoint_every": 1}

@@ -13,10 +13,10 @@ from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, ObjectViews  # noqa: E402
 from openvima.policies import preset  # noqa: E402
-from openvima.policies.config import PolicyConfig  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
-from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.config import PolicyConfig  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
