@@ -22,7 +22,6 @@ import numpy as np
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import TEXTURE_SETS, tasks_at
 from openvima.policies.checkpoint import load_network
-from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
 from openvima.training.pretrain import (
@@ -93,9 +92,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     network, _ = load_network(arguments.policy)
-    encoder = network.images
-    if not isinstance(encoder, ObjectEncoder) or not encoder.config.appearance_width:
-        parser.error(f"{arguments.policy} does not match looks; give a policy with an appearance embedding.")
+    encoder = network.object_encoder
+    if encoder is None or not encoder.config.appearance_width:
+        parser.error(f"{arguments.policy} has no appearance embedding.")
     results: dict[str, dict[str, float]] = {}
     print(f"{'scenes':<30}{'objects':>9}{'prompt':>9}{'again':>9}{'turn':>9}")
     for name, pairs in all_pairs(arguments.scenes):

@@ -36,7 +36,6 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.runner import Job
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.rasteriser import Rasteriser
 from policy import random_network, tokenizer_of
@@ -49,22 +48,18 @@ TASKS = ("visual_manipulation", "rearrange", "sweep_without_exceeding")  # short
 LEVEL = "L1"
 MIN_EPISODES = 4  # of a task in one round, where a batch is smaller
 OTHER = "transfer"
-PHASES: dict[str, list[tuple[Any, str]]] = {  # phase → owner and name of the functions that it consists of
+PHASES: dict[str, list[tuple[Any, str]]] = {  # phase → owner and name of its functions, but for inference
     "simulation": [(EnvConfig, "make"), (TabletopEnv, "reset"), (TabletopEnv, "step")],
     "rendering": [(Rasteriser, "scene"), (Rasteriser, "prompt")],
     "seeing": [(Processor, "encode_prompts"), (Processor, "encode_observations")],
-    "inference": [
-        (PolicyNetwork, "encode_images"),
-        (PolicyNetwork, "encode_prompts"),
-        (PolicyNetwork, "extend"),
-    ],
 }
+INFERENCE = ("encode_images", "encode_prompt", "decode_step")  # methods of the network
 
 
 @contextmanager
 def timed_phases(policy: NetworkPolicy) -> Iterator[dict[str, float]]:
-    """Time the functions of `PHASES` and the policy's head; yields seconds by phase, each counted once."""
-    seconds = dict.fromkeys((*PHASES, OTHER), 0.0)
+    """Time the functions of `PHASES` and the network; yields seconds by phase, each counted once."""
+    seconds = dict.fromkeys((*PHASES, "inference", OTHER), 0.0)
     running, since = [OTHER], time.perf_counter()
 
     def switch() -> None:
@@ -86,7 +81,7 @@ def timed_phases(policy: NetworkPolicy) -> Iterator[dict[str, float]]:
         return wrapper
 
     parts = [(phase, *part) for phase, found in PHASES.items() for part in found]
-    parts.append(("inference", type(policy.network.head), "decide"))
+    parts += [("inference", type(policy.network), name) for name in INFERENCE]
     originals = [getattr(owner, name) for _, owner, name in parts]
     for (phase, owner, name), original in zip(parts, originals, strict=True):
         setattr(owner, name, timed(phase, original))

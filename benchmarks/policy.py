@@ -7,8 +7,8 @@ episodes that the oracle plays. The processor computes in float32, as the origin
 a preset takes is measured in float64, too, in which `openvima evaluate` computes.
 
 A decision at history 5 is the fifth of an episode, from images to action. Against it stand reading everything
-anew (the prompt with T5-base, the crops of prompt and all steps, the trunk over all steps), the same with
-equal crops encoded once, and the original's way (prompt and tokens are kept, the trunk reads all steps
+anew (the prompt with T5-base, the crops of prompt and all steps, the decoder over all steps), the same with
+equal crops encoded once, and the original's way (prompt and tokens are kept, the decoder reads all steps
 again). None of these three is charged for cutting out crops, which the first one is. Ways take turns; medians
 are reported. Times of one decision are given as processor time as well, which other work on the machine
 lengthens less than that of a clock, and with the 90th percentile over episodes and rounds. `--decisions`
@@ -39,9 +39,9 @@ from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import preset
 from openvima.policies.batch import HistoryBatch
-from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets
-from openvima.policies.inference import NetworkPolicy
 from openvima.policies.build import outline_network
+from openvima.policies.inference import NetworkPolicy
+from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
@@ -87,7 +87,7 @@ class Decision:
         self._actions = torch.full((1, HISTORY, ACTION_WIDTH), 0.3)
         with torch.inference_mode():
             self._features = self._network.encode_images(self._images)
-            self._memory = self._network.encode_prompts(self._prompt, self._features)
+            self._encoded = self._network.encode_prompt(self._prompt, self._features)
 
     def sizes(self) -> dict[str, int]:
         """Return how much there is to read."""
@@ -122,18 +122,19 @@ class Decision:
             prompt = replace(prompt, crop_index_VS=prompt_numbers.view_as(prompt_index))
             history = replace(history, crop_index_BTVN=step_numbers.view_as(step_index))
         features = self._network.encode_images(images)
-        self._decode(self._network.encode_prompts(prompt, features), history, features)
+        self._decode(self._network.encode_prompt(prompt, features), history, features)
 
     @torch.inference_mode()
-    def trunk_anew(self) -> None:
-        """Decide with prompt and tokens kept, but nothing in the trunk."""
+    def decoder_anew(self) -> None:
+        """Decide with prompt and tokens kept, but no keys and values."""
         self._network.encode_images(self._images[self._history.crop_index_BTVN[:, -1].flatten()])
-        self._decode(self._memory, self._history, self._features)
+        self._decode(self._encoded, self._history, self._features)
 
     def _decode(
-        self, memory: Any, history: HistoryBatch, features: torch.Tensor
-    ) -> None:  # Any: the network's
-        self._network.head.decide(self._network(memory, history, features, self._actions))
+        self, prompt: Any, history: HistoryBatch, features: torch.Tensor
+    ) -> None:  # Any: the model's own
+        state, has_previous = self._network.init_cache(prompt), torch.arange(HISTORY)[None] > 0
+        self._network.decode_step(prompt, state, history, features, self._actions, has_previous)
 
 
 class Training:
@@ -170,9 +171,8 @@ class Training:
             encoded = network.encode_images(self._images)
             shape = (self._num_images, *encoded.shape[1:])
             features = encoded.new_zeros(shape).index_copy(0, self._used, encoded)
-            memory = network.encode_prompts(self._prompts, features)
-            inputs = network(memory, self._history, features, self._targets.actions_BTC)
-            loss, _ = network.head.loss(inputs, self._targets)
+            prompt = network.encode_prompt(self._prompts, features)
+            loss, _ = network.loss(prompt, self._history, features, self._targets)
         loss.backward()
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
@@ -237,7 +237,7 @@ def measure_decision(policy: NetworkPolicy, episode: Demonstration, num_rounds: 
         "keeping": keeping,
         "anew": lambda: seconds(decision.anew),
         "anew_sharing_crops": lambda: seconds(lambda: decision.anew(share=True)),
-        "trunk_anew": lambda: seconds(decision.trunk_anew),
+        "decoder_anew": lambda: seconds(decision.decoder_anew),
     }
     times = in_turns(works, num_rounds)
     return {f"{name}_s": round(value, 4) for name, value in times.items()} | decision.sizes()
@@ -374,7 +374,7 @@ def ratios(name: str, times: dict[str, float]) -> dict[str, float]:
     return {
         title: round(times["anew_s"] / keeping, 2),
         f"{title}_sharing_crops": round(times["anew_sharing_crops_s"] / keeping, 2),
-        f"{title}_decoder_only": round(times["trunk_anew_s"] / keeping, 2),
+        f"{title}_decoder_only": round(times["decoder_anew_s"] / keeping, 2),
         "batch8_cost_over_8_singles": times["batch8_cost_over_8_singles"],
     }
 

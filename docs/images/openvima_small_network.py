@@ -10,13 +10,13 @@ from typing import Any  # the type of matplotlib's axes is not public
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from openvima.policies.heads.candidates import FreePoints
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.perception.objects import ObjectViews, observe, observe_prompt_image
 from openvima.policies import preset
 from openvima.policies.batch import WORD
-from openvima.policies.heads.candidates import FreePoints
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render.camera import TOP, project

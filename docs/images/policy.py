@@ -21,7 +21,6 @@ from openvima.policies import preset
 from openvima.policies.batch import WORD
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.nn.bins import NUM_BINS, encode_bins
-from openvima.policies.nn.decoder import PrefixConfig
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render import channels_last
@@ -197,7 +196,7 @@ def draw_title(axes: Any, y: float, name: str, text: str) -> None:
 
 def draw_vima(axes: Any, story: Story) -> None:
     """Draw the way of a prompt and two steps through VIMA."""
-    processor = Processor.of(preset("vima-nano").images)
+    processor = Processor.of(preset("vima-nano").inputs)
     draw_title(axes, 0.25, "VIMA", "one token for each object in each view; cross-attention to the prompt")
     draw_prompt(axes, processor, story.prompt)
     draw_text(axes, LEFT, 2.68, "history", fontweight="bold")
@@ -287,17 +286,17 @@ def draw_baselines(axes: Any, story: Story) -> None:
     heading = "The same episode as the baselines see it: whole frames, front and top, of 64 × 128 pixels"
     axes.plot((0.2, WIDTH - 0.25), (8.2, 8.2), color=FAINT, linewidth=0.8)
     draw_text(axes, 0.2, 8.4, heading, fontweight="bold")
-    for y, (family, (name, text)) in zip((8.82, 10.25, 11.65), BASELINES.items(), strict=True):
+    for y, (architecture, (name, text)) in zip((8.82, 10.25, 11.65), BASELINES.items(), strict=True):
         draw_title(axes, y, name, text)
-        draw_baseline(axes, story, family, y)
+        draw_baseline(axes, story, architecture, y)
 
 
-def draw_baseline(axes: Any, story: Story, family: str, y: float) -> None:
+def draw_baseline(axes: Any, story: Story, architecture: str, y: float) -> None:
     """Draw the tokens of one baseline below its title: all in one sequence, or prompt and history apart."""
     config = preset(f"{family}-nano")
-    processor = Processor.of(config.images)
+    processor = Processor.of(config.inputs)
     images = [stacked(part.rgb) for part in story.prompt.sequence() if isinstance(part, PromptImage)]
-    is_patches = family == "gato"
+    is_patches = architecture == "gato"
     x, y = LEFT, y + (0.32 if is_patches else 0.9)
     for is_image, group in groupby(
         prompt_tokens(processor, story.prompt), lambda token: token.colour != FAINT
@@ -307,7 +306,7 @@ def draw_baseline(axes: Any, story: Story, family: str, y: float) -> None:
         draw_text(axes, x, y, "…")
         x, y = LEFT, y + 0.42
         draw_text(axes, x - 0.15, y, "…", ha="right")
-    if isinstance(config.trunk, PrefixConfig):
+    if isinstance(config.decoder, PrefixDecoderConfig):
         x = draw_group(axes, [Token("separator")], x, y)[-1] + GAP
     else:
         draw_text(axes, x + 0.7, y - 0.13, "cross-attention", ha="center", fontsize=8)
