@@ -21,6 +21,7 @@ from openvima.policies import preset
 from openvima.policies.batch import WORD
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.nn.bins import NUM_BINS, encode_bins
+from openvima.policies.nn.decoder import PrefixDecoderConfig
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render import channels_last
@@ -293,7 +294,7 @@ def draw_baselines(axes: Any, story: Story) -> None:
 
 def draw_baseline(axes: Any, story: Story, architecture: str, y: float) -> None:
     """Draw the tokens of one baseline below its title: all in one sequence, or prompt and history apart."""
-    config = preset(f"{family}-nano")
+    config = preset(f"{architecture}-nano")
     processor = Processor.of(config.inputs)
     images = [stacked(part.rgb) for part in story.prompt.sequence() if isinstance(part, PromptImage)]
     is_patches = architecture == "gato"
