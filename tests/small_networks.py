@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 
-from openvima.policies import preset
-from openvima.policies.config import PolicyConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
-from openvima.policies.pointer.config import CorrespondenceConfig
+from openvima.policies.pointer.config import CorrespondenceConfig, PointerConfig, small
 
 
-def narrow_small(width: int = 32, crop_width: int = 4) -> PolicyConfig:
+def narrow_small(width: int = 32, crop_width: int = 4) -> PointerConfig:
     """The preset small, narrower and shallower."""
-    sizes = preset("small")
+    sizes = small()
     text = replace(sizes.prompt.text, width=width, num_layers=1, num_heads=2, head_width=16, hidden_width=32)
     crop = ConvConfig(width=crop_width, output_width=4 * crop_width)
     return replace(

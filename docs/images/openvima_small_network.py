@@ -10,13 +10,13 @@ from typing import Any  # the type of matplotlib's axes is not public
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from openvima.policies.heads.candidates import FreePoints
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.perception.objects import ObjectViews, observe, observe_prompt_image
 from openvima.policies import preset
 from openvima.policies.batch import WORD
+from openvima.policies.pointer.candidates import GridCandidates
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import END_ID, word_ids
 from openvima.render.camera import TOP, project
@@ -73,7 +73,7 @@ def draw_object(axes: Any, crops: np.ndarray, slot: int, x: float, y: float) -> 
 
 def draw_prompt(axes: Any, demo: Demonstration) -> None:
     """Draw the prompt, its encoder, and the scene that it shows."""
-    batch, stack = Processor.of(preset("small").images).encode_prompts([demo.prompt])
+    batch, stack = Processor.of(preset("small").inputs).encode_prompts([demo.prompt])
     crops = stack.images()[batch.crop_index_VS]
     words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
@@ -163,7 +163,7 @@ def draw_places(axes: Any, demo: Demonstration, step: int, x: float, title: str)
     place = (x, top, width)
     draw_text(axes, x, top - 0.17, title, fontsize=9, fontweight="bold")
     draw_picture(axes, picture(demo.rgb["top"][step]), x, top, (width, width / 2))
-    points_mm = FreePoints(1).points_mm.numpy() / 1000
+    points_mm = GridCandidates(1).points_mm.numpy() / 1000
     points = np.concatenate([points_mm, np.zeros((len(points_mm), 1))], axis=1)
     for column, row in on_picture(points, place):
         axes.plot([column], [row], ".", color="white", alpha=0.55, markersize=3, zorder=3)

@@ -1,7 +1,7 @@
 r"""What the parts of the preset `small` are worth, and what more demonstrations are.
 
     python experiments/openvima_small/ablations.py --data train400 --crops crops --out ablations \
-        --only full,no-comparison
+        --only full,no-correspondence
 
 Every variant is trained with the same number of steps, then plays the same evaluation episodes. Most begin
 with the crop encoder of the run `--crops`, which stays as it is; so differences are those of cloning. Two
@@ -17,9 +17,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from openvima.policies.families.vima import vima
-from openvima.policies.heads.copying import CopyingConfig
-from openvima.policies.heads.pointing import PointingConfig
 from safetensors.torch import load_file
 
 from openvima.atomic_io import atomic_write_file
@@ -30,10 +27,11 @@ from openvima.policies.base import WEIGHTS_FILE, find_checkpoint
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.config import PolicyConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.presets import PRESETS, small
+from openvima.policies.pointer.config import CandidateHeadConfig, ObjectHeadConfig, small
+from openvima.policies.presets import PRESETS
 from openvima.policies.sizes import SIZES
+from openvima.policies.vima.config import vima
 from openvima.training import TrainingConfig, train
 from openvima.training.recipes import RECIPES
 
@@ -68,27 +66,24 @@ class Variant:
     crops: bool = True
 
 
-def _without_turns() -> PolicyConfig:
+def _without_rotations() -> PolicyConfig:
     config = small()
-    assert isinstance(config.images, ObjectEncoderConfig)
     return replace(config, images=replace(config.images, rotation_bins=0))
 
 
-def _with_dropout(share: float) -> PolicyConfig:
+def _with_dropout(probability: float) -> PolicyConfig:
     config = small()
-    assert isinstance(config.images, ObjectEncoderConfig)
-    return replace(config, images=replace(config.images, crop_dropout=share))
+    return replace(config, images=replace(config.images, crop_dropout=probability))
 
 
-def _without_loss_of_looks() -> PolicyConfig:
+def _without_appearance_loss() -> PolicyConfig:
     config = small()
-    assert isinstance(config.head, CopyingConfig)
-    return replace(config, head=replace(config.head, look_weight=0.0))
+    assert isinstance(config.head, CandidateHeadConfig)
+    return replace(config, head=replace(config.head, appearance_loss_weight=0.0))
 
 
-def _without_referents() -> PolicyConfig:
-    config = small()
-    return replace(config, prompt=replace(config.prompt, referents=False))
+def _without_coreference() -> PolicyConfig:
+    return replace(small(), coreference=False)
 
 
 def _vima() -> PolicyConfig:
@@ -104,16 +99,16 @@ def _vima() -> PolicyConfig:
 VARIANTS = {
     "full": Variant("the preset as it is"),
     "pointing": Variant(
-        "pointing head: places only beside objects in view",
-        lambda: replace(small(), head=PointingConfig()),
+        "object head: places only relative to objects in view",
+        lambda: replace(small(), head=ObjectHeadConfig()),
     ),
-    "no-comparison": Variant(
-        "objects are not compared with those of the prompt, nor with each other",
-        lambda: replace(small(), comparison=None),
+    "no-correspondence": Variant(
+        "no correspondence between objects of different images",
+        lambda: replace(small(), correspondence=None),
     ),
-    "no-looks": Variant("no loss of picking by looks alone", _without_loss_of_looks),
-    "no-referents": Variant("words do not bring pictures along", _without_referents),
-    "no-turns": Variant("turns between two images are not estimated", _without_turns),
+    "no-appearance-loss": Variant("no appearance loss", _without_appearance_loss),
+    "no-coreference": Variant("no coreference", _without_coreference),
+    "no-rotation": Variant("no relative rotation", _without_rotations),
     "no-motions": Variant(
         "no demonstrations as motions", settings={"augmentation.inverse_dynamics_prob": 0.0}
     ),

@@ -30,12 +30,12 @@ def pairs():
     return render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", variety=HARD)
 
 
-def _encoder(turn_bins: int = 72) -> ObjectEncoder:
+def _encoder(rotation_bins: int = 72) -> ObjectEncoder:
     torch.manual_seed(0)
     crop = ConvConfig(8, 32, place_channels=8)
     return ObjectEncoder(
         ObjectEncoderConfig(
-            crop, box_width=4, width=8, fuse_views=True, appearance_width=16, turn_bins=turn_bins
+            crop, box_width=4, width=8, fuse_views=True, appearance_width=16, rotation_bins=rotation_bins
         )
     )
 
@@ -204,9 +204,9 @@ def test_looks_and_turns_are_learnt_together():
     assert turning.turn_accuracy(encoder, pairs) > 0.25  # by chance a tenth
 
 
-def test_without_turn_bins_only_looks_are_learnt(pairs):
+def test_without_rotation_bins_only_looks_are_learnt(pairs):
     generator = step_generator(0, "test", 0)
-    _, metrics = turning.joint_loss(_encoder(turn_bins=0), pairs, temperature=0.1, generator=generator)
+    _, metrics = turning.joint_loss(_encoder(rotation_bins=0), pairs, temperature=0.1, generator=generator)
     assert set(metrics) == {"contrastive_accuracy", "second_view_accuracy", *LOSSES}
 
 
@@ -218,7 +218,7 @@ def test_a_turn_counts_as_right_within_fifteen_degrees():
             return torch.log_softmax(50.0 * torch.eye(72)[[5] * seen.shape[-1]], dim=-1)
 
     encoder = _encoder()
-    encoder.turns = Fixed()
+    encoder.rotation = Fixed()
     features, seen = torch.zeros(3, 2, 4, 1), torch.ones(3, 2, 4, dtype=torch.bool)
     turns = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
     right = turning._right_turns(encoder, features, seen, turns)
@@ -239,7 +239,7 @@ def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
     tiny = presets.PRESETS["tiny"]()
 
     def turning_tiny():
-        return replace(tiny, images=replace(tiny.images, turn_bins=24))
+        return replace(tiny, images=replace(tiny.images, rotation_bins=24))
 
     monkeypatch.setitem(presets.PRESETS, "turning-tiny", turning_tiny)
     harder = {

@@ -12,8 +12,7 @@ from torch import nn
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.torch_dataset import BatchStream, batches_of
 from openvima.errors import ConfigError
-from openvima.policies.network import PolicyNetwork
-from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
@@ -145,8 +144,8 @@ class BehaviourCloning:
 
 def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
     """Whether the crop encoder stays frozen: it was pretrained, here or where the weights come from."""
-    images, pretraining = network.images, config.pretraining
-    has_appearance = isinstance(images, ObjectEncoder) and images.config.appearance_width > 0
+    encoder, pretraining = network.object_encoder, config.pretraining
+    has_appearance = encoder is not None and encoder.config.appearance_width > 0
     is_pretrained = bool(pretraining.steps or config.init_from)
     return has_appearance and is_pretrained and not pretraining.finetune_crop_encoder
 

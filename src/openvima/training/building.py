@@ -7,11 +7,16 @@ import torch
 
 from openvima.errors import ConfigError
 from openvima.policies.base import find_checkpoint
+from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
-from openvima.policies.config import PolicyConfig
-from openvima.policies.families.midas import with_autoregression, with_visual_residual
-from openvima.policies.network import PolicyNetwork, build_network
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.config import (
+    PolicyConfig,
+    appearance_width,
+    config_to_dict,
+    with_autoregression,
+    with_visual_residual,
+)
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.t5 import load_t5, tokenizer_for
@@ -49,7 +54,7 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     if ":" in config.preset:
         return _for_own_learner(config)
     sizes = _sizes(config)
-    needs_t5, images = sizes.prompt.tokenizer == "t5", sizes.images
+    needs_t5 = sizes.prompt.tokenizer == "t5"
     if needs_t5 and config.t5 is None and config.init_from is None:
         raise ConfigError(
             f"preset {config.preset!r} encodes prompts with T5; set t5 to the folder that holds it, or to "
@@ -58,12 +63,12 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     if config.t5 is not None and not needs_t5:
         raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
     for name in _FOR_OBJECTS:
-        if getattr(augmentation, name) and not isinstance(images, ObjectEncoderConfig):
+        if getattr(augmentation, name) and sizes.inputs.tokens == "frames":
             raise ConfigError(
                 f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
                 "whole frames; it needs one that takes objects."
             )
-    has_appearance = isinstance(images, ObjectEncoderConfig) and images.appearance_width
+    has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and not has_appearance:
         raise ConfigError(
             f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} has no "
@@ -128,7 +133,7 @@ def build_learner(config: TrainingConfig) -> Learner:
             f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
             "folder that holds it, or to 't5-base'. Its weights are then not read."
         )
-    processor = Processor.of(sizes.images, tokenizer_for(sizes.prompt, where))
+    processor = Processor.of(sizes.inputs, tokenizer_for(sizes.prompt, where))
     augmentation = config.augmentation
     return PolicyLearner(
         network,
@@ -146,7 +151,7 @@ def build_learner(config: TrainingConfig) -> Learner:
 def _load_weights_of(network: PolicyNetwork, source: str) -> Path | None:
     """Copy the weights of another network, and return the folder of its tokenizer, if it has one."""
     other, tokenizer = load_network(source)
-    ours, theirs = flattened(network.config.to_dict()), flattened(other.config.to_dict())
+    ours, theirs = flattened(config_to_dict(network.config)), flattened(config_to_dict(other.config))
     differing = [
         f"{name} is {theirs.get(name)!r} there and {ours.get(name)!r} here"
         for name in {**theirs, **ours}

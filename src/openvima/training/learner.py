@@ -117,9 +117,8 @@ class PolicyLearner(Learner):
         if batch.images is not None:
             features = network.encode_images(batch.images)
         assert features is not None  # batches without images are made only where there are features
-        memory = network.encode_prompt(batch.prompts, features)
-        inputs = network(memory, batch.history, features, batch.targets.actions_BTC)
-        return network.head.loss(inputs, batch.targets)
+        prompt = network.encode_prompt(batch.prompts, features)
+        return network.loss(prompt, batch.history, features, batch.targets)
 
     def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
         """Write a checkpoint that `load_policy` takes."""

@@ -75,8 +75,8 @@ def _read(network: PolicyNetwork, processor: Processor, tokens: PreprocessedEpis
     black = network.encode_images(torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device))
     features = black.expand(1 + len(tokens.images), *black.shape[1:])
     try:
-        memory = network.encode_prompt(batch.prompts, features)
-        network(memory, batch.history, features, batch.targets.actions_BTC)
+        prompt = network.encode_prompt(batch.prompts, features)
+        network.loss(prompt, batch.history, features, batch.targets)
     except PolicyError as error:
         reading = " read as a motion" if is_motion else ""
         raise DatasetError(

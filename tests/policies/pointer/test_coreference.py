@@ -2,15 +2,15 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
 from openvima.env import TabletopEnv  # noqa: E402
+from openvima.policies.batch import PromptBatch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.pointer.coreference import coreference  # noqa: E402
-from openvima.policies.processor import PromptBatch, Reader, batch_prompts  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 WORD = -1
@@ -70,10 +70,9 @@ def prompt():
 
 @torch.no_grad()
 def _encoded(network, prompt):
-    read = Reader.of(network.config.inputs).read_prompt(prompt)
-    images = torch.from_numpy(read.objects.crops.reshape(-1, 3, 32, 32))
-    batch = batch_prompts([read], [np.arange(len(images)).reshape(2, -1)])
-    return network.encode_prompt(batch, network.encode_images(images)), batch
+    batch, stack = Processor.of(network.config.inputs).encode_prompts([prompt])
+    features = network.encode_images(torch.from_numpy(stack.images()))
+    return network.encode_prompt(batch, features), batch
 
 
 def test_a_noun_has_the_appearance_of_the_image_that_defined_it(network, prompt):

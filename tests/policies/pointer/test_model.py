@@ -1,4 +1,4 @@
-"""The network that copies and compares: what it keeps of an episode, and what must not matter to it."""
+"""The pointer model: what its head reads, what it keeps of an episode, and what must not matter."""
 
 import re
 from dataclasses import fields, replace
@@ -16,8 +16,10 @@ from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
-from openvima.policies.nn.actions import ACTION_PARTS, HeadInputs, Remembered  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH  # noqa: E402
+from openvima.policies.nn.history import shift_actions  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
 from openvima.training.inverse_dynamics import as_motion  # noqa: E402
@@ -51,7 +53,7 @@ def network() -> PolicyNetwork:
 
 @torch.no_grad()
 def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInputs, "torch.Tensor"]:
-    """What the head is given for all steps of some demonstrations, and what it decides.
+    """Inputs of the head for all steps of some demonstrations, and what it decodes.
 
     Actions are those of the demonstrations, or others that were taken.
     """
@@ -59,10 +61,11 @@ def read_whole(network: PolicyNetwork, demos, taken_BTC=None) -> tuple[HeadInput
     examples, images = examples_of(demos, processor)
     batch = collate_examples(processor, examples)
     features = network.encode_images(images)
-    memory = network.encode_prompt(batch.prompts, features)
+    prompt = network.encode_prompt(batch.prompts, features)
     actions_BTC = batch.targets.actions_BTC if taken_BTC is None else taken_BTC
-    inputs = network(memory, batch.history, features, actions_BTC)
-    return inputs, network.head.decide(inputs)
+    previous = shift_actions(replace(batch.targets, actions_BTC=actions_BTC))
+    inputs, _ = network._head_inputs(prompt, network.init_cache(prompt), batch.history, features, *previous)
+    return inputs, network.head.decode(inputs)
 
 
 @torch.no_grad()
@@ -72,8 +75,8 @@ def read_stepwise(network: PolicyNetwork, demo: Demonstration) -> list[HeadInput
     (example,), images = examples_of([demo], processor)
     batch = collate_examples(processor, [example])
     features = network.encode_images(images)
-    memory = network.encode_prompt(batch.prompts, features)
-    state, given = network.begin(memory), []
+    prompt = network.encode_prompt(batch.prompts, features)
+    state, given = network.init_cache(prompt), []
     actions = torch.cat([torch.zeros(1, 1, 12), batch.targets.actions_BTC], dim=1)
     for t in range(demo.num_steps):
         now = slice(t, t + 1)
@@ -81,7 +84,7 @@ def read_stepwise(network: PolicyNetwork, demo: Demonstration) -> list[HeadInput
             *(getattr(batch.history, field.name)[:, now] for field in fields(batch.history))
         )
         has_previous = torch.full((1, 1), t > 0)
-        inputs, state = network.extend(memory, state, step, features, actions[:, now], has_previous)
+        inputs, state = network._head_inputs(prompt, state, step, features, actions[:, now], has_previous)
         given.append(inputs)
     return given
 
@@ -94,16 +97,17 @@ def test_reading_step_by_step_gives_the_head_what_reading_at_once_does(network, 
             torch.testing.assert_close(now.query_BTD[0, 0], whole.query_BTD[b, t])
             torch.testing.assert_close(now.objects_BTND[0, 0], whole.objects_BTND[b, t, :count])
             torch.testing.assert_close(now.previous_BTC[0, 0], whole.previous_BTC[b, t])
-            assert now.recollection.steps_T.tolist() == [t]
-            for kind in ("first", "scenes"):
-                one, all_of_them = getattr(now.recollection, kind), getattr(whole.recollection, kind)
+            assert now.steps_T.tolist() == [t]
+            for one, all_of_them in (
+                (now.first_step, whole.first_step),
+                (now.prompt.objects, whole.prompt.objects),
+            ):
                 exist = one.masks_BK[0]
                 assert all_of_them.masks_BK[b].sum() == exist.sum()
-                for field in fields(Remembered):
-                    if (value := getattr(one, field.name)) is not None:
-                        others = getattr(all_of_them, field.name)[b, : len(exist)]
-                        torch.testing.assert_close(value[0][exist], others[exist])
-            torch.testing.assert_close(network.head.decide(now)[0, 0], decided[b, t])
+                for name in ObjectSet.__slots__:
+                    others = getattr(all_of_them, name)[b, : len(exist)]
+                    torch.testing.assert_close(getattr(one, name)[0][exist], others[exist])
+            torch.testing.assert_close(network.head.decode(now)[0, 0], decided[b, t])
 
 
 def test_acting_in_a_batch_decides_what_reading_whole_histories_does(network, demos):
@@ -130,9 +134,9 @@ def test_acting_in_a_batch_decides_what_reading_whole_histories_does(network, de
     assert (changed[:, 1] > 1e-6).all()
 
 
-def test_the_first_observation_stays_in_memory_and_pictures_of_single_objects_are_no_places(network, demos):
+def test_the_first_step_is_kept_and_images_of_single_objects_are_no_candidates(network, demos):
     inputs, _ = read_whole(network, demos)
-    first, scenes = inputs.recollection.first, inputs.recollection.scenes
+    first, scenes = inputs.first_step, inputs.prompt.objects
     assert torch.equal(first.positions_BK2, inputs.positions_BTN2[:, 0])
     assert torch.equal(first.masks_BK, inputs.masks_BTN[:, 0])
     shown = {task: scenes.masks_BK[b].sum().item() for b, task in enumerate(TASKS)}
@@ -140,14 +144,14 @@ def test_the_first_observation_stays_in_memory_and_pictures_of_single_objects_ar
     assert shown == {**dict(zip(TASKS, records, strict=True)), "visual_manipulation": 0}
 
 
-def test_places_keep_all_their_digits_in_half_precision(demos):
+def test_positions_keep_float32_in_half_precision(demos):
     inputs, decided = read_whole(network_of(narrow_small()).bfloat16(), demos)
-    for positions in (inputs.recollection.first.positions_BK2, inputs.recollection.scenes.positions_BK2):
+    for positions in (inputs.first_step.positions_BK2, inputs.prompt.objects.positions_BK2):
         assert positions.dtype == torch.float32
     assert decided.isfinite().all()
 
 
-def test_sessions_have_memories_of_their_own(network, demos):
+def test_sessions_have_states_of_their_own(network, demos):
     policy = NetworkPolicy(network)
     other = policy.new_session()
     long, another = demos[0], demos[1]
@@ -176,19 +180,18 @@ def test_it_survives_its_files(demos, tmp_path):
     assert all(np.allclose(ours[key], theirs[key], atol=1e-6) for key in ours)
 
 
-def test_without_comparisons_it_copies_places_but_estimates_no_turns(demos):
-    network = network_of(replace(narrow_small(), comparison=None)).double()
+def test_without_correspondence_it_copies_places_but_estimates_no_rotations(demos):
+    network = network_of(replace(narrow_small(), correspondence=None)).double()
     inputs, decided = read_whole(network, demos)
-    assert inputs.recollection.scenes.turns_BKR is None
+    assert inputs.prompt.objects.rotations_BKR.shape[-1] == 0
     assert decided.isfinite().all()
 
 
-def test_comparisons_serve_the_other_heads_as_well(demos):
-    for head in ("nano", "nano-bins"):
-        network = network_of(replace(narrow_small(), head=preset(head).head)).double()
-        inputs, decided = read_whole(network, demos)
-        assert inputs.recollection is None
-        assert decided.isfinite().all()
+def test_correspondence_serves_the_object_head_as_well(demos):
+    network = network_of(replace(narrow_small(), head=preset("nano").head)).double()
+    inputs, decided = read_whole(network, demos)
+    assert inputs.prompt.objects.rotations_BKR.any()
+    assert decided.isfinite().all()
 
 
 def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(demos):
@@ -203,28 +206,26 @@ def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(d
         np.testing.assert_array_equal(batch.positions_S2, ObjectViews.concatenated(objects).positions())
 
 
-def test_pictures_of_single_objects_do_not_change_what_pictures_of_the_table_tell(network, demos):
+def test_images_of_single_objects_do_not_change_the_correspondence_of_scenes(network, demos):
     """Following a motion is the same task whether or not the prompt also names the object that moves."""
     frames, alone = demos[1].prompt, demos[3].prompt.images["base_obj"]
     with_object = replace(
         frames, text=f"{{base_obj}} {frames.text}", images={"base_obj": alone, **frames.images}
     )
-    told = []
+    encoded = []
     for prompt in (frames, with_object):
         batch, stack = Processor.of(network.config.inputs).encode_prompts([prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
-            scenes = network.encode_prompt(batch, features).scenes
-            shown = network._shown(
-                batch, batch.object_index_BL >= 0, features[batch.crop_index_VS], scenes.appearance_BKA[0]
-            )
-        told.append((scenes.numbers_BK, scenes.turns_BKR, shown.changes_SD[None]))
-    for before, after in zip(*told, strict=True):
+            prompt = network.encode_prompt(batch, features)
+            changes, rotations = network._changes_in_prompt(prompt.features)
+        encoded.append((prompt.objects.image_index_BK, rotations, changes))
+    for before, after in zip(*encoded, strict=True):
         torch.testing.assert_close(after[:, 1:], before)
-    assert told[0][0].max() == len(frames.images) - 1
+    assert encoded[0][0].max() == len(frames.images) - 1
 
 
-def test_motions_show_the_table(demos):
+def test_frames_of_motions_are_scenes(demos):
     processor = Processor("objects")
     examples, _ = examples_of(demos[:1], processor)
     motion = as_motion(preprocess(demos[0], "objects"))
@@ -233,34 +234,39 @@ def test_motions_show_the_table(demos):
     assert batch.prompts.image_index_S.max() == demos[0].num_steps
 
 
-def test_an_episode_may_be_read_with_none_of_its_prompt_found(network, demos):
+def test_a_prompt_without_images_is_possible(network, demos):
     demo = demos[3]
     processor = Processor.of(network.config.inputs)
     prompt = replace(demo.prompt, text="Rotate it 30 degrees.", images={})
     batch, stack = processor.encode_prompts([prompt])
     history, stack = processor.encode_observations([[demo.observation(0)]], stack=stack)
     features = network.encode_images(torch.from_numpy(stack.images()))
-    memory = network.encode_prompt(batch, features)
-    inputs = network(memory, history, features, torch.zeros(1, 1, 12))
-    assert network.head.decide(inputs).isfinite().all()
+    encoded = network.encode_prompt(batch, features)
+    previous = torch.zeros(1, 1, ACTION_WIDTH), torch.zeros(1, 1, dtype=torch.bool)
+    actions, _ = network.decode_step(encoded, network.init_cache(encoded), history, features, *previous)
+    assert actions.isfinite().all()
 
 
-def test_roles_do_not_follow_from_names_of_textures_and_looks_of_words_do(network, demos):
+def test_names_of_textures_change_text_appearance_and_not_the_masked_encoding(network, demos):
     prompt = demos[4].prompt
     first, rest = prompt.text.removeprefix("Put the ").split(" object in ", 1)
-    memories = []
+    prompts = []
     for named in (first, *(("green", "purple") if first != "green" else ("purple", "green"))):
         named_prompt = replace(prompt, text=f"Put the {named} object in {rest}")
         batch, stack = Processor.of(network.config.inputs).encode_prompts([named_prompt])
         with torch.no_grad():
             features = network.encode_images(torch.from_numpy(stack.images()))
-            memories.append(network.encode_prompt(batch, features))
-    _, green, purple = memories
-    torch.testing.assert_close(green.roles_BLD, purple.roles_BLD)
+            prompts.append(network.encode_prompt(batch, features))
+    _, green, purple = prompts
+    torch.testing.assert_close(green.masked_BLD, purple.masked_BLD)
     assert (green.tokens_BLD - purple.tokens_BLD).abs().max() > 1e-3
-    assert (green.word_looks_BLA - purple.word_looks_BLA).abs().amax(-1).nonzero().tolist() == [[0, 2]]
+    assert (green.text_appearance_BLA - purple.text_appearance_BLA).abs().amax(-1).nonzero().tolist() == [
+        [0, 2]
+    ]
     names = [word for word in re.split(r"\W+", rest) if word_ids().get(word) in texture_word_ids()]
-    assert green.word_looks_BLA.abs().amax(-1).count_nonzero() == 1 + len(names)  # no other word has a look
+    assert green.text_appearance_BLA.abs().amax(-1).count_nonzero() == 1 + len(
+        names
+    )  # no other word has an appearance
 
 
 def test_words_of_textures_are_those_that_name_them_alone():

@@ -2,8 +2,7 @@
 
 import torch
 
-from openvima.policies.network import PolicyNetwork
-from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import Metrics
 from openvima.training.occlusion import with_gaps
@@ -30,9 +29,9 @@ class ContrastivePretraining:
     name = "1-pretraining"
 
     def __init__(self, network: PolicyNetwork, config: PretrainingConfig, seed: int, pairs: Pairs) -> None:
-        assert isinstance(network.images, ObjectEncoder)  # `resolved` has checked it
+        assert network.object_encoder is not None  # `resolved` has checked it
         self.learning_rate = config.learning_rate
-        self.encoder = network.images
+        self.encoder = network.object_encoder
         self.parameters = crop_parameters(network)
         held_out = pairs.scenes >= int(pairs.scenes.max()) * (1 - _VALIDATION_SCENES)
         self._training = pairs.select(torch.nonzero(~held_out)[:, 0])
@@ -44,7 +43,7 @@ class ContrastivePretraining:
         config = self._config
         generator = step_generator(self._seed, _PURPOSE, step)
         batch = self._training.select(self._rows(generator).to(self._training.looks.device))
-        if self.encoder.config.turn_bins:
+        if self.encoder.config.rotation_bins:
             batch = mirrored(batch, generator)
         if config.occlusion_prob:
             batch = with_gaps(batch, config.occlusion_prob, generator)
@@ -65,7 +64,7 @@ class ContrastivePretraining:
         metrics = {"retrieval_accuracy": scene_accuracy(self.encoder, pairs)}
         if pairs.again:
             metrics["second_view_accuracy"] = scene_accuracy(self.encoder, pairs_again(pairs, pairs.again))
-        if self.encoder.config.turn_bins:
+        if self.encoder.config.rotation_bins:
             metrics["rotation_accuracy"] = turn_accuracy(self.encoder, pairs)
         return metrics
 
@@ -80,14 +79,15 @@ class ContrastivePretraining:
 
 def compares_rotations(network: PolicyNetwork) -> bool:
     """Whether a network estimates the relative rotation of objects in two images."""
-    return isinstance(network.images, ObjectEncoder) and network.images.config.turn_bins > 0
+    encoder = network.object_encoder
+    return encoder is not None and encoder.config.rotation_bins > 0
 
 
 def crop_parameters(network: PolicyNetwork) -> list[torch.nn.Parameter]:
     """Return what pretraining trains, and behaviour cloning keeps frozen."""
-    images = network.images
-    if not isinstance(images, ObjectEncoder):
-        return list(images.frame_encoder.parameters())
-    appearance = list(images.appearance.parameters()) if images.config.appearance_width else []
-    turns = list(images.turns.parameters()) if images.config.turn_bins else []
-    return [*images.crop_encoder.parameters(), *appearance, *turns]
+    encoder = network.object_encoder
+    if encoder is None:
+        return list(network.get_submodule("frame_encoder").parameters())
+    appearance = list(encoder.appearance.parameters()) if encoder.config.appearance_width else []
+    rotation = list(encoder.rotation.parameters()) if encoder.config.rotation_bins else []
+    return [*encoder.crop_encoder.parameters(), *appearance, *rotation]
