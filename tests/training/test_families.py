@@ -38,7 +38,10 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
     return main([str(word) for word in (*words, "--schedule.checkpoint-every", 1, *options)])
 
 
-@pytest.mark.parametrize("architecture", ["vima", "gato", "flamingo", "gpt", "midas"])
+@pytest.mark.parametrize(
+    "architecture",
+    ["vima", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gato", "flamingo", "gpt", "midas"))],
+)
 def test_an_interrupted_run_gives_a_policy_that_acts(architecture, data, tmp_path, monkeypatch) -> None:
     preset, whole, torn = f"{architecture}-nano", tmp_path / "whole", tmp_path / "torn"
     assert run_train(data, whole, preset) == 0

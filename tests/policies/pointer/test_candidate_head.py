@@ -366,6 +366,7 @@ def test_the_first_prompt_query_is_trained_to_attend_to_the_most_similar_object(
 
 
 @pytest.mark.parametrize(("kind", "first"), [("first_step", FIRST_STEP), ("prompt", IN_PROMPT)])
+@pytest.mark.slow
 def test_it_learns_to_copy_the_place_of_what_is_similar_also_for_unseen_appearance(kind, first):
     """Objects differ from step to step; that one of the set is similar to the picked one stays the same."""
     with torch.random.fork_rng(devices=[]):
@@ -439,6 +440,7 @@ def test_the_pick_depends_on_neighbours_and_on_what_a_scene_shows_there(head, in
     assert (changed > 1e-6).tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 def test_it_learns_to_pick_what_lies_where_the_last_object_was_put():
     """Tokens and appearance are drawn anew, so nothing else separates the objects."""
     with torch.random.fork_rng(devices=[]):
