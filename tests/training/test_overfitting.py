@@ -7,16 +7,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.policies.heads.base import ACTION_PARTS, to_unit_range  # noqa: E402
-from openvima.policies.heads.bins import encode_bins  # noqa: E402
-from openvima.policies.network import PolicyNetwork, build_network  # noqa: E402
-
 from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range  # noqa: E402
+from openvima.policies.nn.bins import encode_bins  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
+from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.behaviour_cloning import BehaviourCloning  # noqa: E402
@@ -55,9 +55,11 @@ def demonstrations() -> dict[str, list[Demonstration]]:
     return runs
 
 
-@pytest.mark.parametrize("family", ["vima", "gato", "flamingo", "gpt", "midas"])
-def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family, demonstrations) -> None:
-    model = build_network(preset(f"{family}-nano"), seed=0).eval()  # that is, without dropout
+@pytest.mark.parametrize("architecture", ["vima", "gato", "flamingo", "gpt", "midas"])
+def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(
+    architecture, demonstrations
+) -> None:
+    model = build_network(preset(f"{architecture}-nano"), seed=0).eval()  # that is, without dropout
     tasks = [read(model, group) for group in demonstrations.values()]
     learn_by_heart(model, tasks)
     with torch.no_grad():
@@ -69,7 +71,7 @@ def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(family
 
 def read(model: PolicyNetwork, runs: Sequence[Demonstration]) -> tuple[Batch, "torch.Tensor"]:
     """One batch of all, and its images."""
-    processor = Processor.of(model.config.images)
+    processor = Processor.of(model.config.inputs)
     examples, images = examples_of(runs, processor)
     return collate_examples(processor, examples), images
 
@@ -105,9 +107,8 @@ def loss_and_accuracy(
     for batch, images in tasks:
         share = int(batch.targets.steps_BT.sum()) / total
         features = model.encode_images(images)
-        memory = model.encode_prompts(batch.prompts, features)
-        inputs = model(memory, batch.history, features, batch.targets.actions_BTC)
-        loss, metrics = model.head.loss(inputs, batch.targets)
+        prompt = model.encode_prompt(batch.prompts, features)
+        loss, metrics = model.loss(prompt, batch.history, features, batch.targets)
         if backward:
             (loss * share).backward()
         for place, value in enumerate((loss, metrics["accuracy"])):
@@ -141,10 +142,10 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
         sizes,
         images=replace(sizes.images, crop=ConvConfig(8, 32), width=64, crop_dropout=0.0),
         prompt=replace(sizes.prompt, text=replace(sizes.prompt.text, num_layers=1)),
-        trunk=replace(sizes.trunk, width=64, num_layers=1, dropout=0.0),
+        decoder=replace(sizes.decoder, width=64, num_layers=1, dropout=0.0),
     )
     runs = [run for group in demonstrations.values() for run in group]
-    processor = Processor.of(sizes.images)
+    processor = Processor.of(sizes.inputs)
     source = source_of(runs, processor)
     model = build_network(sizes, seed=0)
     learner = PolicyLearner(model, processor)
@@ -175,9 +176,9 @@ def test_the_copying_network_learns_places_by_heart_that_prompt_and_past_show(ta
     env = TabletopEnv(task, level="train", domain="user")
     runs = [rollout_oracle(env, seed) for seed in range(6)]
     sizes = narrow_small(width=64)
-    images, trunk = replace(sizes.images, crop_dropout=0.0), replace(sizes.trunk, dropout=0.0)
-    sizes = replace(sizes, images=images, trunk=trunk)
-    processor = Processor.of(sizes.images)
+    images, decoder = replace(sizes.images, crop_dropout=0.0), replace(sizes.decoder, dropout=0.0)
+    sizes = replace(sizes, images=images, decoder=decoder)
+    processor = Processor.of(sizes.inputs)
     source, model = source_of(runs, processor), build_network(sizes, seed=0)
     learner = PolicyLearner(model, processor)
     config = TrainingConfig(
