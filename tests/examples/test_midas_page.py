@@ -21,8 +21,9 @@ def test_the_code_of_the_page_runs() -> None:
     names: dict[str, object] = {}
     for code in re.findall(r"^```python\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL):
         exec(compile(code, "midas.md", "exec"), names)
-    assert names["vima"].trunk == preset("vima-nano").trunk
-    assert names["plain"].head == preset("vima-nano").head
+    assert names["vima"].decoder == preset("vima-nano").decoder
+    plain, vima = names["plain"].head, preset("vima-nano").head
+    assert type(plain) is type(vima) and plain.hidden_width == vima.hidden_width
 
 
 def test_the_table_of_sizes_is_that_of_the_presets() -> None:
