@@ -18,7 +18,7 @@ from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.nn.bins import encode_bins
 from openvima.policies.processor import Processor
 from openvima.scene import Action
-from openvima.training.inverse_dynamics import motion_prompt
+from openvima.training.augmentation.inverse_dynamics import motion_prompt
 from policy import (
     ACTION,
     FAINT,

@@ -13,7 +13,7 @@ from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training.augment import augmented  # noqa: E402
+from openvima.training.augmentation.false_positives import augmented  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     ExampleSource,
     Parts,
@@ -49,23 +49,23 @@ def names_of(source: ExampleSource) -> set[tuple[str, int]]:
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):
     cache = open_object_cache(Dataset(data))
-    training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
+    training, kept = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
     assert names_of(training).isdisjoint(names_of(kept))
     assert len(names_of(training) | names_of(kept)) == 24
     assert 1 <= len(kept) <= 14
     of_one_task = open_object_cache(Dataset(data, tasks=["rotate"]))
-    _, fewer = split_examples(of_one_task, validation_share=0.3, validation_episodes=100)
+    _, fewer = split_examples(of_one_task, validation_fraction=0.3, validation_episodes=100)
     assert names_of(fewer) <= names_of(kept)
-    _, least = split_examples(cache, validation_share=0.3, validation_episodes=1)
+    _, least = split_examples(cache, validation_fraction=0.3, validation_episodes=1)
     assert len(least) == 1
     assert names_of(least) <= names_of(kept)
     with pytest.raises(DatasetError, match="no demonstration to learn from"):
-        split_examples(cache, validation_share=1.0, validation_episodes=1)
+        split_examples(cache, validation_fraction=1.0, validation_episodes=1)
 
 
 def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_process(data):
     cache = open_object_cache(Dataset(data))
-    _, few = split_examples(cache, validation_share=0.3, validation_episodes=3)
+    _, few = split_examples(cache, validation_fraction=0.3, validation_episodes=3)
     orders = [order_of(few, batch=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
     assert [order.batch for order in orders] == [2, 2]
     with pytest.raises(ConfigError, match="there are 3 demonstrations to learn from and 4 processes"):
@@ -74,7 +74,7 @@ def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_pro
 
 def test_an_example_of_a_source_knows_its_images_among_all(data):
     cache = open_object_cache(Dataset(data))
-    training, kept = split_examples(cache, validation_share=0.3, validation_episodes=100)
+    training, kept = split_examples(cache, validation_fraction=0.3, validation_episodes=100)
     images = np.concatenate([episode.images for episode in cache])
     for source in (training, kept):
         for example in source:

@@ -24,10 +24,10 @@ from openvima.policies import load_policy  # noqa: E402
 from openvima.policies.detection import DetectedObjects, Detections  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
+from openvima.training.augmentation.inverse_dynamics import motion_prompt  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
-from openvima.training.inverse_dynamics import motion_prompt  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.retelling import Retelling  # noqa: E402
 from openvima.training.source import ExampleSource, Parts, split_examples, with_boxes_of  # noqa: E402
 from training_examples import train_until  # noqa: E402
 
@@ -95,9 +95,9 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
     batch = PolicyCollate(Processor(layout), 0.0, with_images=True)(examples)
     assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
-    motions = PolicyCollate(Processor(layout), 0.0, with_images=True, retelling=Retelling(motion_share=1.0))(
-        examples
-    )
+    motions = PolicyCollate(
+        Processor(layout), 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0)
+    )(examples)
     shown = [
         motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
         for demo in demos
@@ -139,7 +139,7 @@ def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrati
 def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
     """Demonstrations with true boxes, and with those of the clumsy extractor."""
     dataset = Dataset(data)
-    true, _ = split_examples(open_object_cache(dataset), validation_share=0.2, validation_episodes=9)
+    true, _ = split_examples(open_object_cache(dataset), validation_fraction=0.2, validation_episodes=9)
     return true, with_boxes_of(detected_object_cache(dataset, plugged_boxes(HOOK)), true)
 
 
@@ -156,7 +156,7 @@ def detected_rows(sources, share: float, number: int, rows: slice = slice(None))
                 found.append(example.row)
 
     examples = [true[index] for index in range(len(true))][rows]
-    Parts(collate, 3, 5, detected=detected, detected_share=share)(examples, number)
+    Parts(collate, 3, 5, detected=detected, detected_prob=share)(examples, number)
     return sorted(found), sorted(draws)
 
 

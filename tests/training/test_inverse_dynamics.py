@@ -18,11 +18,11 @@ from openvima.perception.objects import observe, whole_frames  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
+from openvima.training.augmentation.inverse_dynamics import motion_prompt, motion_text, with_motion_prompt  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
-from openvima.training.inverse_dynamics import as_motion, motion_prompt, motion_text  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 PROCESSORS = {
@@ -39,7 +39,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
     kind, demonstrations_of_several_steps
 ) -> None:
     for demo in demonstrations_of_several_steps:
-        motion = as_motion(preprocess(demo, kind))
+        motion = with_motion_prompt(preprocess(demo, kind))
         prompt = motion.prompt
         assert prompt.text == motion_text(demo.num_steps + 1)
         assert prompt.is_scene.tolist() == [True] * (demo.num_steps + 1)
@@ -58,7 +58,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
 
 def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
     tokens = preprocess(demonstrations_of_several_steps[0], "objects")
-    motion = as_motion(tokens)
+    motion = with_motion_prompt(tokens)
     for name in ("images", "objects", "objects_per_step", "actions"):
         assert getattr(motion, name) is getattr(tokens, name)
 
@@ -69,7 +69,7 @@ def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
 ) -> None:
     processor, demos = PROCESSORS[name], demonstrations_of_several_steps
     episodes = [preprocess(demo, processor.input_kind) for demo in demos]
-    collate = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=1.0))
+    collate = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0))
     ours = collate([Example(episode) for episode in episodes])
     prompts = [motion_prompt(whole_motion(demo), demo.objects) for demo in demos]
     theirs, stack = processor.encode_prompts(prompts)
@@ -94,10 +94,10 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
     """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
     processor = PROCESSORS["midas-nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps] * 4
-    mixed = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
+    mixed = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(0.5))
     tasks = prompts_of(PolicyCollate(processor, 0.0, with_images=True), episodes)
     motions = prompts_of(
-        PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=1.0)), episodes
+        PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0)), episodes
     )
     with_motions = prompts_of(mixed, episodes, rngs_of(episodes))
     are_motions = [prompt == motion for prompt, motion in zip(with_motions, motions, strict=True)]
@@ -120,7 +120,7 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
 def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
     processor = PROCESSORS["nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
-    mixed = PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=0.5))
+    mixed = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(0.5))
     examples = [Example(episode) for episode in episodes]
     together = mixed(examples, rngs_of(episodes)).prompts.mask_BL.sum(1).tolist()
     assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
@@ -133,7 +133,8 @@ def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
     plain, half, all_of_them = (
         prompts_of(
-            PolicyCollate(processor, 0.0, with_images=True, retelling=Retelling(motion_share=share)), episodes
+            PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(share)),
+            episodes,
         )
         for share in (0.0, 0.5, 1.0)
     )

@@ -4,7 +4,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.training.occlusion import with_gaps  # noqa: E402
+from openvima.training.augmentation.occlusion import with_gaps  # noqa: E402
 from openvima.training.pretrain import PLAIN, Variety, render_pairs  # noqa: E402
 from openvima.training.schedule import step_generator  # noqa: E402
 

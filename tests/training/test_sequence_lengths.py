@@ -13,7 +13,7 @@ from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn import decoder  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, sequence_lengths, train  # noqa: E402
-from openvima.training.inverse_dynamics import as_motion  # noqa: E402
+from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
 
 NAMES = ("nano", "midas-nano", "gato-nano")  # objects, views, frames
 
@@ -46,7 +46,7 @@ def test_widths_are_those_of_the_episodes(case) -> None:
 def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
     cache, _, processor = case
     prompt, whole = sequence_lengths._at_most(cache, processor, is_motion)
-    episodes = [as_motion(tokens) if is_motion else tokens for tokens in cache]
+    episodes = [with_motion_prompt(tokens) if is_motion else tokens for tokens in cache]
     found = np.array([num_places(tokens, processor) for tokens in episodes])
     assert (found <= prompt).all() and (prompt < whole).all()
     assert prompt.max() <= 2 * found.max()  # or else too many would be read
@@ -54,16 +54,18 @@ def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
 
 def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
     cache, network, processor = case
-    tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, as_motion))
+    tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, with_motion_prompt))
     limit = max(motions) - 1
     for module in (sequence_lengths, decoder):
         monkeypatch.setattr(module, "MAX_PROMPT_POSITIONS", limit)
-    with pytest.raises(DatasetError, match=r"^episode \d+ of \w+ read as a motion is too long to learn from"):
-        sequence_lengths.check_lengths(cache, network, processor, motion_share=1.0)
+    with pytest.raises(
+        DatasetError, match=r"^episode \d+ of \w+ with its inverse-dynamics prompt is too long"
+    ):
+        sequence_lengths.check_lengths(cache, network, processor, inverse_dynamics_prob=1.0)
     if max(tasks) <= limit:
         sequence_lengths.check_lengths(cache, network, processor)
-        with pytest.raises(DatasetError, match="read as a motion"):
-            sequence_lengths.check_lengths(cache, network, processor, motion_share=0.5)
+        with pytest.raises(DatasetError, match="with its inverse-dynamics prompt"):
+            sequence_lengths.check_lengths(cache, network, processor, inverse_dynamics_prob=0.5)
 
 
 def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, monkeypatch) -> None:
@@ -82,6 +84,6 @@ def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
     cache, network, processor = case
     monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
     before = torch.get_rng_state()
-    sequence_lengths.check_lengths(cache, network.train(), processor, motion_share=0.5)
+    sequence_lengths.check_lengths(cache, network.train(), processor, inverse_dynamics_prob=0.5)
     assert torch.equal(torch.get_rng_state(), before)
     assert all(parameter.grad is None for parameter in network.parameters())

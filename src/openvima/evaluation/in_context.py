@@ -12,7 +12,7 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import OracleError
 from openvima.scene import ObjectRecord, RenderedPrompt
 from openvima.tasks.registry import task_spec
-from openvima.training.inverse_dynamics import motion_prompt
+from openvima.training.augmentation.inverse_dynamics import motion_prompt
 
 HELD_OUT_TASKS = ("twist", "follow_motion", "follow_order")
 

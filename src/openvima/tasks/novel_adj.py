@@ -30,6 +30,7 @@ REQUEST = "Put the {adv}{novel_adj} {dragged_obj} into the {base_obj}."
     family="novel_concept_grounding",
     template=f"{comparison_text()} {REQUEST}",
     oracle_max_steps=3,
+    distractors_allowed=True,
 )
 def sample(
     table: TableSampler,

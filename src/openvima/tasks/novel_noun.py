@@ -25,6 +25,7 @@ REQUEST = "Put a {novel_name_1} into a {novel_name_2}."
     family="novel_concept_grounding",
     template=" ".join((*INTRODUCTIONS, REQUEST)),
     oracle_max_steps=3,
+    distractors_allowed=True,
 )
 def sample(
     table: TableSampler,

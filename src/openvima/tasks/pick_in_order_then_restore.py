@@ -38,7 +38,11 @@ def template(num_targets: int) -> str:
 
 
 @register_task(
-    "pick_in_order_then_restore", family="visual_reasoning", template=template(2), oracle_max_steps=4
+    "pick_in_order_then_restore",
+    family="visual_reasoning",
+    template=template(2),
+    oracle_max_steps=4,
+    distractors_allowed=True,
 )
 def sample(table: TableSampler, *, same_bases: bool = True, difficulty: str = "easy") -> Problem:
     """Sample one problem.

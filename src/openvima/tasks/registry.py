@@ -36,6 +36,8 @@ class TaskSpec:
         oracle_max_steps: Step limit of the oracle.
         summary: First line of the task file's docstring.
         sample: Samples a `Problem` with a `TableSampler`; keyword arguments are the task's options.
+        distractors_allowed: Whether prompt and goals stay unambiguous with more objects on the table, so that
+            training may insert distractors.
     """
 
     name: str
@@ -46,6 +48,7 @@ class TaskSpec:
     oracle_max_steps: int
     summary: str
     sample: SampleFunction
+    distractors_allowed: bool = False
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -96,6 +99,7 @@ def register_task(
     oracle_max_steps: int,
     end_effector: EndEffector = "suction",
     pools: Mapping[Level, Pool] | None = None,
+    distractors_allowed: bool = False,
 ) -> Callable[[SampleFunction], SampleFunction]:
     """Register a task; decorates its `sample` function.
 
@@ -106,6 +110,7 @@ def register_task(
         oracle_max_steps: Step limit of the oracle.
         end_effector: Tool of the arm.
         pools: Objects and textures at each level; by default those of the catalogue.
+        distractors_allowed: See `TaskSpec`.
 
     Returns:
         The decorator, which returns the function unchanged.
@@ -126,6 +131,7 @@ def register_task(
             oracle_max_steps=oracle_max_steps,
             summary=_summary(sample),
             sample=sample,
+            distractors_allowed=distractors_allowed,
         )
         return sample
 

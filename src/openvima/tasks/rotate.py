@@ -19,7 +19,13 @@ TOLERANCE_M = 0.1
 NUM_DISTRACTORS = {"easy": 1, "medium": 3, "hard": 5}
 
 
-@register_task("rotate", family="simple_object_manipulation", template=TEMPLATE, oracle_max_steps=3)
+@register_task(
+    "rotate",
+    family="simple_object_manipulation",
+    template=TEMPLATE,
+    oracle_max_steps=3,
+    distractors_allowed=True,
+)
 def sample(
     table: TableSampler,
     *,

@@ -17,7 +17,11 @@ TEMPLATE = "Put the {dragged_obj_1} into the {base_obj}."
 
 
 @register_task(
-    "visual_manipulation", family="simple_object_manipulation", template=TEMPLATE, oracle_max_steps=3
+    "visual_manipulation",
+    family="simple_object_manipulation",
+    template=TEMPLATE,
+    oracle_max_steps=3,
+    distractors_allowed=True,
 )
 def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "easy") -> Problem:
     """Sample one problem.

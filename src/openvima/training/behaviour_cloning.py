@@ -121,9 +121,9 @@ class BehaviourCloning:
                 # Sharded weights are gathered at every pass, so all processes must make equally many.
                 count=min(parts, ours) if self._parallel.is_sharded else None,
                 detected=self._detected,
-                detected_share=config.loader.detected_prob or 0.0,
-                strangers=self._training if config.augmentation.distractor_prob else None,
-                stranger_share=config.augmentation.distractor_prob,
+                detected_prob=config.loader.detected_prob or 0.0,
+                distractors=self._training if config.augmentation.distractor_prob else None,
+                distractor_prob=config.augmentation.distractor_prob,
             ),
         )
         return iter(batches_of(stream, num_workers=min(config.loader.num_workers, _num_cpus())))

@@ -20,9 +20,9 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.t5 import load_t5, tokenizer_for
+from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
-from openvima.training.retelling import Retelling
 from openvima.training.schedule import step_seed
 from openvima.training.validation import flattened
 
@@ -134,17 +134,11 @@ def build_learner(config: TrainingConfig) -> Learner:
             "folder that holds it, or to 't5-base'. Its weights are then not read."
         )
     processor = Processor.of(sizes.inputs, tokenizer_for(sizes.prompt, where))
-    augmentation = config.augmentation
     return PolicyLearner(
         network,
         processor,
-        spurious_probability=augmentation.false_positive_prob,
-        retelling=Retelling(
-            motion_share=augmentation.inverse_dynamics_prob,
-            bystander_share=augmentation.drop_unused_objects_prob,
-            naming_share=augmentation.rename_objects_prob,
-            reordering_share=augmentation.shuffle_sentences_prob,
-        ),
+        false_positive_prob=config.augmentation.false_positive_prob,
+        augmentation=demonstration_augmentation(config.augmentation),
     )
 
 

@@ -19,9 +19,9 @@ from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
-from openvima.training.augment import augmented
+from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
+from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example, stack_images
-from openvima.training.retelling import AS_TOLD, Retelling
 
 # From examples and, while training, one generator for each of them, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -84,8 +84,8 @@ class PolicyLearner(Learner):
     Args:
         network: The network; it is trained in place.
         processor: How it sees prompts and observations.
-        spurious_probability: How often each view of each step shows an object that is none.
-        retelling: How demonstrations are told otherwise.
+        false_positive_prob: Probability that a view of a step contains a false detection.
+        augmentation: Transforms of demonstrations.
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class PolicyLearner(Learner):
         network: PolicyNetwork,
         processor: Processor,
         *,
-        spurious_probability: float = 0.0,
-        retelling: Retelling = AS_TOLD,
+        false_positive_prob: float = 0.0,
+        augmentation: DemonstrationAugmentation = NO_AUGMENTATION,
     ) -> None:
         super().__init__()
         self.network = network
@@ -102,13 +102,16 @@ class PolicyLearner(Learner):
         self.input_kind = processor.input_kind
         self.score = network.score
         self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
-        self._spurious_probability, self._retelling = spurious_probability, retelling
+        self._false_positive_prob, self._augmentation = false_positive_prob, augmentation
 
     def collator(self) -> "PolicyCollate":
         """Return what makes batches; see `Learner`."""
         with_images = self.features is None
         return PolicyCollate(
-            self.processor, self._spurious_probability, with_images=with_images, retelling=self._retelling
+            self.processor,
+            self._false_positive_prob,
+            with_images=with_images,
+            augmentation=self._augmentation,
         )
 
     def forward(self, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -141,23 +144,23 @@ class PolicyCollate:
 
     Args:
         processor: How the network sees prompts and observations.
-        spurious_probability: How often each view of each step shows an object that is none.
+        false_positive_prob: Probability that a view of a step contains a false detection.
         with_images: Put the images that are used into the batch, each once. Without, numbers count through
             the images of all demonstrations.
-        retelling: How demonstrations are told otherwise; when validating, as motions if all are, else not.
+        augmentation: Transforms of demonstrations; not in validation, unless all are inverse dynamics.
     """
 
     def __init__(
         self,
         processor: Processor,
-        spurious_probability: float,
+        false_positive_prob: float,
         *,
         with_images: bool,
-        retelling: Retelling = AS_TOLD,
+        augmentation: DemonstrationAugmentation = NO_AUGMENTATION,
     ) -> None:
         self._processor = processor
-        self._probability, self._with_images = spurious_probability, with_images
-        self._retelling = retelling
+        self._probability, self._with_images = false_positive_prob, with_images
+        self._augmentation = augmentation
 
     def __call__(
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
@@ -167,7 +170,7 @@ class PolicyCollate:
         if self._with_images:
             examples, stack = _stacked(examples, processor)
         drawn = [None] * len(examples) if rngs is None else rngs
-        examples = [self._retelling(example, rng) for example, rng in zip(examples, drawn, strict=True)]
+        examples = [self._augmentation(example, rng) for example, rng in zip(examples, drawn, strict=True)]
         batch = processor.collate([e.episode for e in examples], [e.base for e in examples])
         if rngs is not None:
             batch = augmented(batch, processor.layout, probability=self._probability, rngs=rngs)

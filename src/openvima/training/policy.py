@@ -9,10 +9,10 @@ from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
+from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
-from openvima.training.inverse_dynamics import MOTION_TEXT
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
@@ -121,7 +121,7 @@ class _Stages:
             if prob:
                 learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))
             for cache in caches:
-                check_lengths(cache, learner.network, learner.processor, motion_share=prob)
+                check_lengths(cache, learner.network, learner.processor, inverse_dynamics_prob=prob)
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches)
         if config.runtime.compile:
@@ -137,7 +137,7 @@ class _Stages:
         loader = self.config.loader
         return split_examples(
             self._caches[0],
-            validation_share=loader.validation_fraction,
+            validation_fraction=loader.validation_fraction,
             validation_episodes=loader.validation_episodes,
         )
 

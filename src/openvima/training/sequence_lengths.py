@@ -1,4 +1,4 @@
-"""Whether demonstrations fit into a network: looked at before training rather than in the middle of it."""
+"""Whether demonstrations fit into a network: checked before training rather than in the middle of it."""
 
 import numpy as np
 import torch
@@ -12,13 +12,13 @@ from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
-from openvima.training.inverse_dynamics import as_motion, motion_text
+from openvima.training.augmentation.inverse_dynamics import motion_text, with_motion_prompt
 
 MAX_READ = 256  # only those that may be too long are read, and of them the longest
 
 
 def check_lengths(
-    cache: ObjectCache, network: PolicyNetwork, processor: Processor, *, motion_share: float = 0.0
+    cache: ObjectCache, network: PolicyNetwork, processor: Processor, *, inverse_dynamics_prob: float = 0.0
 ) -> None:
     """Read the longest demonstrations, if one of them may be too long.
 
@@ -26,7 +26,7 @@ def check_lengths(
         cache: The tokens of all.
         network: What is trained; it is left in evaluation mode.
         processor: How it sees prompts and observations.
-        motion_share: Share of demonstrations that are read as motions.
+        inverse_dynamics_prob: Probability of inverse dynamics.
 
     Raises:
         DatasetError: A demonstration has more tokens than the network takes.
@@ -34,13 +34,16 @@ def check_lengths(
     if not len(cache):
         return
     network.eval()
-    for is_motion in [*([False] if motion_share < 1 else []), *([True] if motion_share else [])]:
+    for is_motion in [
+        *([False] if inverse_dynamics_prob < 1 else []),
+        *([True] if inverse_dynamics_prob else []),
+    ]:
         prompt, whole = _at_most(cache, processor, is_motion)
         excess = np.maximum(prompt / MAX_PROMPT_POSITIONS, whole / MAX_POSITIONS)
         longest = np.argsort(-excess, kind="stable")[:MAX_READ]
         for row in longest[excess[longest] > 1]:
             tokens = cache[int(row)]
-            _read(network, processor, as_motion(tokens) if is_motion else tokens, is_motion)
+            _read(network, processor, with_motion_prompt(tokens) if is_motion else tokens, is_motion)
 
 
 def _at_most(cache: ObjectCache, processor: Processor, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -78,8 +81,8 @@ def _read(network: PolicyNetwork, processor: Processor, tokens: PreprocessedEpis
         prompt = network.encode_prompt(batch.prompts, features)
         network.loss(prompt, batch.history, features, batch.targets)
     except PolicyError as error:
-        reading = " read as a motion" if is_motion else ""
+        reading = " with its inverse-dynamics prompt" if is_motion else ""
         raise DatasetError(
-            f"episode {tokens.seed} of {tokens.task}{reading} is too long to learn from: {error} Or "
+            f"episode {tokens.seed} of {tokens.task}{reading} is too long to train on: {error} Or "
             "leave its task out, with `openvima data sample --tasks`."
         ) from None

@@ -11,10 +11,10 @@ from openvima.data.object_cache.cache import ObjectCache
 from openvima.errors import ConfigError, DatasetError
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
+from openvima.training.augmentation.distractor_insertion import allows_distractors
 from openvima.training.dataset import Example
-from openvima.training.hash_split import lots_of
+from openvima.training.hash_split import split_hashes
 from openvima.training.learner import Collate
-from openvima.training.strangers import receives_strangers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,17 +50,17 @@ class ExampleSource(Sequence[Example]):
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """How a process works off its share of a batch: in parts of demonstrations of like length.
+    """Makes a process's part of a batch, in parts of demonstrations of similar length.
 
     Args:
         collate: Makes a batch of each part.
         seed: Of the run; every example has a generator of its own for every batch.
-        largest: Demonstrations of a part.
-        count: Make exactly so many parts, whatever the lengths; None makes as many as are useful.
+        largest: Most demonstrations of a part.
+        count: Make exactly so many parts, whatever the lengths; None makes as many as needed.
         detected: The same demonstrations with the boxes of a detector; see `with_boxes_of`.
-        detected_share: How many are shown with these instead.
-        strangers: Where objects come from that are shown in demonstrations of others; see `with_strangers`.
-        stranger_share: How many demonstrations that can show such ones do.
+        detected_prob: Probability of using these instead.
+        distractors: Demonstrations from which distractors are inserted; see `with_distractors`.
+        distractor_prob: Probability of that, for demonstrations that allow it.
     """
 
     collate: Collate
@@ -68,25 +68,29 @@ class Parts:
     largest: int
     count: int | None = None
     detected: ExampleSource | None = None
-    detected_share: float = 0.0
-    strangers: ExampleSource | None = None
-    stranger_share: float = 0.0
+    detected_prob: float = 0.0
+    distractors: ExampleSource | None = None
+    distractor_prob: float = 0.0
 
     def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
         """Return the batches of one step, each with its number of steps in demonstrations."""
         parts = []
         for part in self._divided(examples):
             rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
-            shown = [self._shown(example, rng) for example, rng in zip(part, rngs, strict=True)]
-            parts.append((self.collate(shown, rngs), sum(e.episode.num_steps for e in part)))
+            drawn = [self._drawn(example, rng) for example, rng in zip(part, rngs, strict=True)]
+            parts.append((self.collate(drawn, rngs), sum(e.episode.num_steps for e in part)))
         return parts
 
-    def _shown(self, example: Example, rng: np.random.Generator) -> Example:
-        """Draw whose boxes an example is shown with, and what else; it has equally many steps with any."""
-        if self.detected is not None and rng.random() < self.detected_share:
+    def _drawn(self, example: Example, rng: np.random.Generator) -> Example:
+        """Draw the boxes of an example, and where distractors come from; the number of steps stays."""
+        if self.detected is not None and rng.random() < self.detected_prob:
             example = self.detected.example(example.row)
-        source = self.strangers
-        if source is None or not receives_strangers(example.episode) or rng.random() >= self.stranger_share:
+        source = self.distractors
+        if (
+            source is None
+            or not allows_distractors(example.episode.task)
+            or rng.random() >= self.distractor_prob
+        ):
             return example
         return replace(example, other=source[int(rng.integers(len(source)))])
 
@@ -104,30 +108,33 @@ class Parts:
 
 
 def split_examples(
-    cache: ObjectCache, *, validation_share: float, validation_episodes: int
+    cache: ObjectCache, *, validation_fraction: float, validation_episodes: int
 ) -> tuple[ExampleSource, ExampleSource]:
-    """Divide demonstrations into those to learn from and those for validation.
+    """Split demonstrations into those to train on and held-out ones.
 
-    Whether one is kept follows from its task and seed, so that it stays there when data are added.
+    Which ones are held out follows from task and seed, so that it stays when data are added.
 
     Args:
         cache: All demonstrations.
-        validation_share: Share to keep.
+        validation_fraction: Fraction to hold out.
         validation_episodes: At most so many are used; which ones follows from task and seed, too.
 
     Raises:
-        DatasetError: There is none to learn from.
+        DatasetError: There is none to train on.
     """
-    lots = lots_of(cache.dataset)
+    hashes = split_hashes(cache.dataset)
     counts = cache.image_counts()
     bases = np.cumsum(counts) - counts
     lengths = cache.lengths()
-    training, kept = np.flatnonzero(lots >= validation_share), np.flatnonzero(lots < validation_share)
+    training, kept = (
+        np.flatnonzero(hashes >= validation_fraction),
+        np.flatnonzero(hashes < validation_fraction),
+    )
     if not len(training):
         raise DatasetError(
-            "there is no demonstration to learn from; generate some, or lower validation_share."
+            "there is no demonstration to train on; generate some, or lower loader.validation_fraction."
         )
-    kept = np.sort(kept[np.argsort(lots[kept], kind="stable")[:validation_episodes]])
+    kept = np.sort(kept[np.argsort(hashes[kept], kind="stable")[:validation_episodes]])
     first, second = (ExampleSource(cache, rows, bases, lengths[rows]) for rows in (training, kept))
     return first, second
 
@@ -136,8 +143,8 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
     """Return the demonstrations of a source with the boxes of a detector.
 
     Args:
-        detected: What the detector found in the demonstrations of the source's cache. Its images come after
-            all of that one's.
+        detected: The detections in the demonstrations of the source's cache. Its images come after all of
+            that one's.
         source: Which demonstrations.
     """
     counts = detected.image_counts()
@@ -146,7 +153,7 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
 
 
 def check_words(cache: ObjectCache, processor: Processor) -> None:
-    """Look at every text before training rather than in the middle of it.
+    """Check the words of every prompt before training.
 
     Raises:
         PromptError: A prompt has a word that the vocabulary lacks.
@@ -167,7 +174,7 @@ def order_of(
     """
     if len(source) < num_ranks:
         raise ConfigError(
-            f"there are {len(source)} demonstrations to learn from and {num_ranks} processes; start fewer of "
+            f"there are {len(source)} demonstrations to train on and {num_ranks} processes; start fewer of "
             "these, or generate more."
         )
     batch = min(batch, len(source) // num_ranks * num_ranks)
@@ -183,7 +190,7 @@ def order_of(
 
 
 def by_length(examples: Sequence[Example]) -> list[list[Example]]:
-    """Sort examples into those of one step, of two or three, and longer ones, so that little is padded."""
+    """Group examples of one step, of two or three, and longer ones, to reduce padding."""
     groups: dict[int, list[Example]] = {}
     for example in examples:
         groups.setdefault(min(2, example.episode.num_steps // 2), []).append(example)

@@ -22,7 +22,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
-from openvima.training.inverse_dynamics import as_motion  # noqa: E402
+from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
@@ -228,7 +228,7 @@ def test_images_of_single_objects_do_not_change_the_correspondence_of_scenes(net
 def test_frames_of_motions_are_scenes(demos):
     processor = Processor("objects")
     examples, _ = examples_of(demos[:1], processor)
-    motion = as_motion(preprocess(demos[0], "objects"))
+    motion = with_motion_prompt(preprocess(demos[0], "objects"))
     batch = collate_examples(processor, [replace(examples[0], episode=motion)])
     assert batch.prompts.in_scene_S.all()
     assert batch.prompts.image_index_S.max() == demos[0].num_steps

@@ -1,22 +1,22 @@
-"""Which demonstrations a detector learns from, and which are kept aside."""
+"""Which demonstrations a detector is trained on, and which are held out."""
 
 import numpy as np
 
 from openvima.data.reader import Dataset
-from openvima.training.hash_split import lots_of
+from openvima.training.hash_split import split_hashes
 
 
-def split_episodes(dataset: Dataset, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Divide demonstrations into those to learn from and those kept for validation.
+def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+    """Split demonstrations into those to train on and held-out ones.
 
-    Which ones are kept follows from task and seed alone, so that it stays when data are added.
+    Which ones are held out follows from task and seed, so that it stays when data are added.
 
     Args:
         dataset: The demonstrations.
-        share: About so many are kept.
+        fraction: Fraction to hold out.
 
     Returns:
-        Numbers of the episodes of both parts.
+        Indices of both.
     """
-    lots = lots_of(dataset, "detector/")
-    return np.flatnonzero(lots >= share), np.flatnonzero(lots < share)
+    hashes = split_hashes(dataset, "detector/")
+    return np.flatnonzero(hashes >= fraction), np.flatnonzero(hashes < fraction)

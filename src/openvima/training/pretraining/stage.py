@@ -3,9 +3,9 @@
 import torch
 
 from openvima.policies.nn.policy_network import PolicyNetwork
+from openvima.training.augmentation.occlusion import with_gaps
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import Metrics
-from openvima.training.occlusion import with_gaps
 from openvima.training.pretrain import Pairs, matching_loss, pairs_again, scene_accuracy
 from openvima.training.schedule import step_generator
 from openvima.training.turning import joint_loss, mirrored, shifted, turn_accuracy

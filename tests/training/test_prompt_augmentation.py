@@ -15,11 +15,13 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.tasks.novel_words import NOUNS  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
+from openvima.training.augmentation.drop_unused_objects import without_unused_objects  # noqa: E402
+from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
+from openvima.training.augmentation.rename_objects import RenameObjects, renamed  # noqa: E402
+from openvima.training.augmentation.shuffle_sentences import shuffled  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
-from openvima.training.inverse_dynamics import as_motion  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.rereading import as_named, in_any_order, without_bystanders  # noqa: E402
-from openvima.training.retelling import Retelling  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 NAMED = (
@@ -50,7 +52,7 @@ def _images(episode) -> dict[str, list]:
 def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task, episodes):
     episode, with_others = episodes[task], 0
     for seed in range(12):
-        named = as_named(episode, np.random.default_rng(seed))
+        named = renamed(episode, np.random.default_rng(seed))
         images = _images(named)
         others = [images.pop(name) for name in list(images) if name.startswith("other_")]
         assert images == _images(episode)
@@ -78,13 +80,13 @@ def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task,
 
 @pytest.mark.parametrize("task", KEPT)
 def test_prompts_with_invented_words_or_without_single_objects_stay(task, episodes):
-    assert as_named(episodes[task], np.random.default_rng(0)) is episodes[task]
+    assert renamed(episodes[task], np.random.default_rng(0)) is episodes[task]
 
 
 def test_names_are_read_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    naming = Retelling(naming_share=1.0)
-    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, retelling=naming)
+    naming = DemonstrationAugmentation(of_tasks=(RenameObjects(1.0),))
+    collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, augmentation=naming)
     plain = PolicyCollate(Processor("objects"), 0.0, with_images=True)
     assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)
     lengths = [made(several, rngs_of(several)).prompts.mask_BL.sum(1) for made in (collate, plain)]
@@ -96,8 +98,8 @@ def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholde
     seen, examples = set(), set()
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        before = as_named(episodes[task], rng)
-        after = in_any_order(before, rng)
+        before = renamed(episodes[task], rng)
+        after = shuffled(before, rng)
         sentences, images = before.prompt.text.split(". "), _images(before)
         assert all(images[name] == rows for name, rows in _images(after).items())
         assert after.prompt.objects_per_image.sum() == len(after.prompt.objects)
@@ -116,26 +118,26 @@ def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholde
 @pytest.mark.parametrize("task", ["twist", "rearrange", "same_shape"])
 def test_prompts_that_explain_nothing_stay_in_order(task, episodes):
     episode = episodes[task]
-    assert in_any_order(episode, np.random.default_rng(0)) is episode
+    assert shuffled(episode, np.random.default_rng(0)) is episode
 
 
 def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        text = in_any_order(as_named(episodes["pick_in_order_then_restore"], rng), rng).prompt.text
+        text = shuffled(renamed(episodes["pick_in_order_then_restore"], rng), rng).prompt.text
         assert ". Finally restore it into its original container." in text
         assert text.index("Put ") < text.index("Finally")
 
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "pick_in_order_then_restore"])
 def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
-    motion = as_motion(episodes[task])
+    motion = with_motion_prompt(episodes[task])
     used = {*motion.pick_ids.tolist(), *motion.place_ids.tolist()}
     bystanders = set(motion.objects.ids.tolist()) - used
     assert bystanders
     unseen, unpictured = set(), set()
     for seed in range(20):
-        less = without_bystanders(motion, 0.5, np.random.default_rng(seed))
+        less = without_unused_objects(motion, 0.5, np.random.default_rng(seed))
         assert less.objects_per_step.sum() == len(less.objects)
         assert less.prompt.objects_per_image.sum() == len(less.prompt.objects)
         assert np.array_equal(less.pick_ids, motion.pick_ids)
@@ -154,7 +156,7 @@ def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
         unseen |= gone[0]
         unpictured |= gone[1]
     assert unseen == unpictured == bystanders
-    same = without_bystanders(motion, 0.0, np.random.default_rng(0))
+    same = without_unused_objects(motion, 0.0, np.random.default_rng(0))
     for ours, theirs in ((same.objects, motion.objects), (same.prompt.objects, motion.prompt.objects)):
         assert np.array_equal(rows_of(ours), rows_of(theirs))
 

@@ -1,36 +1,44 @@
-"""Demonstrations read as motions: what was seen is the prompt, and what was done the answer.
+"""Inverse dynamics: the prompt consists of the frames of the demonstration, and the actions are predicted.
 
     "Follow this motion: {frame_0} {frame_1} … {frame_T}."
 
-Any demonstration of T steps can be read that way. A network learns by it what moved from frame to frame and
-how to bring that about, from the same data and whatever the task was. The frames show what the policy saw
-before each action and after the last.
+Any demonstration of T steps can be used that way, whatever its task. The frames are the observations before
+each action and after the last.
 
-Source: MIDAS (Li et al. 2023), inverse dynamics pretraining.
+Source: MIDAS (Li et al. 2023), inverse-dynamics pretraining.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
+from openvima.training.dataset import Example
 
 MOTION_TEXT = "Follow this motion: {frames}."
 
 
-def as_motion(episode: PreprocessedEpisode) -> PreprocessedEpisode:
-    """Return the same demonstration with its own frames as the prompt.
+@dataclass(frozen=True, slots=True)
+class InverseDynamics:
+    """Replaces the prompt by the frames of the demonstration."""
 
-    Nothing is copied but rows of numbers: the prompt names the images of the history. Nothing is left of the
-    task's own prompt.
+    def __call__(self, example: Example) -> Example:
+        """Augment a demonstration."""
+        return replace(example, episode=with_motion_prompt(example.episode))
+
+
+def with_motion_prompt(episode: PreprocessedEpisode) -> PreprocessedEpisode:
+    """Replace the prompt by the frames of the demonstration.
+
+    Only table rows are copied: the prompt refers to the images of the history. Nothing is left of the task's
+    own prompt.
 
     Args:
-        episode: The demonstration. Its objects may be in any order; in a prompt image they stand in that of
-            their ids, as the scenes in the prompts of tasks have it. One that no view shows, as it stands
-            for a moment in which a detector found nothing, is left out.
+        episode: The demonstration. In a prompt image its objects are ordered by id, as in the scenes of task
+            prompts. Objects without any box, which stand for steps without detections, are left out.
     """
     objects = ObjectTable.concatenate([episode.objects, episode.final])
     num_frames = episode.num_steps + 1
@@ -47,10 +55,10 @@ def as_motion(episode: PreprocessedEpisode) -> PreprocessedEpisode:
 
 
 def motion_prompt(observations: Sequence[Mapping], objects: Sequence[ObjectRecord]) -> RenderedPrompt:
-    """Make the prompt that shows a motion, for a policy that acts.
+    """Make the prompt of an in-context demonstration.
 
     Args:
-        observations: What was seen: `rgb` and `segm`, each view name to array.
+        observations: `rgb` and `segm`, each view name to array.
         objects: The objects of the scene.
     """
     records = tuple(sorted(objects, key=lambda record: record.object_id))
@@ -62,6 +70,6 @@ def motion_prompt(observations: Sequence[Mapping], objects: Sequence[ObjectRecor
 
 
 def motion_text(num_frames: int) -> str:
-    """Return the text of a motion of so many frames, with a placeholder for each."""
+    """Return the text for so many frames, with a placeholder for each."""
     frames = " ".join(f"{{frame_{number}}}" for number in range(num_frames))
     return MOTION_TEXT.format(frames=frames)

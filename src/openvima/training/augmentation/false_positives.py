@@ -1,4 +1,4 @@
-"""Augmentation of batches: false detections among the objects, and objects in any order.
+"""Augmentation of batches: false detections among the objects, and shuffled objects.
 
 Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 """

@@ -1,30 +1,42 @@
-"""Demonstrations into whose view objects of others come, so that policies look at what the prompt names."""
+"""Scene augmentation: objects of another demonstration are inserted as distractors (copy-paste)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
-from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.errors import UnknownTaskError
 from openvima.perception.iou import box_iou
 from openvima.perception.preprocessing import ObjectTable
+from openvima.tasks.registry import task_spec
 from openvima.training.dataset import Example
 
-MOST_STRANGERS = 3
-# Tasks whose prompts show whatever matters. "All objects …" or "the object that was to the left" could mean a
-# stranger, and in a scene to be restored it would lie in the way.
-RECEIVING = ("visual_manipulation", "rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore")
+MAX_DISTRACTORS = 3
 
 
-def receives_strangers(episode: PreprocessedEpisode) -> bool:
-    """Whether what an episode demonstrates stays right with other objects in view."""
-    return episode.task in RECEIVING
+@cache
+def allows_distractors(task: str) -> bool:
+    """Whether demonstrations of a task stay correct with distractors, see `TaskSpec.distractors_allowed`."""
+    try:
+        return task_spec(task).distractors_allowed
+    except UnknownTaskError:  # demonstrations of a task that is not installed here
+        return False
 
 
-def with_strangers(example: Example, other: Example, rng: np.random.Generator) -> Example:
-    """Put up to three objects of another demonstration into view, at all steps where they lie there.
+@dataclass(frozen=True, slots=True)
+class DistractorInsertion:
+    """Inserts distractors where the loader has supplied another demonstration, `Example.other`."""
 
-    They lie where no view shows anything else at any step. Nothing is copied but rows of numbers. In few
-    episodes a stranger is what the prompt shows as well as the object meant; which it is then cannot be told.
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration."""
+        return example if example.other is None else with_distractors(example, example.other, rng)
+
+
+def with_distractors(example: Example, other: Example, rng: np.random.Generator) -> Example:
+    """Insert up to three objects of another demonstration, where they are, at all steps.
+
+    Their boxes overlap no other box of any step. Only table rows are copied, no images. In few episodes a
+    distractor matches the prompt as well as the target does, which makes the prompt ambiguous.
 
     Args:
         example: The demonstration.
@@ -35,7 +47,7 @@ def with_strangers(example: Example, other: Example, rng: np.random.Generator) -
         The demonstration with numbers of images that count through the whole stack.
     """
     episode = example.episode.with_image_offset(example.base)
-    count = int(rng.integers(1, MOST_STRANGERS + 1))
+    count = int(rng.integers(1, MAX_DISTRACTORS + 1))
     there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))
     there = there.with_image_offset(other.base).select(rng.permutation(len(there)))
     there = there.select(np.asarray(there.masks.all(axis=1)))

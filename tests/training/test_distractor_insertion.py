@@ -14,10 +14,14 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.augmentation.distractor_insertion import (  # noqa: E402
+    MAX_DISTRACTORS,
+    allows_distractors,
+    with_distractors,
+)
 from openvima.training.dataset import Example, stack_images  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import Parts  # noqa: E402
-from openvima.training.strangers import MOST_STRANGERS, receives_strangers, with_strangers  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
@@ -50,29 +54,29 @@ def _overlap(one, other) -> bool:
     return False
 
 
-def test_strangers_lie_beside_what_was_there_at_all_steps_and_nothing_else_changes(stacked):
+def test_distractors_lie_beside_what_was_there_at_all_steps_and_nothing_else_changes(stacked):
     examples, stack = stacked
     added = 0
     for example in examples[:4]:
         for seed, other in enumerate(examples):
             if other is example:
                 continue
-            more = with_strangers(example, other, np.random.default_rng(seed)).episode
+            more = with_distractors(example, other, np.random.default_rng(seed)).episode
             before, source = example.episode, other.episode
             first = source.objects.split(source.objects_per_step)[0]
-            strangers = None
+            distractors = None
             steps = (each.objects.split(each.objects_per_step) for each in (before, more))
             for ours, theirs in zip(*steps, strict=True):
                 assert np.array_equal(theirs.ids[: len(ours)], ours.ids)
                 assert np.array_equal(theirs.boxes[: len(ours)], ours.boxes)
                 came = theirs.select(slice(len(ours), None))
-                assert strangers is None or np.array_equal(rows_of(came), rows_of(strangers))
-                strangers = came
+                assert distractors is None or np.array_equal(rows_of(came), rows_of(distractors))
+                distractors = came
                 assert not set(came.ids) & set(before.objects.ids)
                 assert not any(_overlap(a, b) for a in _rows(came) for b in _rows(ours))
-            assert strangers is not None and len(strangers) <= MOST_STRANGERS
-            added += len(strangers)
-            for row in _rows(strangers):
+            assert distractors is not None and len(distractors) <= MAX_DISTRACTORS
+            added += len(distractors)
+            for row in _rows(distractors):
                 (origin,) = (
                     k for k in _rows(first) if np.array_equal(k.crop_index + other.base, row.crop_index)
                 )
@@ -89,16 +93,16 @@ def test_strangers_lie_beside_what_was_there_at_all_steps_and_nothing_else_chang
     assert added > 10
 
 
-def test_few_tasks_receive_strangers(episodes):
-    assert [receives_strangers(episode) for episode in episodes] == [True] * 4 + [False] * 2
+def test_few_tasks_receive_distractors(episodes):
+    assert [allows_distractors(episode.task) for episode in episodes] == [True] * 4 + [False] * 2
 
 
-def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes):
+def test_distractors_are_drawn_in_training_alone_with_the_share_asked_for(episodes):
     examples = [Example(episode, row=row) for row, episode in enumerate(episodes)]
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
     def counts(share: float) -> torch.Tensor:
-        parts = Parts(collate, 0, 99, count=1, strangers=examples, stranger_share=share)
+        parts = Parts(collate, 0, 99, count=1, distractors=examples, distractor_prob=share)
         ((batch, _),) = parts(examples, 4)
         return (batch.history.num_slots_BT * batch.history.steps_BT).sum(dim=1)
 
@@ -108,7 +112,7 @@ def test_strangers_are_drawn_in_training_alone_with_the_share_asked_for(episodes
     )
     assert torch.equal(counts(0.0), plain)
     more = counts(1.0) - plain
-    receiving = torch.tensor([receives_strangers(episodes[row]) for row in order])
+    receiving = torch.tensor([allows_distractors(episodes[row].task) for row in order])
     assert (more[~receiving] == 0).all() and (more >= 0).all() and more.sum() > 0
 
 
@@ -122,7 +126,7 @@ def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, 
     for b, example in enumerate(borrowing):
         numbers = batch.history.crop_index_BTVN[b, 0]
         shown = {images[n].numpy().tobytes() for n in numbers.flatten().tolist() if n}
-        expected = with_strangers(example, example.other, rngs_of(borrowing)[b]).episode
+        expected = with_distractors(example, example.other, rngs_of(borrowing)[b]).episode
         first = expected.objects.split(expected.objects_per_step)[0]
         assert shown == {stack[n].numpy().tobytes() for n in first.crop_index.flatten() if n}
 

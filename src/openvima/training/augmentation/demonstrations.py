@@ -1,0 +1,59 @@
+"""Per-demonstration prompt and scene augmentation: the list of transforms, in the order of their draws."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from openvima.training.augmentation.distractor_insertion import DistractorInsertion
+from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
+from openvima.training.augmentation.inverse_dynamics import InverseDynamics
+from openvima.training.augmentation.rename_objects import RenameObjects
+from openvima.training.augmentation.shuffle_sentences import ShuffleSentences
+from openvima.training.config import AugmentationConfig
+from openvima.training.dataset import Example
+
+Transform: TypeAlias = Callable[[Example, np.random.Generator], Example]
+
+
+@dataclass(frozen=True, slots=True)
+class DemonstrationAugmentation:
+    """Transforms of demonstrations, which have either an inverse-dynamics prompt or that of their task.
+
+    Args:
+        inverse_dynamics_prob: Probability of the inverse-dynamics prompt.
+        of_inverse_dynamics: Transforms of demonstrations with that prompt.
+        of_tasks: Transforms of those with the prompt of their task.
+    """
+
+    inverse_dynamics_prob: float = 0.0
+    of_inverse_dynamics: tuple[Transform, ...] = ()
+    of_tasks: tuple[Transform, ...] = (DistractorInsertion(),)
+
+    def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
+        """Augment a demonstration; without a generator, as in validation, only what is certain happens."""
+        prob = self.inverse_dynamics_prob
+        is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
+        if is_inverse:
+            example = InverseDynamics()(example)
+        if rng is not None:
+            for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
+                example = transform(example, rng)
+        return example
+
+
+NO_AUGMENTATION = DemonstrationAugmentation()
+
+
+def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugmentation:
+    """Return the transforms that the settings ask for."""
+    return DemonstrationAugmentation(
+        config.inverse_dynamics_prob,
+        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob),),
+        of_tasks=(
+            DistractorInsertion(),  # acts where the loader supplies another demonstration
+            RenameObjects(config.rename_objects_prob),
+            ShuffleSentences(config.shuffle_sentences_prob),
+        ),
+    )
