@@ -59,7 +59,7 @@ def test_the_split_follows_from_the_episode_and_keeps_everything(data):
     _, least = split_examples(cache, validation_fraction=0.3, validation_episodes=1)
     assert len(least) == 1
     assert names_of(least) <= names_of(kept)
-    with pytest.raises(DatasetError, match="no demonstration to learn from"):
+    with pytest.raises(DatasetError, match="no demonstration to train on"):
         split_examples(cache, validation_fraction=1.0, validation_episodes=1)
 
 
@@ -68,7 +68,7 @@ def test_a_batch_is_no_larger_than_the_demonstrations_and_needs_one_for_each_pro
     _, few = split_examples(cache, validation_fraction=0.3, validation_episodes=3)
     orders = [order_of(few, batch=64, seed=0, bucket=0, rank=rank, num_ranks=2) for rank in range(2)]
     assert [order.batch for order in orders] == [2, 2]
-    with pytest.raises(ConfigError, match="there are 3 demonstrations to learn from and 4 processes"):
+    with pytest.raises(ConfigError, match="there are 3 demonstrations to train on and 4 processes"):
         order_of(few, batch=64, seed=0, bucket=0, rank=0, num_ranks=4)
 
 

@@ -16,14 +16,14 @@ from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 TRAIN = """
 import json, sys
 from pathlib import Path
 from openvima.policies import presets
 from openvima.policies.config import config_from_dict
 from openvima.training import TrainingConfig, train
-
-pytestmark = pytest.mark.slow
 
 sizes, settings = json.loads(sys.argv[1])
 presets.PRESETS["tiny"] = lambda: config_from_dict(sizes)

@@ -94,7 +94,7 @@ def test_a_learner_that_does_not_tell_its_score_is_named_at_once(example, settin
 
 
 def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
-    with pytest.raises(ConfigError, match="does not know pretraining_steps"):
+    with pytest.raises(ConfigError, match=r"does not know pretraining\.steps"):
         train(TrainingConfig.of({**settings, "preset": example}))
 
 

@@ -108,7 +108,7 @@ def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settin
 
 
 def test_a_preset_with_t5_needs_to_know_where_it_is(t5_settings) -> None:
-    with pytest.raises(ConfigError, match="'tiny-t5' reads prompts with T5; set t5"):
+    with pytest.raises(ConfigError, match="'tiny-t5' encodes prompts with T5; set t5"):
         train(TrainingConfig.of({**t5_settings, "t5": None}))
     assert not t5_settings["out"].exists()
 
