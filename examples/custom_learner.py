@@ -19,8 +19,8 @@ from torch.nn import functional as F
 from openvima.evaluation import score
 from openvima.perception.objects import observe, observe_prompt_image
 from openvima.policies import RandomPolicy
-from openvima.policies.base import checkpoint_folder
 from openvima.policies.processor import Processor
+from openvima.policies.sources import checkpoint_folder
 from openvima.scene import Action
 from openvima.training.learner import Learner, PolicyCollate
 

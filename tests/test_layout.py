@@ -98,8 +98,6 @@ def cycle_in(graph: dict[str, set[str]]) -> list[str]:
 
 @pytest.mark.parametrize("package", ORDER)
 def test_no_modules_of_a_package_import_each_other(package: str) -> None:
-    if package == "policies":  # base, checkpoint and inference still do
-        pytest.skip("the circle of policies is not broken yet")
     assert cycle_in(imports_within(package)) == []
 
 

@@ -50,9 +50,9 @@ def test_a_detector_in_the_package_is_small_and_can_be_loaded() -> None:
 
 
 def test_the_policy_in_the_package_is_small_and_whole() -> None:
-    from openvima.policies.bundled import PACKAGED, SMALL
+    from openvima.policies.bundled import BUNDLED, SMALL
 
-    policy = PACKAGED[SMALL]
+    policy = BUNDLED[SMALL]
     assert {file.name for file in policy.folder.iterdir()} == POLICY_FILES
     assert sum(file.stat().st_size for file in policy.folder.iterdir()) <= 20e6
     assert "TODO" not in policy.model_card.read_text(encoding="utf-8")

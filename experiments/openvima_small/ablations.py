@@ -23,14 +23,15 @@ from openvima.atomic_io import atomic_write_file
 from openvima.cli.progress import progress_bar
 from openvima.data import Dataset
 from openvima.evaluation import EvaluationConfig, evaluate
-from openvima.policies.base import WEIGHTS_FILE, find_checkpoint
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import save_checkpoint
 from openvima.policies.config import PolicyConfig
+from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.pointer.config import CandidateHeadConfig, ObjectHeadConfig, small
 from openvima.policies.presets import PRESETS
 from openvima.policies.sizes import SIZES
+from openvima.policies.sources import find_checkpoint
 from openvima.policies.vima.config import vima
 from openvima.training import TrainingConfig, train
 from openvima.training.recipes import RECIPES

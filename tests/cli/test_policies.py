@@ -8,9 +8,9 @@ torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.policies import PRESETS, load_policy, preset  # noqa: E402
-from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER, WEIGHTS_FILE  # noqa: E402
 from openvima.policies.parameter_counts import policy_size  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
 

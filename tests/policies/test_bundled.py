@@ -19,11 +19,12 @@ from openvima.evaluation.rollout import play  # noqa: E402
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy  # noqa: E402
 from openvima.evaluation.sources import policy_sources, weights_hash  # noqa: E402
 from openvima.policies import load_policy, presets  # noqa: E402
-from openvima.policies.base import CHECKPOINTS_FOLDER, Policy, find_checkpoint  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.bundled import MODEL_CARD, PACKAGED, SMALL  # noqa: E402
+from openvima.policies.bundled import BUNDLED, MODEL_CARD, SMALL  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.file_names import CHECKPOINTS_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.sources import find_checkpoint  # noqa: E402
 from openvima.report import assets  # noqa: E402
 from openvima.report.assets import find_metrics  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
@@ -40,7 +41,7 @@ def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder, elsewhere = tmp_path / "package", tmp_path / "elsewhere"
     save_checkpoint(build_network(narrow_small(), seed=5), folder, dtype=torch.float16)
     (folder / MODEL_CARD).write_text("# A card")
-    monkeypatch.setitem(PACKAGED, SMALL, replace(PACKAGED[SMALL], folder=folder))
+    monkeypatch.setitem(BUNDLED, SMALL, replace(BUNDLED[SMALL], folder=folder))
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     return folder
@@ -48,7 +49,7 @@ def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_it_is_loaded_by_its_name_and_never_computes_in_float16(packaged: Path, demonstrations) -> None:
     expected = load_checkpoint(packaged).state_dict()
-    for load in (load_policy, NetworkPolicy.from_pretrained, Policy.from_pretrained):
+    for load in (load_policy, NetworkPolicy.from_pretrained):
         policy = load(SMALL)
         floats = [
             t for t in [*policy.network.parameters(), *policy.network.buffers()] if t.is_floating_point()
@@ -129,7 +130,7 @@ def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(packaged:
     assert main(["evaluate", "--policy", policies, *words]) == 0
     results = Results.read(Path(SMALL, "results.json"))
     sha = weights_hash(packaged)
-    own = {"kind": "run", "packaged": SMALL, "sha256": sha}
+    own = {"kind": "run", "bundled": SMALL, "sha256": sha}
     assert results.policies == {SMALL: own, "mine": own, "copy": {"kind": "run", "sha256": sha}}
     first, *others = (results.row(name, "rotate", "L1").outcomes for name in results.policies)
     assert all(other == first for other in others)
@@ -146,7 +147,7 @@ def test_it_is_filmed_and_listed_and_shown(packaged: Path, capsys) -> None:
     for words in (["list"], ["show", SMALL]):
         assert main(["policies", *words]) == 0
         shown = capsys.readouterr().out
-        for text in (f"{size / 1e6:.1f} MB", PACKAGED[SMALL].trained_on, str(packaged / MODEL_CARD)):
+        for text in (f"{size / 1e6:.1f} MB", BUNDLED[SMALL].trained_on, str(packaged / MODEL_CARD)):
             assert text in shown
     assert main(["policies", "list", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)[-1]

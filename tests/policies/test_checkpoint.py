@@ -11,7 +11,6 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 from openvima.errors import CheckpointError  # noqa: E402
 from openvima.policies import checkpoint, preset  # noqa: E402
-from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER, checkpoint_folder, load_policy  # noqa: E402
 from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
@@ -21,6 +20,9 @@ from openvima.policies.checkpoint import (  # noqa: E402
     save_checkpoint,
 )
 from openvima.policies.config import config_to_dict  # noqa: E402
+from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER  # noqa: E402
+from openvima.policies.loading import load_policy  # noqa: E402
+from openvima.policies.sources import checkpoint_folder  # noqa: E402
 
 
 @pytest.fixture

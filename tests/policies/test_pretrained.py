@@ -11,10 +11,10 @@ torch = pytest.importorskip("torch")
 
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, UnknownPolicyError  # noqa: E402
 from openvima.evaluation.sources import weights_hash  # noqa: E402
-from openvima.policies import Policy, RandomPolicy, load_policy  # noqa: E402
-from openvima.policies.base import TOKENIZER_FOLDER  # noqa: E402
+from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.checkpoint import load_checkpoint, load_network, load_pretrained  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, load_network  # noqa: E402
+from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
 from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
@@ -73,7 +73,7 @@ def assert_same_actions(first, second, demonstrations) -> None:
 def test_a_saved_policy_comes_back_in_every_way_of_loading(policy, demonstrations, tmp_path) -> None:
     policy.save_pretrained(tmp_path / "saved")
     assert not (tmp_path / "saved" / TOKENIZER_FOLDER).exists()
-    for load in (NetworkPolicy.from_pretrained, Policy.from_pretrained, load_policy, load_pretrained):
+    for load in (NetworkPolicy.from_pretrained, load_policy):
         assert_same_actions(load(str(tmp_path / "saved")), policy, demonstrations)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from openvima.policies.bundled import PackagedPolicy
+    from openvima.policies.bundled import BundledPolicy
     from openvima.policies.config import PolicyConfig
     from openvima.policies.parameter_counts import PolicySize
 
@@ -35,7 +35,7 @@ def list_(*, as_json: Json = False) -> int:
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.bundled import PACKAGED
+    from openvima.policies.bundled import BUNDLED
     from openvima.policies.presets import PRESETS, preset
 
     require_torch("counting parameters")
@@ -43,7 +43,7 @@ def list_(*, as_json: Json = False) -> int:
     from openvima.policies.parameter_counts import policy_size
 
     sizes = {name: policy_size(preset(name)) for name in PRESETS}
-    here = {name: policy for name, policy in PACKAGED.items() if policy.is_here}
+    here = {name: policy for name, policy in BUNDLED.items() if policy.is_installed}
     trained = {name: policy_size(read_info(policy.folder).config) for name, policy in here.items()}
     if as_json:
         records = [{"name": name, **_record(size)} for name, size in sizes.items()]
@@ -74,13 +74,13 @@ def show(
         Exit status.
     """
     from openvima.policies.base import require_torch
-    from openvima.policies.bundled import PACKAGED
+    from openvima.policies.bundled import BUNDLED
 
     require_torch("counting parameters")
     from openvima.policies.config import config_to_dict
     from openvima.policies.parameter_counts import policy_size
 
-    config, packaged = _config(policy), PACKAGED.get(policy)
+    config, packaged = _config(policy), BUNDLED.get(policy)
     size = policy_size(config)
     if as_json:
         facts = _facts(packaged) if packaged else {}
@@ -160,8 +160,8 @@ def _config(policy: str) -> "PolicyConfig":
     if policy in PRESETS:
         return preset(policy)
     from openvima.errors import UnknownPolicyError
-    from openvima.policies.base import find_checkpoint, is_policy_source, unknown_policy
     from openvima.policies.checkpoint import load_network, read_info
+    from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
 
     if not is_policy_source(policy):
         raise UnknownPolicyError(unknown_policy(policy, ()))
@@ -178,7 +178,7 @@ def _summary(size: "PolicySize") -> str:
     )
 
 
-def _facts(policy: "PackagedPolicy") -> dict[str, object]:
+def _facts(policy: "BundledPolicy") -> dict[str, object]:
     return {
         "bytes": policy.weights.stat().st_size,
         "trained_on": policy.trained_on,
@@ -186,7 +186,7 @@ def _facts(policy: "PackagedPolicy") -> dict[str, object]:
     }
 
 
-def _print_facts(policy: "PackagedPolicy") -> None:
+def _print_facts(policy: "BundledPolicy") -> None:
     print(f"  weights:     {policy.weights.stat().st_size / 1e6:.1f} MB")
     print(f"  trained on:  {policy.trained_on}")
     print(f"  model card:  {policy.model_card}")

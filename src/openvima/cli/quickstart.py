@@ -7,7 +7,7 @@ from pathlib import Path
 
 from openvima.cli.progress import progress_bar
 from openvima.errors import ConfigError
-from openvima.policies.bundled import SMALL, packaged_folder
+from openvima.policies.bundled import SMALL, bundled_folder
 
 TASKS = ("visual_manipulation", "rotate", "sweep_without_exceeding")
 LEVELS = ("L1", "L2", "L3")
@@ -45,7 +45,7 @@ def main(
     _check(demonstrations=demonstrations, episodes=episodes, workers=workers)
     require_torch("training")
     require_extra()
-    packaged_folder(SMALL)  # fails before any work if missing
+    bundled_folder(SMALL)  # fails before any work if missing
     workers = workers or min(8, os.cpu_count() or 1)
     out.mkdir(parents=True, exist_ok=True)
     _first_look(out / "first_look.png", seed)

@@ -13,8 +13,9 @@ from openvima.atomic_io import atomic_folder, restore_folder
 from openvima.detector.config import DetectorConfig
 from openvima.detector.network import MaskRCNN
 from openvima.errors import CheckpointError, ConfigError
-from openvima.policies.base import CONFIG_FILE, WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.differences import described, listed
+from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE
+from openvima.policies.sources import checkpoint_folder
 
 _KIND = "detector"
 _MAX_LISTED = 5  # names per kind of problem in a message

@@ -24,8 +24,9 @@ from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.errors import ConfigError
 from openvima.perception.objects import ObjectExtractor, ObjectViews, see_nothing
-from openvima.policies.base import WEIGHTS_FILE, checkpoint_folder
 from openvima.policies.detection import DetectedObjects
+from openvima.policies.file_names import WEIGHTS_FILE
+from openvima.policies.sources import checkpoint_folder
 from openvima.scene import PromptImage
 
 DETECTOR = "detector"

@@ -18,7 +18,7 @@ from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, IN_CONTEXT
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
-from openvima.policies.bundled import PACKAGED
+from openvima.policies.bundled import BUNDLED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.seeding import MAX_SEED
 
@@ -210,7 +210,7 @@ class Batch:
     def with_whole_paths(self) -> "Batch":
         """Return the batch for a process with another working directory."""
         source, assets, boxes = self.source, self.env_config.assets, self.boxes
-        is_path = PolicySource(self.policy, source).kind == "run" and source not in PACKAGED
+        is_path = PolicySource(self.policy, source).kind == "run" and source not in BUNDLED
         if is_path and Path(source).exists():
             source = str(Path(source).absolute())
         if assets not in ASSET_PACKS:

@@ -6,7 +6,7 @@ from pathlib import Path
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
-from openvima.policies.base import load_policy
+from openvima.policies.loading import load_policy
 
 ONLINE_EVAL_LEVEL = "L1"
 _DOMAIN = "user"  # evaluation episodes are kept for finished policies

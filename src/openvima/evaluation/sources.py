@@ -9,9 +9,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError
-from openvima.policies.base import find_checkpoint, is_policy_source, unknown_policy
-from openvima.policies.bundled import PACKAGED
+from openvima.policies.bundled import BUNDLED
 from openvima.policies.presets import PRESETS
+from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
 from openvima.serving.client import describe
 from openvima.serving.protocol import is_remote
 
@@ -55,7 +55,7 @@ class PolicySource:
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "run":
-            where = {"packaged": self.source} if self.source in PACKAGED else {}
+            where = {"bundled": self.source} if self.source in BUNDLED else {}
             return {"kind": "run", **where, "sha256": weights_hash(self.source)}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 

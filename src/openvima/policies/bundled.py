@@ -1,4 +1,4 @@
-"""Trained policies that come with the package, each under a name of its own."""
+"""Trained checkpoints bundled with the package, by name."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +13,12 @@ _TRAINED = Path(__file__).parent / "trained"
 
 
 @dataclass(frozen=True, slots=True)
-class PackagedPolicy:
-    """A trained policy of the package.
+class BundledPolicy:
+    """A bundled checkpoint.
 
     Args:
-        folder: Its checkpoint folder, with the model card beside the weights.
-        trained_on: What it was trained on, in one line.
+        folder: The checkpoint folder, with the model card beside the weights.
+        trained_on: Training data, in one line.
     """
 
     folder: Path
@@ -26,45 +26,46 @@ class PackagedPolicy:
 
     @property
     def model_card(self) -> Path:
-        """Where its data, training, scores, weak tasks and limits are told."""
+        """Model card: data, training, scores, weak tasks and limitations."""
         return self.folder / MODEL_CARD
 
     @property
     def weights(self) -> Path:
-        """File of the weights; an installation may lack it."""
+        """Weights file; an installation may lack it."""
         return self.folder / WEIGHTS_FILE
 
     @property
-    def is_here(self) -> bool:
-        """Whether weights and sizes are part of this installation."""
+    def is_installed(self) -> bool:
+        """Whether this installation has weights and config."""
         return self.weights.is_file() and (self.folder / CONFIG_FILE).is_file()
 
 
-PACKAGED: dict[str, PackagedPolicy] = {
-    SMALL: PackagedPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
+BUNDLED: dict[str, BundledPolicy] = {
+    SMALL: BundledPolicy(_TRAINED / SMALL, "demonstrations of the 13 training tasks, training partition"),
 }
 
 
-def packaged_folder(name: str) -> Path:
-    """Return the checkpoint folder of a trained policy of the package.
+def bundled_folder(name: str) -> Path:
+    """Return the folder of a bundled checkpoint.
 
     Args:
-        name: One of `PACKAGED`.
+        name: One of `BUNDLED`.
 
     Raises:
-        PolicyError: A folder here has that name and holds a checkpoint, too.
-        CheckpointError: This installation holds no weights of it.
+        PolicyError: A local folder has that name and holds a checkpoint, too.
+        CheckpointError: This installation lacks its weights.
     """
-    # Other folders may bear the name, as after `evaluate --policy openvima-small --out openvima-small`.
+    # A folder without a checkpoint may have the name, as after
+    # `evaluate --policy openvima-small --out openvima-small`.
     if any((Path(name) / part).exists() for part in (WEIGHTS_FILE, CHECKPOINTS_FOLDER)):
         raise PolicyError(
-            f"{name!r} is a trained policy of the package, and a folder with another one here; write "
-            f"./{name} for the folder, or work elsewhere for that of the package."
+            f"{name!r} is a bundled checkpoint, and also a local folder with a checkpoint; write ./{name} "
+            "for the folder, or run in another directory for the bundled one."
         )
-    policy = PACKAGED[name]
-    if not policy.is_here:
+    policy = BUNDLED[name]
+    if not policy.is_installed:
         raise CheckpointError(
-            f"this installation lacks the weights of {name!r}, which belong into {policy.folder}; install "
-            "openvima again, or give a run folder."
+            f"this installation lacks the weights of {name!r}, which belong into {policy.folder}; "
+            "reinstall openvima, or give a run folder."
         )
     return policy.folder

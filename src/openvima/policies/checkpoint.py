@@ -1,14 +1,13 @@
-"""Checkpoints: a folder with weights and sizes, and with the tokenizer where the policy needs files for it.
+"""Checkpoints: a folder with weights, config and, where needed, the tokenizer.
 
 model.safetensors    weights
-config.yaml          sizes, and the precision of the weights
-tokenizer/           of policies that read prompts with the tokenizer of T5
+config.yaml          config of the network, precision of the weights
+tokenizer/           files of the T5 tokenizer, for policies that use it
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import yaml
@@ -18,38 +17,33 @@ from safetensors.torch import load_file, save_file
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, restore_folder
 from openvima.errors import CheckpointError, ConfigError
-from openvima.policies.base import (
-    CONFIG_FILE,
-    TOKENIZER_FOLDER,
-    WEIGHTS_FILE,
-    find_checkpoint,
-)
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
 from openvima.policies.differences import described, listed
-from openvima.policies.inference import NetworkPolicy
+from openvima.policies.file_names import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.checkpoint import load_published
-from openvima.policies.t5 import T5Tokenizer, tokenizer_for
+from openvima.policies.sources import find_checkpoint
+from openvima.policies.t5 import T5Tokenizer
 from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
-_SHOWN = 5  # names of each kind of problem that a message lists
+_MAX_LISTED = 5  # names that a message lists per kind of problem
 _PRECISIONS = {
     "float32": torch.float32,
     "bfloat16": torch.bfloat16,
     "float16": torch.float16,
     "float64": torch.float64,
 }
-_READ_AS = {torch.float16: torch.float32}  # float16 is for files only; its range is too narrow to compute in
+_COMPUTE_DTYPES = {torch.float16: torch.float32}  # the range of float16 is too narrow to compute in
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointInfo:
-    """What `config.yaml` says.
+    """Contents of `config.yaml`.
 
     Args:
-        config: Sizes of the network.
+        config: Config of the network.
         dtype: Precision of the stored weights.
     """
 
@@ -64,22 +58,22 @@ def save_checkpoint(
     *,
     dtype: torch.dtype = torch.float32,
 ) -> None:
-    """Write a checkpoint folder, whole or not at all; a checkpoint that is there is replaced.
+    """Write a checkpoint folder atomically, replacing an existing checkpoint.
 
     Args:
         network: The network.
-        folder: Where to; it must not exist, be empty, or be a checkpoint.
-        tokenizer: Stored beside the weights if it is that of T5.
-        dtype: Precision of the stored weights: float32, bfloat16, float16 or float64, whatever the network
-            computes in. float16 halves a file of float32 and rounds less than bfloat16; such weights are
-            read as float32.
+        folder: The folder; it must not exist, be empty, or be a checkpoint.
+        tokenizer: Stored beside the weights if it is a T5 tokenizer.
+        dtype: Precision of the stored weights: float32, bfloat16, float16 or float64, independent of the
+            network's own. float16 halves the file size and rounds less than bfloat16; such weights are
+            loaded as float32.
 
     Raises:
-        CheckpointError: The folder holds other files, there is no such precision, or a weight is beyond what
-            it can hold.
+        CheckpointError: The folder holds other files, the precision is not supported, or a weight overflows
+            it.
     """
     folder = Path(folder)
-    _refuse_to_delete(folder)
+    _check_replaceable(folder)
     with atomic_folder(folder) as partial:
         write_checkpoint(network, partial, tokenizer, dtype=dtype)
 
@@ -92,9 +86,9 @@ def write_checkpoint(
     dtype: torch.dtype = torch.float32,
     weights: Mapping[str, torch.Tensor] | None = None,
 ) -> None:
-    """Write the files of a checkpoint into a folder that is still being filled; see `save_checkpoint`.
+    """Write the files of a checkpoint into a partial folder; see `save_checkpoint`.
 
-    `weights` replaces those of the network where it holds but a part of them.
+    `weights` replaces the network's state dict where the network holds only a part of it.
     """
     precision = described(dtype)
     if precision not in _PRECISIONS:
@@ -115,20 +109,18 @@ def write_checkpoint(
 
 
 def load_checkpoint(folder: str | Path) -> PolicyNetwork:
-    """Read a network from a checkpoint folder.
+    """Load a network from a checkpoint folder.
 
-    The weights stay in their file, from which the system reads what is used; the file may be replaced or
-    deleted, but not written into.
+    The weights are memory-mapped: the file may be replaced or deleted, but must not be modified in place.
 
     Args:
         folder: Holds `model.safetensors` and `config.yaml`.
 
     Returns:
-        The network, in evaluation mode and in the precision of the stored weights, or in float32 if that is
-        float16.
+        The network in evaluation mode, in the precision of the stored weights, or in float32 for float16.
 
     Raises:
-        CheckpointError: A file is missing or unreadable, or weights and sizes do not fit.
+        CheckpointError: A file is missing or unreadable, or weights and config do not match.
     """
     folder = Path(folder)
     restore_folder(folder)
@@ -136,16 +128,16 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     tensors = _read_weights(folder / WEIGHTS_FILE)
     network = outline_network(info.config)
     _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
-    dtype = _READ_AS.get(info.dtype, info.dtype)
+    dtype = _COMPUTE_DTYPES.get(info.dtype, info.dtype)
     network.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()}, assign=True)
-    return network.to(dtype).eval()  # constants, too
+    return network.to(dtype).eval()  # buffers, too
 
 
 def read_info(folder: Path) -> CheckpointInfo:
-    """Read the sizes of a checkpoint without its weights.
+    """Read the config of a checkpoint without its weights.
 
     Raises:
-        CheckpointError: The config is missing or makes no sense.
+        CheckpointError: The config is missing or invalid.
     """
     file = folder / CONFIG_FILE
     if not file.is_file():
@@ -165,44 +157,14 @@ def read_info(folder: Path) -> CheckpointInfo:
         raise CheckpointError(f"{file}: {error}") from error
 
 
-def load_pretrained(
-    path_or_hub_id: str | Path,
-    *,
-    tokenizer: Tokenizer | None = None,
-    **options: Any,  # Any: of several kinds
-) -> NetworkPolicy:
-    """Load a policy.
-
-    Args:
-        path_or_hub_id: A folder that `save_pretrained` or `openvima train` wrote (of a run the best
-            checkpoint is taken), a published `.ckpt` file, "openvima-small" for the policy of the package, or
-            an id on the Hugging Face Hub such as "owner/policy".
-        tokenizer: By default the one that is stored with the policy, or the closed vocabulary where the
-            policy was trained with that.
-        **options: Of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
-
-    Raises:
-        CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
-        PolicyError: The policy reads prompts with the tokenizer of T5, which is neither stored nor given.
-    """
-    network, stored = load_network(path_or_hub_id)
-    tokenizer = tokenizer or tokenizer_for(network.config.prompt, stored)
-    return NetworkPolicy(network, tokenizer=tokenizer, **options)
-
-
-def save_pretrained(policy: NetworkPolicy, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
-    """Write a policy into a folder, which `load_pretrained` reads; see `save_checkpoint`."""
-    save_checkpoint(policy.network, folder, policy.processor.tokenizer, dtype=dtype)
-
-
 def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None]:
-    """Read a network from anything that `load_pretrained` takes.
+    """Load a network from a path, the name of a bundled checkpoint or a Hub id; see `find_checkpoint`.
 
     Returns:
-        The network, and the folder of the tokenizer that is stored with it, if there is one.
+        The network, and the folder of its stored tokenizer, if there is one.
 
     Raises:
-        CheckpointError: There is no such folder, or it holds no checkpoint that can be read.
+        CheckpointError: There is no such folder, or it holds no readable checkpoint.
     """
     found = find_checkpoint(path_or_hub_id)
     if found.is_file():
@@ -215,7 +177,7 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
     """Copy weights into a network.
 
     Raises:
-        CheckpointError: Names, shapes or dtypes differ; one message tells all of them.
+        CheckpointError: Names, shapes or dtypes differ; one message lists all differences.
     """
     _check(model, tensors, None, source=source)
     model.load_state_dict(tensors)
@@ -224,17 +186,17 @@ def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, s
 def _check(
     network: PolicyNetwork, tensors: Mapping[str, torch.Tensor], dtype: torch.dtype | None, *, source: str
 ) -> None:
-    """Compare weights with what a network takes; by default in its own precision."""
+    """Compare names, shapes and dtypes with those of the network; `dtype` defaults to its own."""
     expected = network.state_dict()
-    problems = _other_size(tensors, expected)
-    problems += listed("missing", [name for name in expected if name not in tensors], most=_SHOWN)
-    problems += listed("unexpected", [name for name in tensors if name not in expected], most=_SHOWN)
+    problems = _size_mismatch(tensors, expected)
+    problems += listed("missing", [name for name in expected if name not in tensors], most=_MAX_LISTED)
+    problems += listed("unexpected", [name for name in tensors if name not in expected], most=_MAX_LISTED)
     differing = []
     for name, wanted in expected.items():
         want = (dtype or wanted.dtype, tuple(wanted.shape))
         if name in tensors and (have := (tensors[name].dtype, tuple(tensors[name].shape))) != want:
             differing.append(f"{name} is {described(*have)} instead of {described(*want)}")
-    problems += listed("wrong", differing, most=_SHOWN)
+    problems += listed("wrong", differing, most=_MAX_LISTED)
     if problems:
         raise CheckpointError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
@@ -243,20 +205,20 @@ def _check(
 
 
 def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch.Tensor]) -> None:
-    """Refuse weights that became infinite by being stored; those that were so before are not our business."""
-    beyond = [
+    """Reject weights that overflow to infinity when stored; infinities of the network itself pass."""
+    overflown = [
         name
         for name, tensor in stored.items()
         if bool((tensor.isinf() & ~weights[name].detach().cpu().isinf()).any())
     ]
-    if beyond:
-        dtype = stored[beyond[0]].dtype
+    if overflown:
+        dtype = stored[overflown[0]].dtype
         most = f"weights beyond {torch.finfo(dtype).max:.4g}, the most that {described(dtype)} holds"
-        raise CheckpointError(f"{listed(most, beyond, most=_SHOWN)[0]}. Store them in float32.")
+        raise CheckpointError(f"{listed(most, overflown, most=_MAX_LISTED)[0]}. Store them in float32.")
 
 
-def _other_size(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
-    """Say in words of the config how the sizes of two networks differ, as far as their weights show it."""
+def _size_mismatch(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
+    """Describe how width, layers and vocabulary of two networks differ."""
     given, wanted = _sizes(tensors), _sizes(expected)
     differing = [
         f"{what} {given[what]}, where the config says {wanted[what]}"
@@ -284,8 +246,8 @@ def _read_weights(file: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(f"{file} is damaged ({error}). Take another checkpoint of the run.") from error
 
 
-def _refuse_to_delete(folder: Path) -> None:
-    """Replacing a folder deletes what is in it; that must be a checkpoint and nothing else."""
+def _check_replaceable(folder: Path) -> None:
+    """Replacing a folder deletes its contents, which must be a checkpoint and nothing else."""
     if not folder.exists():
         return
     if not folder.is_dir():
@@ -293,6 +255,6 @@ def _refuse_to_delete(folder: Path) -> None:
     others = {path.name for path in folder.iterdir()} - {WEIGHTS_FILE, CONFIG_FILE, TOKENIZER_FOLDER}
     if others:
         raise CheckpointError(
-            f"{folder} holds other files than a checkpoint ({', '.join(sorted(others)[:_SHOWN])}), which "
-            "would be lost; give another folder."
+            f"{folder} holds other files than a checkpoint ({', '.join(sorted(others)[:_MAX_LISTED])}), "
+            "which would be lost; give another folder."
         )

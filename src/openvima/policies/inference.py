@@ -1,4 +1,4 @@
-"""A network as a policy: keeps what it has read of a batch of episodes and decides each step."""
+"""Inference: a network as a policy, with cached prompts and decoding states for a batch of episodes."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -12,7 +12,8 @@ import torch
 from openvima.errors import PolicyError
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
-from openvima.policies.base import Policy, prompt_number
+from openvima.policies.base import Policy, prompt_hash
+from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -21,26 +22,26 @@ from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 
-NEAR_TIE = 1e-4  # scores of two classes this near may change places by rounding in float32
+NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swap their order
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Episodes:
-    """The episodes of a batch that still run; all have made equally many steps.
+    """The running episodes of a batch; all have made the same number of steps.
 
     Args:
-        places: Where in the batch each one stands.
-        num_slots: Their numbers of slots for objects, see `Processor.encode_observations`.
-        generators: Generators of their draws.
-        prompt: Their encoded prompts.
-        state: Their decoding state.
-        actions_BC: Their last actions, metres and quaternions, float32; None before the first.
-        margins_B: How far the best class of their last action lay above the next, in its tightest choice;
-            None before the first.
+        indices: Index of each episode in the batch.
+        num_slots: Object slots of each episode, see `Processor.encode_observations`.
+        generators: One for each episode, to sample actions.
+        prompt: Encoded prompts.
+        state: Decoding state.
+        actions_BC: Last actions, metres and quaternions, float32; None before the first step.
+        margins_B: Smallest difference between the best and second-best logit over the components of the last
+            action; None before the first step.
         features: Features of the images of the last step, or of the prompts, by digest.
     """
 
-    places: tuple[int, ...]
+    indices: tuple[int, ...]
     num_slots: tuple[int, ...]
     generators: tuple[torch.Generator, ...]
     prompt: Any  # the model's own record
@@ -49,13 +50,13 @@ class _Episodes:
     margins_B: torch.Tensor | None
     features: Mapping[bytes, torch.Tensor]
 
-    def at(self, places: Sequence[int]) -> "_Episodes":
-        """Return those that stand at some places of the batch."""
-        rows = [self.places.index(place) for place in places]
-        if len(rows) == len(self.places):
+    def select(self, indices: Sequence[int]) -> "_Episodes":
+        """Return the episodes with these indices in the batch."""
+        rows = [self.indices.index(index) for index in indices]
+        if len(rows) == len(self.indices):
             return self
         return _Episodes(
-            tuple(places),
+            tuple(indices),
             tuple(self.num_slots[row] for row in rows),
             tuple(self.generators[row] for row in rows),
             self.prompt.select(rows),
@@ -67,29 +68,28 @@ class _Episodes:
 
 
 class NetworkPolicy(Policy):
-    """Plays several episodes at once; what the others do does not change an episode's actions.
+    """Runs a network on a batch of episodes; an episode's actions do not depend on the rest of the batch.
 
-    The prompt is encoded once, and keys and values of all that was read are kept, so that a step costs what
-    its own tokens cost. On a CPU it computes in float64 by default: the rounding of sums,
-    which varies with the shape of a batch, then stays far below the float32 in which actions are sent, and
-    the same episode gets the same actions in any batch. In float32 and bfloat16 that holds but for near ties.
-    Large networks are several times faster in float32 and bfloat16.
+    The prompt is encoded once and keys and values are cached, so a step costs only its own tokens. On a CPU
+    the default precision is float64: rounding, which varies with the batch shape, then stays far below the
+    float32 of the returned actions, and an episode gets the same actions in any batch. In float32 and
+    bfloat16 this holds except for near ties; large networks are several times faster there.
 
-    An error in `reset` or `act` leaves the policy as it was before the call.
+    An error in `reset` or `act` leaves the policy unchanged.
 
     Args:
-        network: The network; it is moved to the device and precision, and set to evaluation.
-        tokenizer: Splits the text of prompts; by default the closed vocabulary, for networks made for that.
-        extractor: Finds the objects in images; by default by the simulator's segmentation.
-        device: Where to compute, such as "cpu" or "cuda".
+        network: The network; it is moved to the device and precision, and set to evaluation mode.
+        tokenizer: Tokenizer of prompts; by default the closed vocabulary, for networks trained with it.
+        extractor: Extracts objects from images; by default from the simulator's segmentation.
+        device: Device, such as "cpu" or "cuda".
         dtype: Precision; by default float64 on a CPU and float32 elsewhere.
-        temperature: 0 takes the likeliest action. Above 0 actions are drawn, with scores divided by it.
-        generator: Needed to draw. Its seed and the prompt decide an episode's draws, so that they do not
-            depend on the other episodes; the generator itself is left as it is.
+        temperature: 0 for greedy decoding. Above 0 actions are sampled, with logits divided by it.
+        generator: Required for sampling. Each episode samples from a seed derived from the generator's and
+            the prompt, independent of other episodes; the generator itself does not change.
 
     Raises:
-        PolicyError: The temperature is negative, or above 0 without a generator; no tokenizer is given to a
-            network that reads prompts with that of T5; or there is no such device.
+        PolicyError: The temperature is negative, or above 0 without a generator; the network needs the T5
+            tokenizer and none is given; or the device is not available.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class NetworkPolicy(Policy):
     ) -> None:
         if temperature < 0 or (temperature > 0 and generator is None):
             raise PolicyError(
-                f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to draw with."
+                f"temperature is {temperature:g}; it must be 0, or above 0 with a generator to sample with."
             )
         tokenizer = tokenizer or tokenizer_for(network.config.prompt)
         self.processor = Processor.of(network.config.inputs, tokenizer, extractor)
@@ -113,8 +113,8 @@ class NetworkPolicy(Policy):
         self.dtype = dtype or (torch.float64 if self.device.type == "cpu" else torch.float32)
         self.network = network.to(self.device, self.dtype).eval()
         if self.device.type == "cpu":
-            # Crops are convolved with their channels together; kernels in another order would be copied at
-            # every call, a third of what a few crops cost.
+            # Crops are in channels_last; kernels in another memory format would be copied at every call, a
+            # third of the cost of a few crops.
             self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._temperature = temperature
         self._seed = generator.initial_seed() if generator else 0
@@ -123,10 +123,10 @@ class NetworkPolicy(Policy):
 
     @torch.inference_mode()
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
-        """Begin a batch of episodes.
+        """Start a batch of episodes.
 
         Raises:
-            PolicyError: There is no prompt, or one is too long.
+            PolicyError: The batch is empty, or a prompt is too long.
             PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
@@ -135,9 +135,9 @@ class NetworkPolicy(Policy):
         batch, stack = self.processor.encode_prompts(prompts)
         features_KF, features = self._encode(stack, {})
         prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
-        seeds = [(self._seed ^ prompt_number(prompt)) & (2**63 - 1) for prompt in prompts]
+        seeds = [(self._seed ^ prompt_hash(prompt)) & (2**63 - 1) for prompt in prompts]
         self._episodes = _Episodes(
-            places=tuple(range(len(prompts))),
+            indices=tuple(range(len(prompts))),
             num_slots=(0,) * len(prompts),
             generators=tuple(torch.Generator().manual_seed(seed) for seed in seeds),
             prompt=prompt,
@@ -153,14 +153,14 @@ class NetworkPolicy(Policy):
         """Decide the next action of every episode.
 
         Args:
-            observations: One for each prompt; None for an episode that has ended, from then on.
+            observations: One for each prompt; None from the end of its episode on.
 
         Returns:
             An action for each observation, float32 arrays within the bounds; None for None.
 
         Raises:
-            PolicyError: `reset` was not called, or with another number of prompts; an episode goes on after
-                its end; no object is in view; or a history is too long.
+            PolicyError: `reset` was not called, or with another number of prompts; an observation follows the
+                end of its episode; no object is visible; or a history is too long.
             ShapeError: An image has another shape or dtype.
         """
         if self._episodes is None:
@@ -170,67 +170,76 @@ class NetworkPolicy(Policy):
                 f"got {len(observations)} observations for {self._num_prompts} prompts; give one for each, "
                 "and None for episodes that have ended."
             )
-        seen = {
-            place: observation for place, observation in enumerate(observations) if observation is not None
-        }
-        ended = sorted(seen.keys() - self._episodes.places)
+        running = {index: each for index, each in enumerate(observations) if each is not None}
+        ended = sorted(running.keys() - self._episodes.indices)
         if ended:
             raise PolicyError(
-                f"episode {', '.join(map(str, ended))} ended with a None before; call reset to begin anew."
+                f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
             )
-        episodes = self._episodes.at(list(seen))
+        episodes = self._episodes.select(list(running))
         actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
-        if seen:
-            episodes = self._decide(episodes, list(seen.values()))
+        if running:
+            episodes = self._step(episodes, list(running.values()))
             assert episodes.actions_BC is not None
             arrays_BC = episodes.actions_BC.cpu().numpy()
-            for place, array_C in zip(seen, arrays_BC, strict=True):
-                actions[place] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
+            for index, array_C in zip(running, arrays_BC, strict=True):
+                actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
         self._episodes = episodes
         return actions
 
     def new_session(self) -> "NetworkPolicy":
-        """Return a policy that shares the network with this one and has episodes of its own."""
+        """Return a policy that shares the network and has its own episodes."""
         other = copy(self)
         other._num_prompts, other._episodes = 0, None  # never changed in place, so nothing else is shared
         return other
 
     @property
     def near_ties(self) -> list[bool]:
-        """For each episode whether rounding may have chosen its last action; False where it has ended.
+        """Whether rounding may have decided each episode's last action; False for ended episodes.
 
-        It may where two classes scored within `NEAR_TIE` of each other.
+        That is the case if the two best logits of a component differ by less than `NEAR_TIE`.
         """
         near = [False] * self._num_prompts
         if self._episodes is not None and self._episodes.margins_B is not None:
             margins = self._episodes.margins_B.tolist()
-            for place, margin in zip(self._episodes.places, margins, strict=True):
-                near[place] = margin < NEAR_TIE
+            for index, margin in zip(self._episodes.indices, margins, strict=True):
+                near[index] = margin < NEAR_TIE
         return near
 
     @staticmethod
     def from_pretrained(
         path_or_hub_id: str | Path,
+        *,
+        tokenizer: Tokenizer | None = None,
         **options: Any,  # Any: of several kinds
     ) -> "NetworkPolicy":
-        """Load a policy from a folder or from the Hugging Face Hub; see `load_pretrained`."""
-        from openvima.policies.checkpoint import load_pretrained
-
-        return load_pretrained(path_or_hub_id, **options)
-
-    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
-        """Write the policy into a folder; see `openvima.policies.checkpoint.save_checkpoint`.
+        """Load a policy from a folder, a file or the Hugging Face Hub.
 
         Args:
-            folder: Where to; a checkpoint that is there is replaced.
-            dtype: Precision of the stored weights, whatever the policy computes in.
+            path_or_hub_id: A checkpoint folder; a run folder, of which the best checkpoint is loaded; a
+                published `.ckpt` file; the name of a bundled checkpoint; or a Hub id such as "owner/policy".
+            tokenizer: By default the one stored with the policy, or the closed vocabulary.
+            **options: Options of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
+
+        Raises:
+            CheckpointError: There is no such folder, or it holds no readable checkpoint.
+            PolicyError: The policy needs the T5 tokenizer, which is neither stored nor given.
         """
-        from openvima.policies.checkpoint import save_pretrained
+        network, stored = load_network(path_or_hub_id)
+        tokenizer = tokenizer or tokenizer_for(network.config.prompt, stored)
+        return NetworkPolicy(network, tokenizer=tokenizer, **options)
 
-        save_pretrained(self, folder, dtype=dtype)
+    def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
+        """Write a checkpoint folder; see `openvima.policies.checkpoint.save_checkpoint`.
 
-    def _decide(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
-        """Make one step of all episodes."""
+        Args:
+            folder: The folder; an existing checkpoint is replaced.
+            dtype: Precision of the stored weights, independent of the policy's own.
+        """
+        save_checkpoint(self.network, folder, self.processor.tokenizer, dtype=dtype)
+
+    def _step(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
+        """Decode one action for every running episode."""
         batch, stack = self.processor.encode_observations(
             [[observation] for observation in observations], episodes.num_slots
         )
@@ -255,31 +264,31 @@ class NetworkPolicy(Policy):
             episodes,
             num_slots=tuple(batch.num_slots_BT[:, 0].tolist()),
             state=state,
-            actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as they are sent
+            actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
             margins_B=torch.stack(margins).amin(0) if margins else None,
             features=features,
         )
 
     def _encode(
-        self, stack: ImageStack, known: Mapping[bytes, torch.Tensor]
+        self, stack: ImageStack, cached: Mapping[bytes, torch.Tensor]
     ) -> tuple[torch.Tensor, dict[bytes, torch.Tensor]]:
-        """Encode the images that are new; most objects look as they did a step ago.
+        """Encode new images only; most crops are unchanged since the last step.
 
         Returns:
-            Features of all images, and by digest.
+            Features of all images, and the same by digest.
         """
         images, keys = stack.images(), stack.digests()
-        new = [number for number, key in enumerate(keys) if key not in known]
+        new = [number for number, key in enumerate(keys) if key not in cached]
         encoded = self.network.encode_images(torch.from_numpy(images[new]).to(self.device))
         if len(new) == len(keys):
             return encoded, dict(zip(keys, encoded, strict=True))
-        by_key = {**known, **dict(zip((keys[number] for number in new), encoded, strict=True))}
+        by_key = {**cached, **dict(zip((keys[number] for number in new), encoded, strict=True))}
         features = torch.stack([by_key[key] for key in keys])
         return features, dict(zip(keys, features, strict=True))
 
 
 def _recording_margins(strategy: DecodingStrategy, margins: list[torch.Tensor]) -> DecodingStrategy:
-    """Decode likewise, and record by how much the best class of each row leads, shape (B,)."""
+    """Wrap a strategy to record the difference of the two best logits of each row, shape (B,)."""
 
     def recorded(logits: torch.Tensor) -> torch.Tensor:
         if logits.shape[-1] > 1:

@@ -17,7 +17,7 @@ from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import PolicySource
 from openvima.multiprocess import imap_unordered
-from openvima.policies.bundled import PACKAGED
+from openvima.policies.bundled import BUNDLED
 from openvima.report.page import default_command, write_report
 from openvima.video.clips import Clip, load_clips, png, save_clips
 
@@ -219,7 +219,7 @@ def record_clip(job: RecordingJob, count: Callable[[int], None]) -> Clip:
 def find_metrics(sources: Sequence[PolicySource]) -> Path | None:
     """The training record of the first trained policy that has one."""
     for source in sources:
-        if source.source in PACKAGED:  # a name, not a path
+        if source.source in BUNDLED:  # a name, not a path
             continue
         folder = Path(source.source)
         for candidate in (folder / _METRICS, folder.parent / _METRICS, folder.parent.parent / _METRICS):

@@ -6,7 +6,6 @@ from pathlib import Path
 import torch
 
 from openvima.errors import ConfigError
-from openvima.policies.base import find_checkpoint
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
 from openvima.policies.config import (
@@ -19,6 +18,7 @@ from openvima.policies.config import (
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
+from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig

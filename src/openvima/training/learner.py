@@ -13,10 +13,10 @@ from torch import nn
 
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
-from openvima.policies.base import WEIGHTS_FILE
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
+from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation

@@ -24,7 +24,7 @@ from safetensors.torch import save_file
 
 from openvima.atomic_io import atomic_write_file
 from openvima.errors import CheckpointError, ConfigError
-from openvima.policies.base import BEST_FILE, CHECKPOINTS_FOLDER
+from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
 from openvima.training.learner import Learner, read_tensors
 from openvima.training.tensorboard import BOARD_FOLDER
 from openvima.training.validation import flattened

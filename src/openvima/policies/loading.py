@@ -1,0 +1,53 @@
+"""Loading policies by name, from a folder or from the Hugging Face Hub."""
+
+from pathlib import Path
+from typing import Any
+
+from openvima.errors import PolicyError, UnknownPolicyError
+from openvima.policies.base import Policy, RandomPolicy, require_torch
+from openvima.policies.presets import PRESETS
+from openvima.policies.sources import is_policy_source, unknown_policy
+
+
+def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  # Any: of several kinds
+    """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
+
+    Args:
+        name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; "openvima-small", the
+            bundled checkpoint; a run folder of `openvima train`, of which the best checkpoint is loaded; a
+            checkpoint folder; a published `.ckpt` file; or a Hub id such as "owner/policy".
+        seed: Seed of the random policy and of fresh weights.
+        **options: Options of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy
+            ignores them.
+
+    Returns:
+        The policy, ready for `reset`.
+
+    Raises:
+        UnknownPolicyError: It is neither a known name, nor a path, nor a possible Hub id.
+        CheckpointError: The folder or file holds no readable checkpoint, or the download failed.
+        PolicyError: The policy needs the T5 tokenizer, which is neither stored nor given; or a local folder
+            has the name of a preset, or holds a checkpoint and has the name of a bundled one.
+        MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
+    """
+    if name_or_run == "random":
+        return RandomPolicy(seed)
+    if name_or_run == "untrained" or name_or_run in PRESETS:
+        if Path(name_or_run).is_dir():
+            raise PolicyError(
+                f"{name_or_run!r} is a preset, with fresh weights, and a folder here; write ./{name_or_run} "
+                "for the folder, or work elsewhere for the preset."
+            )
+        require_torch(f"policy {name_or_run!r}")
+        from openvima.policies.build import build_network
+        from openvima.policies.inference import NetworkPolicy
+        from openvima.policies.presets import preset
+
+        config = preset("nano" if name_or_run == "untrained" else name_or_run)
+        return NetworkPolicy(build_network(config, seed=seed), **options)
+    if not is_policy_source(name_or_run):
+        raise UnknownPolicyError(unknown_policy(name_or_run, ("random", "untrained")))
+    require_torch(f"the policy in {name_or_run}")
+    from openvima.policies.inference import NetworkPolicy
+
+    return NetworkPolicy.from_pretrained(name_or_run, **options)

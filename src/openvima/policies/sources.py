@@ -1,0 +1,79 @@
+"""Where checkpoints come from: local folders and files, bundled checkpoints, the Hugging Face Hub."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from openvima.atomic_io import restore_folder
+from openvima.errors import CheckpointError, unknown_name
+from openvima.policies.bundled import BUNDLED, bundled_folder
+from openvima.policies.file_names import (
+    BEST_FILE,
+    CHECKPOINTS_FOLDER,
+    CONFIG_FILE,
+    TOKENIZER_FOLDER,
+    WEIGHTS_FILE,
+)
+from openvima.policies.hub import fetch_from_hub, is_hub_id
+from openvima.policies.presets import PRESETS
+
+
+def is_policy_source(text: str) -> bool:
+    """Whether a text names a bundled checkpoint, an existing path or a repository on the Hub."""
+    return text in BUNDLED or Path(text).exists() or is_hub_id(text)
+
+
+def unknown_policy(name: str, others: Sequence[str]) -> str:
+    """Compose the message for an unknown policy.
+
+    Args:
+        name: The name as given.
+        others: Allowed names besides bundled checkpoints and presets.
+    """
+    named = (*others, *BUNDLED)
+    hint = (
+        f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
+        "run, a published .ckpt file, or an id owner/name on the Hugging Face Hub."
+    )
+    return unknown_name("policy", name, (*named, *PRESETS), hint)
+
+
+def find_checkpoint(path_or_hub_id: str | Path) -> Path:
+    """Resolve a path, a name or a Hub id to a checkpoint folder or a published file.
+
+    Args:
+        path_or_hub_id: A run folder, a checkpoint folder, a file, the name of a bundled checkpoint (as text;
+            a `Path` is always a local path), or a Hub id such as "owner/policy", which is downloaded.
+
+    Raises:
+        CheckpointError: There is no such path, the installation lacks the weights, or the download failed.
+        PolicyError: A local folder has the name of a bundled checkpoint and holds a checkpoint, too.
+        MissingExtraError: The Hub's client is needed and not installed.
+    """
+    if isinstance(path_or_hub_id, str) and path_or_hub_id in BUNDLED:
+        return bundled_folder(path_or_hub_id)
+    path, name = Path(path_or_hub_id), str(path_or_hub_id)
+    restore_folder(path)
+    if path.is_dir():
+        return checkpoint_folder(path)
+    if path.exists():
+        return path
+    if is_hub_id(name):
+        return fetch_from_hub(name, (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*"))
+    raise CheckpointError(
+        f"there is no checkpoint at {name}; give a folder, a .ckpt file, an id owner/name or "
+        f"{', '.join(BUNDLED)}."
+    )
+
+
+def checkpoint_folder(folder: Path) -> Path:
+    """Return the folder itself, or the best, else the latest, checkpoint of a run folder."""
+    checkpoints = folder / CHECKPOINTS_FOLDER
+    if not checkpoints.is_dir():
+        return folder
+    best = checkpoints / BEST_FILE
+    if best.is_file():
+        named = checkpoints / best.read_text(encoding="utf-8").strip()
+        if named.is_dir():
+            return named
+    found = sorted(path for path in checkpoints.iterdir() if path.is_dir() and not path.suffix)
+    return found[-1] if found else folder
