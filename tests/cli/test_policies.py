@@ -52,7 +52,7 @@ def test_the_list_can_be_read_by_machines(capsys) -> None:
     records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}
     assert list(records)[: len(PRESETS)] == list(PRESETS)
     record = records["gato-200m"]
-    assert (record["family"], record["width"], record["layers"], record["heads"]) == ("gato", 768, 22, 24)
+    assert (record["architecture"], record["width"], record["layers"], record["heads"]) == ("gato", 768, 22, 24)
     total = record["parameters"].pop("total")
     for kind in ("trainable", "frozen"):
         assert sum(count[kind] for count in record["parameters"].values()) == total[kind] > 0
@@ -62,7 +62,7 @@ def test_a_preset_is_shown_with_all_of_its_sizes(capsys) -> None:
     assert main(["policies", "show", "gpt-nano"]) == 0
     shown = capsys.readouterr().out
     assert "gpt, width 128, 4 layers, 4 heads; 3.50 M parameters, of which 3.50 M are trained" in shown
-    assert "3,497,792" in shown and "readout: class" in shown
+    assert "3,497,792" in shown and "architecture: gpt" in shown
 
 
 def test_a_checkpoint_and_a_published_file_are_shown_by_their_path(published, tmp_path, capsys) -> None:
@@ -70,7 +70,7 @@ def test_a_checkpoint_and_a_published_file_are_shown_by_their_path(published, tm
     for path in (tmp_path / "saved", published):
         assert main(["policies", "show", str(path), "--json"]) == 0
         record = json.loads(capsys.readouterr().out)
-        assert (record["width"], record["config"]["trunk"]["num_layers"]) == (32, 1)
+        assert (record["width"], record["config"]["decoder"]["num_layers"]) == (32, 1)
 
 
 def test_a_published_file_becomes_a_policy(published, tmp_path, capsys) -> None:

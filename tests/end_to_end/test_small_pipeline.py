@@ -24,7 +24,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
     """Name of a preset of a narrow network."""
 
     def sizes():
-        nano = presets.nano()
+        nano = presets.preset("nano")
         return replace(nano, images=replace(nano.images, crop=ConvConfig(width=4, output_width=16)))
 
     monkeypatch.setitem(presets.PRESETS, "tiny", sizes)
