@@ -52,7 +52,8 @@ def test_the_list_can_be_read_by_machines(capsys) -> None:
     records = {record["name"]: record for record in json.loads(capsys.readouterr().out)}
     assert list(records)[: len(PRESETS)] == list(PRESETS)
     record = records["gato-200m"]
-    assert (record["architecture"], record["width"], record["layers"], record["heads"]) == ("gato", 768, 22, 24)
+    keys = ("architecture", "width", "layers", "heads")
+    assert tuple(record[key] for key in keys) == ("gato", 768, 22, 24)
     total = record["parameters"].pop("total")
     for kind in ("trainable", "frozen"):
         assert sum(count[kind] for count in record["parameters"].values()) == total[kind] > 0
