@@ -66,7 +66,6 @@ UNCOVERED = (
     "benchmarks/policy.py",
     "docs/images/",
     "docs/openvima_small.md",
-    "docs/training.md",
     "examples/custom_learner.py",
     "experiments/",
 )
