@@ -1,12 +1,12 @@
-"""How well a crop encoder matches looks and tells turns, on scenes that it has not seen.
+"""Retrieval and rotation accuracy of a crop encoder on unseen scenes.
 
     python benchmarks/crops.py --policy RUN [--scenes N] [--json FILE]
 
-Looks: the share of prompt images, and of objects in the same scene laid again, whose object is the most
-similar one of its scene. Turns: the share of objects laid again whose likeliest turn is right within 15
-degrees; by chance 10 %. Scenes of training are drawn with other seeds. Scenes of one shape hold it in three
-textures of all light ones, turned at random, flat on the table, as in `twist`; letter R is in
-no training partition.
+Retrieval: fraction of prompt images, and of objects in a rearranged view of the scene, whose nearest object
+of the scene is right. Rotation: fraction of objects whose rotation between the two views is estimated within
+15 degrees; 10 % at random. Training scenes are sampled with other seeds. Scenes of one shape contain it in
+three textures of all light ones, rotated at random, flat on the table, as in `twist`; letter R is in no
+training partition.
 """
 
 import argparse
@@ -24,44 +24,43 @@ from openvima.catalog.partitions import TEXTURE_SETS, tasks_at
 from openvima.policies.checkpoint import load_network
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Placement, Pose, Scene
-from openvima.training.pretrain import (
+from openvima.training.augmentation.rearranged_view import rearranged
+from openvima.training.pretraining.contrastive import retrieval_accuracy
+from openvima.training.pretraining.pairs import (
     Pairs,
-    Variety,
-    pairs_again,
+    SceneAugmentation,
     pairs_of_scene,
     render_pairs,
-    scene_accuracy,
     stacked,
 )
-from openvima.training.scene_variants import laid_again
-from openvima.training.turning import turn_accuracy
+from openvima.training.pretraining.rotation import rotation_accuracy
 from sim import circumstances
 
 SEED = 7_000_000  # no run is likely to have it
 SHAPES = ("letter A", "letter G", "heart", "letter R")  # the last is novel
-PLACES_Y = (-0.25, 0.0, 0.25)  # m
-VARIETIES = {
-    "training partition": Variety(again=True),
-    "with twins": Variety(twins=0.5, again=True),
-    "with random looks and twins": Variety(random_looks=0.5, twins=0.5, again=True),
+POSITIONS_Y = (-0.25, 0.0, 0.25)  # m
+AUGMENTATIONS = {
+    "training partition": SceneAugmentation(second_view=True),
+    "with hard negatives": SceneAugmentation(hard_negative_prob=0.5, second_view=True),
+    "with random appearance as well": SceneAugmentation(0.5, 0.5, second_view=True),
 }
 
 
 def scenes_of(shape: str, num_scenes: int) -> Pairs:
-    """Draw scenes of one shape, each laid twice."""
+    """Render scenes of one shape, each with a rearranged view."""
     rng = np.random.default_rng([SEED, *shape.encode()])
     rasteriser = Rasteriser(load_assets("procedural"))
     rows: list[tuple] = []
-    looks: dict[tuple, int] = {}
+    indices: dict[tuple, int] = {}
     for number in range(num_scenes):
-        textures = rng.choice(TEXTURE_SETS["T"], size=len(PLACES_Y), replace=False)
+        textures = rng.choice(TEXTURE_SETS["T"], size=len(POSITIONS_Y), replace=False)
         scene = Scene(
             tuple(
                 Placement(5 + k, shape, str(textures[k]), (0.0, 0.0, 0.0), _lying(y, rng))
-                for k, y in enumerate(PLACES_Y)
+                for k, y in enumerate(POSITIONS_Y)
             )
         )
-        rows += pairs_of_scene(scene, {}, rasteriser, looks, number, laid_again(scene, rng))
+        rows += pairs_of_scene(scene, {}, rasteriser, indices, number, rearranged(scene, rng))
     return stacked(rows)
 
 
@@ -71,12 +70,14 @@ def _lying(y: float, rng: np.random.Generator) -> Pose:
 
 
 def all_pairs(num_scenes: int) -> Iterator[tuple[str, Pairs]]:
-    """Draw what is looked at, under the names of the table."""
-    for name, variety in VARIETIES.items():
+    """Render all kinds of scenes, by their names in the table."""
+    for name, augmentation in AUGMENTATIONS.items():
         tasks = tasks_at("train")
         yield (
             name,
-            render_pairs(tasks, num_scenes=num_scenes, seed=SEED, assets="procedural", variety=variety),
+            render_pairs(
+                tasks, num_scenes=num_scenes, seed=SEED, assets="procedural", augmentation=augmentation
+            ),
         )
     for shape in SHAPES:
         yield shape, scenes_of(shape, num_scenes)
@@ -96,19 +97,17 @@ def main() -> None:
     if encoder is None or not encoder.config.appearance_width:
         parser.error(f"{arguments.policy} has no appearance embedding.")
     results: dict[str, dict[str, float]] = {}
-    print(f"{'scenes':<30}{'objects':>9}{'prompt':>9}{'again':>9}{'turn':>9}")
+    keys = ("prompt", "second_view", "rotation")
+    print(f"{'scenes':<31}{'objects':>9}" + "".join(f"{key:>13}" for key in keys))
     for name, pairs in all_pairs(arguments.scenes):
-        assert pairs.again is not None
         results[name] = {
-            "objects": len(pairs.looks),
-            "prompt": scene_accuracy(encoder, pairs),
-            "again": scene_accuracy(encoder, pairs_again(pairs, pairs.again)),
-            **({"turn": turn_accuracy(encoder, pairs)} if encoder.config.rotation_bins else {}),
+            "objects": len(pairs.scenes),
+            "prompt": retrieval_accuracy(encoder, pairs),
+            "second_view": retrieval_accuracy(encoder, pairs.second_view_pairs()),
+            **({"rotation": rotation_accuracy(encoder, pairs)} if encoder.config.rotation_bins else {}),
         }
-        shares = "".join(
-            f"{results[name].get(key, float('nan')):>9.1%}" for key in ("prompt", "again", "turn")
-        )
-        print(f"{name:<30}{len(pairs.looks):>9}{shares}", flush=True)
+        accuracies = "".join(f"{results[name].get(key, float('nan')):>13.1%}" for key in keys)
+        print(f"{name:<31}{len(pairs.scenes):>9}{accuracies}", flush=True)
     if arguments.json:
         arguments.json.write_text(json.dumps({**circumstances(), "results": results}, indent=2) + "\n")
 

@@ -1,58 +1,68 @@
-"""Gaps that are painted over crops before looks are matched."""
+"""Occlusion of the crops of contrastive pretraining."""
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.training.augmentation.occlusion import with_gaps  # noqa: E402
-from openvima.training.pretrain import PLAIN, Variety, render_pairs  # noqa: E402
+from openvima.training.augmentation.occlusion import with_occlusion  # noqa: E402
+from openvima.training.pretraining.pairs import NO_AUGMENTATION, SceneAugmentation, render_pairs  # noqa: E402
 from openvima.training.schedule import step_generator  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def pairs():
-    variety = Variety(twins=0.3, again=True)
-    return render_pairs(("visual_manipulation",), num_scenes=16, seed=0, assets="procedural", variety=variety)
+    augmentation = SceneAugmentation(hard_negative_prob=0.3, second_view=True)
+    return render_pairs(
+        ("visual_manipulation",), num_scenes=16, seed=0, assets="procedural", augmentation=augmentation
+    )
 
 
-def test_the_ground_shows_through_gaps_and_the_rest_stays(pairs):
-    gaps = with_gaps(pairs, 1.0, step_generator(0, "gaps", 0))
-    for before, after, ground in (
-        (pairs.prompt_crops, gaps.prompt_crops, 255),
-        (pairs.scene_crops, gaps.scene_crops, 51),
-        (pairs.again.crops, gaps.again.crops, 51),
+def test_bars_have_the_colour_of_the_background_and_the_rest_stays(pairs):
+    occluded = with_occlusion(pairs, 1.0, step_generator(0, "gaps", 0))
+    for before, after, background in (
+        (pairs.prompt_crops, occluded.prompt_crops, 255),
+        (pairs.scene_crops, occluded.scene_crops, 51),
+        (pairs.second_view.crops, occluded.second_view.crops, 51),
     ):
         changed = after != before
-        assert (after[changed] == ground).all()
-        share = (after == ground).all(2).float().mean((1, 2, 3))
-        assert (share > 0.05).all()
+        assert (after[changed] == background).all()
+        fraction = (after == background).all(2).float().mean((1, 2, 3))
+        assert (fraction > 0.05).all()
         assert changed.float().mean() < 0.6
         border = torch.stack([changed[..., [0, -1], :].any(), changed[..., :, [0, -1]].any()])
         assert not border.any()
 
 
-def test_gaps_come_to_some_objects_and_then_in_all_of_their_images(pairs):
-    gaps = with_gaps(pairs, 0.4, step_generator(0, "gaps", 1))
+def test_some_objects_are_occluded_in_all_of_their_images(pairs):
+    occluded = with_occlusion(pairs, 0.4, step_generator(0, "gaps", 1))
     touched = [
         (after != before).flatten(1).any(1)
-        for before, after in ((pairs.prompt_crops, gaps.prompt_crops), (pairs.scene_crops, gaps.scene_crops))
+        for before, after in (
+            (pairs.prompt_crops, occluded.prompt_crops),
+            (pairs.scene_crops, occluded.scene_crops),
+        )
     ]
-    has_gaps = touched[0] | touched[1]
-    assert 0.2 < has_gaps.float().mean() < 0.6
-    assert gaps.again.turns[has_gaps].isnan().all()
-    assert torch.equal(gaps.again.turns[~has_gaps].nan_to_num(), pairs.again.turns[~has_gaps].nan_to_num())
+    is_occluded = touched[0] | touched[1]
+    assert 0.2 < is_occluded.float().mean() < 0.6
+    assert occluded.second_view.rotations[is_occluded].isnan().all()
+    assert torch.equal(
+        occluded.second_view.rotations[~is_occluded].nan_to_num(),
+        pairs.second_view.rotations[~is_occluded].nan_to_num(),
+    )
 
 
-def test_a_share_of_zero_changes_nothing_and_a_seed_draws_the_same_gaps(pairs):
-    none = with_gaps(pairs, 0.0, step_generator(0, "gaps", 0))
+def test_probability_zero_changes_nothing_and_equal_seeds_occlude_equally(pairs):
+    none = with_occlusion(pairs, 0.0, step_generator(0, "gaps", 0))
     assert torch.equal(none.prompt_crops, pairs.prompt_crops.float())
-    assert torch.equal(none.again.turns.nan_to_num(), pairs.again.turns.nan_to_num())
-    same = [with_gaps(pairs, 0.5, step_generator(0, "gaps", 2)).scene_crops for _ in range(2)]
+    assert torch.equal(none.second_view.rotations.nan_to_num(), pairs.second_view.rotations.nan_to_num())
+    same = [with_occlusion(pairs, 0.5, step_generator(0, "gaps", 2)).scene_crops for _ in range(2)]
     assert torch.equal(*same)
 
 
-def test_scenes_that_are_laid_once_get_gaps_as_well():
-    once = render_pairs(("visual_manipulation",), num_scenes=2, seed=0, assets="procedural", variety=PLAIN)
-    gaps = with_gaps(once, 1.0, step_generator(0, "gaps", 0))
-    assert gaps.again is None
-    assert not torch.equal(gaps.scene_crops, once.scene_crops.float())
+def test_pairs_without_second_view_are_occluded_as_well():
+    once = render_pairs(
+        ("visual_manipulation",), num_scenes=2, seed=0, assets="procedural", augmentation=NO_AUGMENTATION
+    )
+    occluded = with_occlusion(once, 1.0, step_generator(0, "gaps", 0))
+    assert occluded.second_view is None
+    assert not torch.equal(occluded.scene_crops, once.scene_crops.float())

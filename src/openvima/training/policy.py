@@ -16,7 +16,7 @@ from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
-from openvima.training.pretrain import Variety, render_pairs
+from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
@@ -102,11 +102,11 @@ class _Stages:
             num_scenes=config.num_scenes,
             seed=self.config.seed,
             assets=self.config.assets,
-            variety=Variety(
+            augmentation=SceneAugmentation(
                 config.appearance_randomization_prob,
                 config.hard_negative_prob,
-                again=compares_rotations(network) or config.hard_negative_prob > 0,
-                grays=config.grayscale_prob,
+                second_view=compares_rotations(network) or config.hard_negative_prob > 0,
+                grayscale_prob=config.grayscale_prob,
             ),
             report=self._say,
         )

@@ -76,7 +76,7 @@ class RunFolder:
         settings: Plain values that decide the run.
         force: Throw away what is there if it belongs to other settings.
         keep_every: Steps between checkpoints that are never deleted; None keeps the latest and the best only.
-        is_first: Whether this process looks after the folder; others only read.
+        is_first: Whether this process writes the folder; others only read.
 
     Raises:
         ConfigError: The folder belongs to a run with other settings.

@@ -3,15 +3,18 @@
 import torch
 
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.training.augmentation.occlusion import with_gaps
+from openvima.training.augmentation.box_jitter import with_box_jitter
+from openvima.training.augmentation.horizontal_flip import with_horizontal_flips
+from openvima.training.augmentation.occlusion import with_occlusion
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import Metrics
-from openvima.training.pretrain import Pairs, matching_loss, pairs_again, scene_accuracy
+from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy
+from openvima.training.pretraining.pairs import Pairs
+from openvima.training.pretraining.rotation import rotation_accuracy
 from openvima.training.schedule import step_generator
-from openvima.training.turning import joint_loss, mirrored, shifted, turn_accuracy
 
 _VALIDATION_SCENES = 0.05  # the last ones
-_PURPOSE = "1-matching"  # hashed into the seed of every batch; another word would change all runs
+_PURPOSE = "1-matching"  # hashed into the seed of every batch; changing it would change all runs
 
 
 class ContrastivePretraining:
@@ -42,15 +45,16 @@ class ContrastivePretraining:
         """Draw a batch of pairs and add its gradients."""
         config = self._config
         generator = step_generator(self._seed, _PURPOSE, step)
-        batch = self._training.select(self._rows(generator).to(self._training.looks.device))
+        batch = self._training.select(self._rows(generator).to(self._training.scenes.device))
         if self.encoder.config.rotation_bins:
-            batch = mirrored(batch, generator)
+            batch = with_horizontal_flips(batch, generator)
         if config.occlusion_prob:
-            batch = with_gaps(batch, config.occlusion_prob, generator)
+            batch = with_occlusion(batch, config.occlusion_prob, generator)
         if config.box_jitter_px:
-            batch = shifted(batch, config.box_jitter_px, generator)
-        loss_of = matching_loss if batch.again is None else joint_loss
-        loss, metrics = loss_of(self.encoder, batch, temperature=config.temperature, generator=generator)
+            batch = with_box_jitter(batch, config.box_jitter_px, generator)
+        loss, metrics = contrastive_loss(
+            self.encoder, batch, temperature=config.temperature, generator=generator
+        )
         loss.backward()
         return {"loss": loss.item(), **{name: value.item() for name, value in metrics.items()}}
 
@@ -61,11 +65,11 @@ class ContrastivePretraining:
         have one.
         """
         pairs = self._validation
-        metrics = {"retrieval_accuracy": scene_accuracy(self.encoder, pairs)}
-        if pairs.again:
-            metrics["second_view_accuracy"] = scene_accuracy(self.encoder, pairs_again(pairs, pairs.again))
+        metrics = {"retrieval_accuracy": retrieval_accuracy(self.encoder, pairs)}
+        if pairs.second_view:
+            metrics["second_view_accuracy"] = retrieval_accuracy(self.encoder, pairs.second_view_pairs())
         if self.encoder.config.rotation_bins:
-            metrics["rotation_accuracy"] = turn_accuracy(self.encoder, pairs)
+            metrics["rotation_accuracy"] = rotation_accuracy(self.encoder, pairs)
         return metrics
 
     def _rows(self, generator: torch.Generator) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Rendered pairs: where they come from and what colours do to them."""
+"""Pairs of contrastive pretraining: where they come from, channel mixing, and the loss."""
 
 import pytest
 
@@ -7,22 +7,25 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.partitions import pool  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
-from openvima.training import pretrain  # noqa: E402
+from openvima.training.augmentation.channel_mixing import channel_mixing  # noqa: E402
+from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
+from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy  # noqa: E402
+from openvima.training.pretraining.pairs import render_pairs  # noqa: E402
 from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
 
 
-def test_pairs_show_training_objects_in_textures_of_their_role_only(monkeypatch):
+def test_pairs_contain_training_objects_in_textures_of_their_role_only(monkeypatch):
     shown = []
-    original = pretrain._prompt_image
+    original = pairs_module._prompt_image
 
     def spy(placement, *rest):
         shown.append((placement.object, placement.texture, placement.fixed))
         return original(placement, *rest)
 
-    monkeypatch.setattr(pretrain, "_prompt_image", spy)
-    pairs = pretrain.render_pairs(TASKS, num_scenes=30, seed=0, assets="procedural")
+    monkeypatch.setattr(pairs_module, "_prompt_image", spy)
+    pairs = render_pairs(TASKS, num_scenes=30, seed=0, assets="procedural")
     pools = [pool(task, "train") for task in TASKS]
     objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
     objects |= {name for entry in pools for name in getattr(entry, "constraint_objects", ())} | {"line"}
@@ -32,14 +35,14 @@ def test_pairs_show_training_objects_in_textures_of_their_role_only(monkeypatch)
         for fixed, names in ((False, entry.dragged_textures), (True, entry.base_textures))
         for name in names
     }
-    assert len(pairs.looks) == len(shown)
+    assert len(pairs.appearances) == len(shown)
     assert {name for name, _, _ in shown} <= objects
     assert {(texture, fixed) for _, texture, fixed in shown} <= textures
 
 
 def test_pairs_follow_from_the_seed():
     first, second, other = (
-        pretrain.render_pairs(TASKS, num_scenes=4, seed=seed, assets="procedural") for seed in (0, 0, 1)
+        render_pairs(TASKS, num_scenes=4, seed=seed, assets="procedural") for seed in (0, 0, 1)
     )
     assert torch.equal(first.scene_crops, second.scene_crops)
     assert first.scene_crops.shape != other.scene_crops.shape or not torch.equal(
@@ -47,9 +50,9 @@ def test_pairs_follow_from_the_seed():
     )
 
 
-def test_mixed_colours_leave_grey_alone():
+def test_channel_mixing_keeps_grey():
     generator = step_generator(0, "colours", 0)
-    mixings = torch.stack([pretrain.colour_mixing(generator) for _ in range(50)])
+    mixings = torch.stack([channel_mixing(generator) for _ in range(50)])
     torch.testing.assert_close(mixings.sum(dim=2), torch.ones(50, 3))
     assert (mixings >= 0).all()
     unchanged = (mixings == torch.eye(3)).all(dim=2).all(dim=1).float().mean()
@@ -57,21 +60,19 @@ def test_mixed_colours_leave_grey_alone():
 
 
 @pytest.mark.slow
-def test_the_matching_loss_falls_when_pairs_are_told_apart():
+def test_the_contrastive_loss_decreases():
     torch.manual_seed(0)
     encoder = ObjectEncoder(
         ObjectEncoderConfig(ConvConfig(8, 16), box_width=4, width=8, fuse_views=True, appearance_width=16)
     )
-    pairs = pretrain.render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural")
+    pairs = render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural")
     optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
     losses = []
     for step in range(30):
-        loss, _ = pretrain.matching_loss(
-            encoder, pairs, temperature=0.1, generator=step_generator(0, "test", step)
-        )
+        loss, _ = contrastive_loss(encoder, pairs, temperature=0.1, generator=step_generator(0, "test", step))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
-    assert pretrain.scene_accuracy(encoder, pairs) > 0.7
+    assert retrieval_accuracy(encoder, pairs) > 0.7

@@ -1,4 +1,4 @@
-"""Harder pretraining: random looks, twins, scenes laid twice, and the turns between them."""
+"""Scene augmentation of contrastive pretraining, second views, and relative rotations between them."""
 
 import math
 from dataclasses import replace
@@ -15,19 +15,33 @@ from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.render.rasteriser import Rasteriser  # noqa: E402
 from openvima.scene import Placement, Pose, Scene  # noqa: E402
-from openvima.training import pretrain, turning  # noqa: E402
-from openvima.training.pretrain import Variety, pairs_of_scene, render_pairs, stacked  # noqa: E402
-from openvima.training.scene_variants import laid_again, with_twins  # noqa: E402
+from openvima.training.augmentation.box_jitter import with_box_jitter  # noqa: E402
+from openvima.training.augmentation.hard_negatives import with_hard_negatives  # noqa: E402
+from openvima.training.augmentation.horizontal_flip import with_horizontal_flips  # noqa: E402
+from openvima.training.augmentation.rearranged_view import rearranged  # noqa: E402
+from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
+from openvima.training.pretraining.contrastive import contrastive_loss  # noqa: E402
+from openvima.training.pretraining.pairs import (  # noqa: E402
+    SceneAugmentation,
+    pairs_of_scene,
+    render_pairs,
+    stacked,
+)
+from openvima.training.pretraining.rotation import (  # noqa: E402
+    is_rotation_correct,
+    rotation_accuracy,
+    rotation_loss,
+)
 from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("twist", "novel_adj", "visual_manipulation")
 LOSSES = ("loss/contrastive", "loss/second_view")
-HARD = Variety(random_looks=0.5, twins=0.6, again=True)
+HARD = SceneAugmentation(0.5, 0.6, second_view=True)
 
 
 @pytest.fixture(scope="module")
 def pairs():
-    return render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", variety=HARD)
+    return render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", augmentation=HARD)
 
 
 def _encoder(rotation_bins: int = 72) -> ObjectEncoder:
@@ -40,16 +54,16 @@ def _encoder(rotation_bins: int = 72) -> ObjectEncoder:
     )
 
 
-def test_nothing_of_the_test_levels_is_drawn(monkeypatch):
+def test_nothing_comes_from_the_test_levels(monkeypatch):
     shown = []
-    original = pretrain.pairs_of_scene
+    original = pairs_module.pairs_of_scene
 
-    def spy(scene, *rest, **grays):
+    def spy(scene, *rest, **options):
         shown.extend((p.object, p.texture, p.fixed) for p in scene.placements)
-        return original(scene, *rest, **grays)
+        return original(scene, *rest, **options)
 
-    monkeypatch.setattr(pretrain, "pairs_of_scene", spy)
-    render_pairs(TASKS, num_scenes=24, seed=3, assets="procedural", variety=HARD)
+    monkeypatch.setattr(pairs_module, "pairs_of_scene", spy)
+    render_pairs(TASKS, num_scenes=24, seed=3, assets="procedural", augmentation=HARD)
     pools = [pool(task, "train") for task in TASKS]
     objects = {name for entry in pools for name in (*entry.dragged_objects, *entry.base_objects)}
     textures = {
@@ -60,26 +74,28 @@ def test_nothing_of_the_test_levels_is_drawn(monkeypatch):
     }
     assert {name for name, _, _ in shown if not is_random(name)} <= objects
     assert {(name, fixed) for _, name, fixed in shown if not is_random(name)} <= textures
-    share = sum(is_random(name) for _, name, _ in shown) / len(shown)
-    assert 0.2 < share < 0.8
+    fraction = sum(is_random(name) for _, name, _ in shown) / len(shown)
+    assert 0.2 < fraction < 0.8
 
 
-def test_all_that_is_drawn_follows_from_the_seed(pairs):
-    again = render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", variety=HARD)
+def test_pairs_follow_from_the_seed(pairs):
+    again = render_pairs(TASKS, num_scenes=12, seed=0, assets="procedural", augmentation=HARD)
     assert torch.equal(pairs.scene_crops, again.scene_crops)
-    assert torch.equal(pairs.again.crops, again.again.crops)
-    assert torch.equal(pairs.again.turns.nan_to_num(), again.again.turns.nan_to_num())
+    assert torch.equal(pairs.second_view.crops, again.second_view.crops)
+    assert torch.equal(pairs.second_view.rotations.nan_to_num(), again.second_view.rotations.nan_to_num())
 
 
-def test_without_variety_scenes_are_as_they_always_were():
+def test_a_second_view_leaves_the_scenes_unchanged():
     plain = render_pairs(TASKS, num_scenes=4, seed=0, assets="procedural")
-    twice = render_pairs(TASKS, num_scenes=4, seed=0, assets="procedural", variety=Variety(again=True))
-    assert plain.again is None
+    twice = render_pairs(
+        TASKS, num_scenes=4, seed=0, assets="procedural", augmentation=SceneAugmentation(second_view=True)
+    )
+    assert plain.second_view is None
     assert torch.equal(plain.prompt_crops, twice.prompt_crops)
     assert torch.equal(plain.scene_crops, twice.scene_crops)
 
 
-def test_twins_differ_in_one_respect():
+def test_hard_negatives_differ_in_one_respect():
     assets = RandomAppearanceAssets(load_assets("procedural"))
     rng = np.random.default_rng(0)
     originals = tuple(
@@ -88,51 +104,50 @@ def test_twins_differ_in_one_respect():
     )
     kinds = set()
     for _ in range(40):
-        scene = with_twins(Scene(originals), 1.0, {"red", "dark red", "green"}, assets, rng)
-        for twin in scene.placements[2:]:
+        scene = with_hard_negatives(Scene(originals), 1.0, {"red", "dark red", "green"}, assets, rng)
+        for negative in scene.placements[2:]:
             differing = min(
                 (
                     [
                         name
                         for name in ("object", "texture", "scale")
-                        if getattr(twin, name) != getattr(p, name)
+                        if getattr(negative, name) != getattr(p, name)
                     ]
                     for p in originals
                 ),
                 key=len,
             )
             assert len(differing) <= 1
-            kinds |= {*differing, twin.texture}
+            kinds |= {*differing, negative.texture}
     assert {"object", "scale", "dark red"} <= kinds or {"scale", "texture", "dark red"} <= kinds
     assert "dark green" not in kinds
 
 
-def test_turns_are_those_between_the_headings():
+def test_rotations_are_those_between_the_headings():
     rng = np.random.default_rng(1)
     hearts = (Placement(k, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1 * k, k)) for k in (1, 2))
     scene = Scene(tuple(hearts))
-    again, turns = laid_again(scene, rng)
+    again, rotations = rearranged(scene, rng)
     for before, after in zip(scene.placements, again.placements, strict=True):
-        error = after.pose.yaw_rad - before.pose.yaw_rad - turns[before.id]
+        error = after.pose.yaw_rad - before.pose.yaw_rad - rotations[before.id]
         assert abs(math.remainder(error, 2 * math.pi)) < 1e-9
 
 
-def test_a_prompt_image_turned_as_the_pairs_say_looks_like_the_scene():
-    """Turns from prompt images are right: no turn gives the crop that a lone object would have anyway."""
+def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, math.pi / 2)),))
     rasteriser = Rasteriser(load_assets("procedural"))
     rows = pairs_of_scene(scene, {}, rasteriser, {}, 0, (scene, {5: 0.0}))
     drawn = stacked(rows)
-    assert drawn.again.turns.tolist() == [[0.0, 0.0]]
+    assert drawn.second_view.rotations.tolist() == [[0.0, 0.0]]
     red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
     also_red = (drawn.scene_crops[0, 1, 0] == 255) & (drawn.scene_crops[0, 1, 1] == 87)
     assert (red == also_red).float().mean() > 0.95
 
 
-def test_turns_from_prompt_images_follow_from_the_heading():
+def test_rotations_from_prompt_images_follow_from_the_heading():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
     rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.5}))
-    np.testing.assert_allclose(stacked(rows).again.turns[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(stacked(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.4, 1.9])
@@ -148,47 +163,53 @@ def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
     assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
 
 
-def test_objects_of_other_height_are_other_looks():
+def test_objects_of_other_height_are_other_appearances():
     low = Placement(5, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1))
     high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))
     scene = Scene((low, high))
     rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.0, 6: 0.0}))
-    first, second = stacked(rows).looks.tolist()
+    first, second = stacked(rows).appearances.tolist()
     assert first != second
     assert len(set(stacked(rows).shapes.tolist())) == 1
 
 
-def test_mirroring_reverses_turns_and_flips_all_images(pairs):
-    mirrored = turning.mirrored(pairs, step_generator(0, "mirror", 0))
+def test_horizontal_flips_reverse_rotations(pairs):
+    mirrored = with_horizontal_flips(pairs, step_generator(0, "mirror", 0))
     is_mirrored = (mirrored.scene_crops == pairs.scene_crops.flip(-1)).flatten(1).all(1)
-    shows = ~pairs.again.turns[:, 0].isnan()
+    shows = ~pairs.second_view.rotations[:, 0].isnan()
     assert 0.2 < is_mirrored.float().mean() < 0.8
-    expected = torch.where(is_mirrored[:, None], -pairs.again.turns, pairs.again.turns)
-    assert torch.equal(mirrored.again.turns[shows], expected[shows])
-    crops = pairs.again.crops
+    expected = torch.where(is_mirrored[:, None], -pairs.second_view.rotations, pairs.second_view.rotations)
+    assert torch.equal(mirrored.second_view.rotations[shows], expected[shows])
+    crops = pairs.second_view.crops
     flipped = torch.where(is_mirrored[:, None, None, None, None], crops.flip(-1), crops)
-    assert torch.equal(mirrored.again.crops, flipped)
+    assert torch.equal(mirrored.second_view.crops, flipped)
 
 
-def test_shifted_crops_stay_near(pairs):
-    still = turning.shifted(pairs, 1e-6, step_generator(0, "shift", 0))
+def test_jittered_crops_stay_similar(pairs):
+    still = with_box_jitter(pairs, 1e-6, step_generator(0, "shift", 0))
     torch.testing.assert_close(still.scene_crops, pairs.scene_crops.float(), atol=0.1, rtol=0)
-    moved = turning.shifted(pairs, 2.0, step_generator(0, "shift", 0))
+    moved = with_box_jitter(pairs, 2.0, step_generator(0, "shift", 0))
     change = (moved.scene_crops - pairs.scene_crops).abs().mean()
     assert 1 < change < 40
-    assert torch.equal(moved.again.turns.nan_to_num(), pairs.again.turns.nan_to_num())
+    assert torch.equal(moved.second_view.rotations.nan_to_num(), pairs.second_view.rotations.nan_to_num())
 
 
 @pytest.mark.slow
-def test_looks_and_turns_are_learnt_together():
-    pairs = render_pairs(("twist",), num_scenes=20, seed=0, assets="procedural", variety=Variety(again=True))
+def test_the_joint_loss_decreases():
+    pairs = render_pairs(
+        ("twist",),
+        num_scenes=20,
+        seed=0,
+        assets="procedural",
+        augmentation=SceneAugmentation(second_view=True),
+    )
     encoder = _encoder()
     optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
     losses = []
     for step in range(30):
         generator = step_generator(0, "test", step)
-        batch = turning.mirrored(pairs, generator)
-        loss, metrics = turning.joint_loss(encoder, batch, temperature=0.1, generator=generator)
+        batch = with_horizontal_flips(pairs, generator)
+        loss, metrics = contrastive_loss(encoder, batch, temperature=0.1, generator=generator)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -201,18 +222,18 @@ def test_looks_and_turns_are_learnt_together():
         "loss/rotation",
     }
     assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
-    assert turning.turn_accuracy(encoder, pairs) > 0.25  # by chance a tenth
+    assert rotation_accuracy(encoder, pairs) > 0.25  # 0.1 at random
 
 
-def test_without_rotation_bins_only_looks_are_learnt(pairs):
+def test_without_rotation_bins_there_is_no_rotation_loss(pairs):
     generator = step_generator(0, "test", 0)
-    _, metrics = turning.joint_loss(_encoder(rotation_bins=0), pairs, temperature=0.1, generator=generator)
+    _, metrics = contrastive_loss(_encoder(rotation_bins=0), pairs, temperature=0.1, generator=generator)
     assert set(metrics) == {"contrastive_accuracy", "second_view_accuracy", *LOSSES}
 
 
-def test_a_turn_counts_as_right_within_fifteen_degrees():
+def test_rotations_are_correct_within_fifteen_degrees():
     class Fixed(torch.nn.Module):
-        """Answers 25 degrees, whatever the crops show."""
+        """Always estimates 25 degrees."""
 
         def forward(self, first, second, seen, seen_again):
             return torch.log_softmax(50.0 * torch.eye(72)[[5] * seen.shape[-1]], dim=-1)
@@ -220,17 +241,17 @@ def test_a_turn_counts_as_right_within_fifteen_degrees():
     encoder = _encoder()
     encoder.rotation = Fixed()
     features, seen = torch.zeros(3, 2, 4, 1), torch.ones(3, 2, 4, dtype=torch.bool)
-    turns = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
-    right = turning._right_turns(encoder, features, seen, turns)
+    rotations = torch.deg2rad(torch.tensor([25.0, 39.0, 41.0, 25.0 - 360.0]))[:, None].expand(4, 2)
+    right = is_rotation_correct(encoder, features, seen, rotations)
     assert right.tolist() == [True, True, False, True]
     exact = torch.deg2rad(torch.tensor([[25.0, 360.0], [25.0, -360.0]]))
-    assert turning.turn_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) > 10  # the second is wrong
+    assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) > 10  # the second is wrong
     seen[1] = False
-    assert turning.turn_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
+    assert rotation_loss(encoder, features[:, :, :2], seen[:, :, :2], exact) < 1e-3
 
 
 @pytest.mark.slow
-def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
+def test_a_run_logs_the_rotation_accuracy(settings, monkeypatch):
     import json
 
     from openvima.policies import presets
@@ -238,21 +259,21 @@ def test_a_run_with_all_of_it_reports_turns(settings, monkeypatch):
 
     tiny = presets.PRESETS["tiny"]()
 
-    def turning_tiny():
+    def rotation_tiny():
         return replace(tiny, images=replace(tiny.images, rotation_bins=24))
 
-    monkeypatch.setitem(presets.PRESETS, "turning-tiny", turning_tiny)
+    monkeypatch.setitem(presets.PRESETS, "rotation-tiny", rotation_tiny)
     harder = {
         "pretraining.appearance_randomization_prob": 0.5,
         "pretraining.hard_negative_prob": 0.5,
         "pretraining.box_jitter_px": 1.0,
     }
-    changes = {"preset": "turning-tiny", "schedule.steps": 2, **harder}
+    changes = {"preset": "rotation-tiny", "schedule.steps": 2, **harder}
     run = train(TrainingConfig.of({**settings, **changes}))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    matching = {name for line in lines if line["name"] == "1-pretraining" for name in line}
+    names = {name for line in lines if line["name"] == "1-pretraining" for name in line}
     assert {
         "rotation_accuracy",
         "validation_rotation_accuracy",
         "validation_second_view_accuracy",
-    } <= matching
+    } <= names

@@ -1,0 +1,280 @@
+"""Pairs for contrastive pretraining: one object alone in a prompt image and among others in a scene.
+
+Scenes are sampled like episodes of the tasks in the data, from the training partition; then every object gets
+another training texture of its role, and a prompt image of its own. Nothing comes from the test levels.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from openvima.catalog.geometry import Assets
+from openvima.catalog.packs import load_assets
+from openvima.catalog.partitions import Pool, pool
+from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
+from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
+from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
+from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
+from openvima.tasks import sample_episode
+from openvima.training.augmentation.appearance_randomization import with_random_appearance
+from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
+from openvima.training.augmentation.hard_negatives import with_hard_negatives
+from openvima.training.augmentation.rearranged_view import rearranged
+from openvima.training.schedule import step_seed
+
+_NUM_COLUMNS = 8  # of `Pairs`, without those of the second view
+_DOMAIN = "user"  # neither training nor evaluation episodes are reused
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SecondView:
+    """K objects in the rearranged view of their scene.
+
+    Args:
+        crops: Shape (K, 2, 3, 32, 32), uint8.
+        masks: Whether it is visible in the view, shape (K, 2), bool.
+        rotations: From the prompt image to the scene, and from there to the second view, counter-clockwise
+            seen from above, in radians; NaN for shapes with rotational symmetry. Shape (K, 2), float32.
+    """
+
+    crops: torch.Tensor
+    masks: torch.Tensor
+    rotations: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """K objects, each in a prompt image and in a scene.
+
+    Args:
+        prompt_crops: Shape (K, 2, 3, 32, 32), uint8.
+        prompt_masks: Whether it is visible in the view, shape (K, 2), bool.
+        scene_crops: Shape (K, 2, 3, 32, 32), uint8.
+        scene_masks: Shape (K, 2), bool.
+        appearances: Index of its pair of shape and texture, shape (K,), int64.
+        scenes: Index of its scene, shape (K,), int64.
+        shapes: Index of its shape, shape (K,), int64.
+        is_grayscale: Whether its prompt image is grayscale and matches by shape, shape (K,), bool.
+        second_view: The objects in the rearranged view; None if there is none.
+    """
+
+    prompt_crops: torch.Tensor
+    prompt_masks: torch.Tensor
+    scene_crops: torch.Tensor
+    scene_masks: torch.Tensor
+    appearances: torch.Tensor
+    scenes: torch.Tensor
+    shapes: torch.Tensor
+    is_grayscale: torch.Tensor
+    second_view: SecondView | None = None
+
+    def to(self, device: torch.device) -> "Pairs":
+        """Return the pairs on another device."""
+        return self._each(lambda column: column.to(device))
+
+    def select(self, rows: torch.Tensor) -> "Pairs":
+        """Return some of the pairs."""
+        return self._each(lambda column: column[rows])
+
+    def second_view_pairs(self) -> "Pairs":
+        """Return the pairs with the second view as prompt images, where it shows the object."""
+        view = self.second_view
+        assert view is not None
+        is_visible = torch.nonzero(view.masks.any(dim=1))[:, 0]
+        in_colour = torch.zeros_like(self.is_grayscale)
+        pairs = replace(self, prompt_crops=view.crops, prompt_masks=view.masks, is_grayscale=in_colour)
+        return pairs.select(is_visible)
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "Pairs":
+        view = self.second_view
+        return Pairs(
+            change(self.prompt_crops),
+            change(self.prompt_masks),
+            change(self.scene_crops),
+            change(self.scene_masks),
+            change(self.appearances),
+            change(self.scenes),
+            change(self.shapes),
+            change(self.is_grayscale),
+            SecondView(change(view.crops), change(view.masks), change(view.rotations)) if view else None,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SceneAugmentation:
+    """Augmentation of the scenes of contrastive pretraining; see `PretrainingConfig`.
+
+    Args:
+        appearance_randomization_prob: Probability for each object of a random texture, and of a random shape.
+        hard_negative_prob: Probability for each movable object of a hard negative.
+        second_view: Add a rearranged view of each scene.
+        grayscale_prob: Probability for each object of a grayscale prompt image.
+    """
+
+    appearance_randomization_prob: float = 0.0
+    hard_negative_prob: float = 0.0
+    second_view: bool = False
+    grayscale_prob: float = 0.0
+
+    def __call__(
+        self, scene: Scene, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
+    ) -> Scene:
+        """Augment a scene; `shades` are the textures that movable objects may have."""
+        if self.appearance_randomization_prob:
+            scene = with_random_appearance(scene, self.appearance_randomization_prob, assets, rng)
+        if self.hard_negative_prob:
+            scene = with_hard_negatives(scene, self.hard_negative_prob, shades, assets, rng)
+        return scene
+
+
+NO_AUGMENTATION = SceneAugmentation()
+
+
+def render_pairs(
+    tasks: Sequence[str],
+    *,
+    num_scenes: int,
+    seed: int,
+    assets: str,
+    augmentation: SceneAugmentation = NO_AUGMENTATION,
+    report: Callable[[int, int, str], None] | None = None,
+) -> Pairs:
+    """Sample and render scenes, and prompt images of all objects in them.
+
+    Args:
+        tasks: Tasks whose training partition and layouts are used, in turn.
+        num_scenes: Number of scenes.
+        seed: Seed of the run.
+        assets: Asset pack, as `load_assets` takes it.
+        augmentation: Augmentation of the scenes.
+        report: Called with scenes done, scenes in all, and a note.
+    """
+    pack = load_assets(assets)
+    rasteriser = Rasteriser(RandomAppearanceAssets(pack))
+    shades = {name for task in tasks for name in pool(task, "train").dragged_textures}
+    indices: dict[tuple, int] = {}
+    rows: list[tuple] = []
+    for number in range(num_scenes):
+        task = tasks[number % len(tasks)]
+        episode_seed = step_seed(seed, "pretraining scene", number)
+        episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
+        scene = _retextured(episode.problem.scene, pool(task, "train"), np.random.default_rng(episode_seed))
+        # A generator of its own, so that the scenes below are the same with any augmentation.
+        rng = np.random.default_rng([episode_seed, 1])
+        scene = augmentation(scene, shades, rasteriser.assets, rng)
+        view = rearranged(scene, rng) if augmentation.second_view else None
+        is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
+        magnifications = _magnifications(episode)
+        rows += pairs_of_scene(
+            scene, magnifications, rasteriser, indices, number, view, is_grayscale=is_grayscale
+        )
+        if report and number % 50 == 0:
+            report(number, num_scenes, "rendering scenes")
+    return stacked(rows)
+
+
+def stacked(rows: Sequence[tuple]) -> Pairs:
+    """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
+    columns = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
+    first, view = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
+    return Pairs(*first, second_view=SecondView(*view) if view else None)
+
+
+def pairs_of_scene(
+    scene: Scene,
+    magnifications: Mapping[str, float],
+    rasteriser: Rasteriser,
+    indices: dict[tuple, int],
+    number: int,
+    second_view: tuple[Scene, dict[int, float]] | None = None,
+    *,
+    is_grayscale: Sequence[bool] | np.ndarray = (),
+) -> list[tuple]:
+    """Render a scene and prompt images of its visible objects.
+
+    Args:
+        scene: The scene.
+        magnifications: Magnification of prompt images by object name; 1 for others.
+        rasteriser: Renders.
+        indices: Indices of appearances, by object and texture (with a second view also by scale, since hard
+            negatives may be stretched), and of shapes, by object. New ones are added.
+        number: Index of the scene.
+        second_view: The rearranged scene, and rotations by object id.
+        is_grayscale: For each object of the scene whether its prompt image is grayscale; none by default.
+
+    Returns:
+        For each visible object the fields of `Pairs`, and those of `SecondView` if there is one.
+    """
+    seen = _seen(scene, rasteriser)
+    seen_again = _seen(second_view[0], rasteriser) if second_view else None
+    pairs = []
+    for slot, placement in enumerate(scene.placements):
+        if not seen.masks[:, slot].any():
+            continue
+        is_gray = bool(len(is_grayscale)) and bool(is_grayscale[slot])
+        prompt = _prompt_image(
+            grayscale(placement) if is_gray else placement,
+            magnifications.get(placement.object, 1.0),
+            rasteriser,
+        )
+        key = (placement.object, placement.texture, *(placement.scale if second_view else ()))
+        appearance = indices.setdefault(key, len(indices))
+        shape = indices.setdefault((placement.object,), len(indices))
+        pair = (
+            prompt.crops[:, 0],
+            prompt.masks[:, 0],
+            seen.crops[:, slot],
+            seen.masks[:, slot],
+            np.int64(appearance),
+            np.int64(number),
+            np.int64(shape),
+            np.bool_(is_gray),
+        )
+        if second_view and seen_again:
+            rotations = _rotations(placement, second_view[1][placement.id])
+            pair = (*pair, seen_again.crops[:, slot], seen_again.masks[:, slot], rotations)
+        pairs.append(pair)
+    return pairs
+
+
+def _rotations(placement: Placement, to_second_view: float) -> np.ndarray:
+    from_prompt = placement.pose.yaw_rad - PROMPT_POSE.yaw_rad
+    rotations = np.array([from_prompt, to_second_view], dtype=np.float32)
+    return rotations if has_visible_heading(placement.object) else np.full_like(rotations, np.nan)
+
+
+def _retextured(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene:
+    """Give every object a training texture; few different ones, so that many differ in shape alone.
+
+    Movable objects get textures of dragged objects and fixed ones those of bases, so that the combinations
+    of level L2, in which the two sets are swapped, stay unseen.
+    """
+    size = max(2, len(scene.placements) - 1)
+    palettes = {
+        fixed: rng.choice(names, size=size, replace=False) if names else ()
+        for fixed, names in ((False, textures.dragged_textures), (True, textures.base_textures))
+    }
+    placements = [replace(p, texture=str(rng.choice(palettes[p.fixed]))) for p in scene.placements]
+    return replace(scene, placements=tuple(placements))
+
+
+def _magnifications(episode: Episode) -> dict[str, float]:
+    """Return the magnification of each object in prompts of this task."""
+    images = [fill for _, fill in episode.problem.prompt.images if isinstance(fill, ObjectImage)]
+    return {image.placement.object: image.magnification for image in images}
+
+
+def _seen(scene: Scene, rasteriser: Rasteriser) -> ObjectViews:
+    views = rasteriser.scene(scene)
+    rgb = {name: image.rgb for name, image in views.items()}
+    segm = {name: image.segm for name, image in views.items()}
+    return extract_objects(rgb, segm, [placement.id for placement in scene.placements])
+
+
+def _prompt_image(placement: Placement, magnification: float, rasteriser: Rasteriser) -> ObjectViews:
+    image = ObjectImage(placement, magnification)
+    prompt = rasteriser.prompt(Prompt("{object}", (("object", image),)))
+    return observe_prompt_image(prompt.images["object"])

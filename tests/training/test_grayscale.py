@@ -1,0 +1,203 @@
+"""Grayscale prompt images, which match by shape alone; random containers that only texture distinguishes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.catalog.packs import load_assets  # noqa: E402
+from openvima.catalog.random_pack import RandomAppearanceAssets, is_random  # noqa: E402
+from openvima.catalog.textures import NEUTRAL_COLOUR  # noqa: E402
+from openvima.perception.objects import observe_prompt_image  # noqa: E402
+from openvima.render.rasteriser import Rasteriser  # noqa: E402
+from openvima.scene import Placement, Pose, Prompt, Scene  # noqa: E402
+from openvima.tasks.novel_words import gray_image  # noqa: E402
+from openvima.training import TrainingConfig, policy, train  # noqa: E402
+from openvima.training.augmentation.appearance_randomization import with_random_appearance  # noqa: E402
+from openvima.training.pretraining import contrastive  # noqa: E402
+from openvima.training.pretraining.contrastive import info_nce, matches, retrieval_accuracy  # noqa: E402
+from openvima.training.pretraining.pairs import (  # noqa: E402
+    Pairs,
+    SceneAugmentation,
+    pairs_of_scene,
+    render_pairs,
+    stacked,
+)
+
+TASKS = ("twist", "novel_adj", "visual_manipulation")
+HARD = SceneAugmentation(0.5, 0.6, second_view=True)
+SIZE = (0.144, 0.144, 0.036)  # m
+RED_A = Placement(5, "letter A", "red", SIZE, Pose.planar(0.5, -0.2))
+BLUE_A = replace(RED_A, id=6, texture="blue", pose=Pose.planar(0.5, 0.0))
+HIGH_HEART = Placement(7, "heart", "red", SIZE, Pose.planar(0.5, 0.2), scale=(1.0, 1.0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def rasteriser() -> Rasteriser:
+    return Rasteriser(load_assets("procedural"))
+
+
+def pairs_of(rasteriser: Rasteriser, *placements: Placement, is_grayscale=()) -> Pairs:
+    return stacked(pairs_of_scene(Scene(placements), {}, rasteriser, {}, 0, is_grayscale=is_grayscale))
+
+
+def drawn(augmentation: SceneAugmentation, seed: int = 0) -> Pairs:
+    return render_pairs(TASKS, num_scenes=9, seed=seed, assets="procedural", augmentation=augmentation)
+
+
+def chroma(crops: "torch.Tensor") -> "torch.Tensor":
+    """How far the channels of each pixel lie apart; (K, 2, 3, 32, 32) gives (K, 2, 32, 32)."""
+    return (crops.amax(dim=2).int() - crops.amin(dim=2).int()).abs()
+
+
+def test_a_grayscale_prompt_image_has_no_colour_and_the_scene_keeps_its_own(rasteriser):
+    pairs = pairs_of(rasteriser, RED_A, BLUE_A, HIGH_HEART, is_grayscale=[True, False, True])
+    assert pairs.is_grayscale.tolist() == [True, False, True]
+    largest = chroma(pairs.prompt_crops).flatten(1).amax(1)
+    neutral = max(NEUTRAL_COLOUR) - min(NEUTRAL_COLOUR)
+    assert (largest[pairs.is_grayscale] <= neutral).all()  # the neutral colour is a warm gray
+    assert (largest[~pairs.is_grayscale] > 4 * neutral).all()
+    assert pairs.prompt_masks.all()
+    plain = pairs_of(rasteriser, RED_A, BLUE_A, HIGH_HEART)
+    assert not plain.is_grayscale.any()
+    assert torch.equal(plain.scene_crops, pairs.scene_crops)
+    assert torch.equal(plain.prompt_crops[1], pairs.prompt_crops[1])
+
+
+def test_a_grayscale_prompt_image_is_that_of_the_tasks_whatever_texture_and_scale(rasteriser):
+    low = replace(HIGH_HEART, id=8, texture="green", scale=(1.0, 1.0, 1.0), pose=Pose.planar(0.6, -0.1))
+    pairs = pairs_of(rasteriser, HIGH_HEART, low, is_grayscale=[True, True])
+    assert torch.equal(pairs.prompt_crops[0], pairs.prompt_crops[1])
+    coloured = pairs_of(rasteriser, HIGH_HEART, replace(low, texture="red"))
+    assert not torch.equal(coloured.prompt_crops[0], coloured.prompt_crops[1])  # scale shows
+    image = rasteriser.prompt(Prompt("{object}", (("object", gray_image(HIGH_HEART)),))).images["object"]
+    np.testing.assert_array_equal(pairs.prompt_crops[0], observe_prompt_image(image).crops[:, 0])
+
+
+def test_a_grayscale_row_matches_its_shape_and_others_their_appearance(rasteriser):
+    purple_a = replace(RED_A, id=8, texture="purple", pose=Pose.planar(0.6, 0.3))
+    red_a = replace(RED_A, id=9, pose=Pose.planar(0.4, 0.3))
+    placements = (RED_A, BLUE_A, HIGH_HEART, purple_a, red_a)
+    pairs = pairs_of(rasteriser, *placements, is_grayscale=[True, False, True, False, False])
+    assert matches(pairs).int().tolist() == [
+        [1, 1, 0, 1, 1],  # a grayscale A
+        [0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0],  # a grayscale heart
+        [0, 0, 0, 1, 0],
+        [1, 0, 0, 0, 1],
+    ]
+
+
+def test_matches_are_no_negatives_of_the_loss_and_the_accuracy():
+    own, other = torch.tensor([1.0, 0.0]), torch.tensor([0.8, 0.6])
+    first, second = torch.stack([other, other]), torch.stack([own, other])  # both are more like the second
+    is_match = torch.eye(2, dtype=torch.bool)
+    strict_loss, strict = info_nce(first, second, is_match, temperature=1.0)
+    is_match[0, 1] = True
+    loss, accuracy = info_nce(first, second, is_match, temperature=1.0)
+    assert (strict, accuracy) == (0.5, 1.0)
+    assert loss < strict_loss
+    scores = first @ second.T
+    # What is left: the second row against the first object, and that object against the second row.
+    apart = torch.stack([scores[1, 0] - scores[1, 1], scores[1, 0] - scores[0, 0]])
+    torch.testing.assert_close(loss, apart.exp().log1p().sum() / 4)
+
+
+def test_a_grayscale_prompt_image_retrieves_any_object_of_its_shape(monkeypatch):
+    """Objects 0 and 1 have one shape; `found` is the object that each prompt image retrieves."""
+    found = torch.tensor([1, 0, 0])
+    crops = torch.zeros(2, 3, 2, 3, 32, 32, dtype=torch.uint8)
+    crops[0, :, 0, 0, 0, 0], crops[1, :, 0, 0, 0, 0] = found, torch.arange(3)
+    seen = torch.ones(3, 2, dtype=torch.bool)
+    is_grayscale = torch.tensor([True, False, True])
+    pairs = Pairs(
+        crops[0],
+        seen,
+        crops[1],
+        seen,
+        torch.arange(3),
+        torch.zeros(3, dtype=torch.int64),
+        torch.tensor([7, 7, 8]),
+        is_grayscale,
+    )
+
+    def embedded(encoder, crops, masks):
+        return torch.nn.functional.one_hot(crops[:, 0, 0, 0, 0].long(), 3).float()
+
+    monkeypatch.setattr(contrastive, "embedded", embedded)
+    assert retrieval_accuracy(None, pairs) == pytest.approx(1 / 3)  # the first; the last is no shape of 8
+    assert retrieval_accuracy(None, replace(pairs, is_grayscale=~is_grayscale)) == pytest.approx(1 / 3)
+    assert retrieval_accuracy(None, replace(pairs, is_grayscale=torch.zeros_like(is_grayscale))) == 0
+
+
+def test_the_second_view_is_in_colour():
+    pairs = drawn(replace(HARD, grayscale_prob=1.0))
+    assert pairs.is_grayscale.all()
+    assert pairs.second_view is not None
+    assert not pairs.second_view_pairs().is_grayscale.any()
+
+
+def test_grayscale_changes_no_other_draws():
+    plain, some = drawn(HARD), drawn(replace(HARD, grayscale_prob=0.5))
+    assert not plain.is_grayscale.any()
+    assert 0.2 < some.is_grayscale.float().mean() < 0.8
+    for name in ("scene_crops", "scene_masks", "appearances", "scenes", "shapes"):
+        assert torch.equal(getattr(plain, name), getattr(some, name)), name
+    assert torch.equal(plain.second_view.crops, some.second_view.crops)
+    assert torch.equal(plain.second_view.rotations.nan_to_num(), some.second_view.rotations.nan_to_num())
+    is_same = (plain.prompt_crops == some.prompt_crops).flatten(1).all(1)
+    assert is_same[~some.is_grayscale].all()
+    assert not is_same[some.is_grayscale].any()
+
+
+def test_grayscale_follows_from_the_seed():
+    augmentation = replace(HARD, grayscale_prob=0.5)
+    first, second, other = drawn(augmentation), drawn(augmentation), drawn(augmentation, seed=1)
+    assert torch.equal(first.is_grayscale, second.is_grayscale)
+    assert torch.equal(first.prompt_crops, second.prompt_crops)
+    assert first.is_grayscale.tolist() != other.is_grayscale.tolist()
+
+
+def test_a_run_passes_its_settings_to_the_pairs(settings, monkeypatch):
+    augmentations, original = [], policy.render_pairs
+
+    def spy(*words, augmentation, **rest):
+        augmentations.append(augmentation)
+        return original(*words, augmentation=augmentation, **rest)
+
+    monkeypatch.setattr(policy, "render_pairs", spy)
+    train(TrainingConfig.of({**settings, "schedule.steps": 1, "pretraining.grayscale_prob": 0.4}))
+    assert [augmentation.grayscale_prob for augmentation in augmentations] == [0.4]
+
+
+def containers_of(seed: int, prob: float = 1.0) -> list[str]:
+    """Shapes of three bowls, a frame and two hearts with random appearance."""
+    names = ("bowl", "bowl", "bowl", "frame", "heart", "heart")
+    scene = Scene(
+        tuple(
+            Placement(5 + k, name, "red", (0.15, 0.15, 0.05), Pose.planar(0.5, 0.1 * k - 0.3), fixed=k < 4)
+            for k, name in enumerate(names)
+        )
+    )
+    changed = with_random_appearance(
+        scene, prob, RandomAppearanceAssets(load_assets("procedural")), np.random.default_rng(seed)
+    )
+    return [placement.object for placement in changed.placements]
+
+
+def test_random_containers_of_one_kind_are_alike_in_half_of_the_scenes():
+    scenes = [containers_of(seed) for seed in range(60)]
+    assert all(is_random(name) for scene in scenes for name in scene)
+    counts = [len(set(scene[:3])) for scene in scenes]
+    assert set(counts) == {1, 3}
+    assert 0.25 < counts.count(1) / len(counts) < 0.75
+    # What was not alike does not become so, and what can be moved has a shape of its own.
+    assert all(scene[3] not in scene[:3] and scene[4] != scene[5] for scene in scenes)
+    assert len({scene[0] for scene in scenes}) == len(scenes)
+
+
+def test_random_containers_follow_from_the_seed():
+    assert containers_of(3, 0.5) == containers_of(3, 0.5)
+    assert len({tuple(containers_of(seed, 0.5)) for seed in range(5)}) > 1
