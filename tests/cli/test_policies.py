@@ -29,8 +29,12 @@ def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys)
     rows = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
     assert rows.keys() >= PRESETS.keys()
     size = policy_size(preset("vima-20m"))
-    counts = [*(count.total for count in size.parts.values()), size.whole.total, size.whole.trainable]
-    numbers = [f"{count / 1e6:.2f}" for count in [*counts, size.whole.frozen]]
+    counts = [
+        *(count.total for count in size.parts.values()),
+        size.parameters.total,
+        size.parameters.trainable,
+    ]
+    numbers = [f"{count / 1e6:.2f}" for count in [*counts, size.parameters.frozen]]
     assert rows["vima-20m"] == ["384", "4", "12", *numbers]
     assert rows["preset"][3:] == [*size.parts, "total", "trained", "frozen"]
 

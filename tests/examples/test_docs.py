@@ -33,15 +33,16 @@ def test_the_tables_of_sizes_are_those_of_the_presets() -> None:
     for name, row in rows:
         size = policy_size(preset(name))
         counts = [count.total for count in size.parts.values()]
-        millions = [f"{count / 1e6:.2f}" for count in (*counts, size.whole.total, size.whole.trainable)]
+        counts += [size.parameters.total, size.parameters.trainable]
+        millions = [f"{count / 1e6:.2f}" for count in counts]
         assert row.split(" | ") == [str(size.width), str(size.num_layers), str(size.num_heads), *millions]
 
 
 def test_totals_of_the_baselines_are_as_near_to_vima_as_the_page_says() -> None:
     for size in ("2m", "43m", "200m"):
-        ours = policy_size(preset(f"vima-{size}")).whole.total
+        ours = policy_size(preset(f"vima-{size}")).parameters.total
         for family, share in {"gato": 0.02, "gpt": 0.02, "flamingo": 0.05}.items():
-            theirs = policy_size(preset(f"{family}-{size}")).whole.total
+            theirs = policy_size(preset(f"{family}-{size}")).parameters.total
             assert abs(theirs / ours - 1) < share
 
 

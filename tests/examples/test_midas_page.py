@@ -32,7 +32,8 @@ def test_the_table_of_sizes_is_that_of_the_presets() -> None:
     for name, row in rows:
         size = policy_size(preset(name))
         counts = [count.total for count in size.parts.values()]
-        millions = [f"{count / 1e6:.2f}" for count in (*counts, size.whole.total, size.whole.trainable)]
+        counts += [size.parameters.total, size.parameters.trainable]
+        millions = [f"{count / 1e6:.2f}" for count in counts]
         assert row.split(" | ") == [str(size.width), str(size.num_layers), str(size.num_heads), *millions]
 
 

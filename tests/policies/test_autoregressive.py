@@ -286,7 +286,7 @@ def test_vectors_without_spread_are_refused() -> None:
 
 
 def test_a_pointer_model_has_no_bins_to_decode_one_by_one() -> None:
-    with pytest.raises(ConfigError, match="take nano-bins"):
+    with pytest.raises(ConfigError, match="use nano-bins"):
         with_autoregression(preset("nano"))
 
 

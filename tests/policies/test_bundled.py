@@ -1,4 +1,4 @@
-"""The trained policy of the package under its name. Most tests put a small network in its place."""
+"""Bundled checkpoints by name. Most tests replace the checkpoint with a small network."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ from small_networks import narrow_small  # noqa: E402
 
 @pytest.fixture
 def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Folder of a small network in float16 that stands in for the policy of the package.
+    """Folder of a small network in float16 that replaces the bundled checkpoint.
 
     The working directory is another, empty one.
     """

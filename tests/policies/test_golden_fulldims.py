@@ -92,7 +92,7 @@ def test_golden_weights_follow_from_their_names(made: dict[str, torch.Tensor], c
 def make_weights(model: str, about: Mapping, made: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Make the weights of a model by their published names, but for those without effect."""
     outline = outline_network(config_of(model, about["cfg"]))
-    assert len(to_published(outline, dead_entries=True)) == about["n_state_dict_keys"]
+    assert len(to_published(outline, unused_entries=True)) == about["n_state_dict_keys"]
     weights = {}
     for name, tensor in to_published(outline).items():
         key = f"{name} {list(tensor.shape)}"

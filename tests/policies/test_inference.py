@@ -370,7 +370,7 @@ def test_an_observation_without_objects_is_refused_where_objects_are_what_is_see
     if policy.processor.layout == "frames":
         assert policy.act([blank(pool[0])]) != [None]
         return
-    with pytest.raises(PolicyError, match="shows no object"):
+    with pytest.raises(PolicyError, match="contains no object"):
         policy.act([blank(pool[0])])
 
 

@@ -81,13 +81,13 @@ def test_fused_slots_follow_what_is_found() -> None:
     batches = [processor.encode_observations([[seen()]])[0] for _ in range(2)]
     counts = [batch.masks_BTVN.any(2).sum() for batch in batches]
     assert counts[1] < counts[0]
-    with pytest.raises(PolicyError, match=r"shows no object.*min_score"):
+    with pytest.raises(PolicyError, match=r"contains no object.*min_score"):
         processor.encode_observations([[seen()]])
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_a_first_observation_without_objects_is_refused(layout: str) -> None:
-    with pytest.raises(PolicyError, match="shows no object"):
+    with pytest.raises(PolicyError, match="contains no object"):
         Processor(layout).encode_observations([[seen()]])
 
 

@@ -36,8 +36,8 @@ def test_every_parameter_belongs_to_one_part(name: str) -> None:
         owners = [part for part, prefixes in PARTS.items() if parameter.startswith(prefixes)]
         expected = 2 if parameter.startswith("head.actions.") else 1  # of two the first counts, "actions"
         assert len(owners) == expected, (parameter, owners)
-    whole = policy_size(preset(name)).whole
-    assert whole.total == sum(parameter.numel() for parameter in network.parameters())
+    total = policy_size(preset(name)).parameters
+    assert total.total == sum(parameter.numel() for parameter in network.parameters())
 
 
 def test_an_outline_counts_what_a_network_has() -> None:
@@ -47,7 +47,7 @@ def test_an_outline_counts_what_a_network_has() -> None:
     parts = policy_size(sizes).parts
     assert parts == count_parameters(network)
     frozen = sum(parameter.numel() for parameter in network.parameters() if not parameter.requires_grad)
-    assert parts["prompt"].frozen == policy_size(sizes).whole.frozen == frozen > 0
+    assert parts["prompt"].frozen == policy_size(sizes).parameters.frozen == frozen > 0
 
 
 def test_of_t5_words_and_all_but_two_layers_are_frozen() -> None:

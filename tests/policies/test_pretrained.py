@@ -170,7 +170,7 @@ def test_without_a_connection_the_error_names_both_places_in_one_line(hub) -> No
         load_policy(HUB_ID)
     message = str(caught.value)
     assert f"no folder '{HUB_ID}' here" in message
-    assert message.endswith("did not give it: cannot reach huggingface.co")
+    assert message.endswith("the download from the Hugging Face Hub failed: cannot reach huggingface.co")
 
 
 def test_without_the_client_of_the_hub_its_package_is_named(monkeypatch) -> None:

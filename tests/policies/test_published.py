@@ -79,8 +79,8 @@ def network(architecture) -> PolicyNetwork:
     return network
 
 
-def contents(network: PolicyNetwork, architecture: str, *, dead_entries: bool = True) -> dict:
-    weights = to_published(network, dead_entries=dead_entries)
+def contents(network: PolicyNetwork, architecture: str, *, unused_entries: bool = True) -> dict:
+    weights = to_published(network, unused_entries=unused_entries)
     return {
         "state_dict": {f"policy.{name}": tensor for name, tensor in weights.items()},
         "cfg": cfg_of(network.config, architecture),
@@ -99,7 +99,7 @@ def saved(values: object, folder: Path) -> Path:
 
 
 def test_names_go_to_published_ones_and_back(network) -> None:
-    published = to_published(network, dead_entries=True)
+    published = to_published(network, unused_entries=True)
     assert_same(from_published(published), network.state_dict())
 
 
@@ -205,7 +205,7 @@ def test_weights_of_something_else_are_refused() -> None:
 )
 def test_sizes_of_every_published_network_follow_from_its_weights(architecture, size) -> None:
     config = preset(f"{architecture}-{size}")
-    weights = to_published(outline_network(config), dead_entries=True)
+    weights = to_published(outline_network(config), unused_entries=True)
     assert config_from_published(weights, cfg_of(config, architecture)) == config
 
 
@@ -238,11 +238,11 @@ def test_a_cfg_that_does_not_fit_is_refused(vima_contents, tmp_path, change, mes
     assert str(caught.value).startswith(str(file))
 
 
-@pytest.mark.parametrize("dead_entries", [True, False])
-def test_a_file_becomes_the_network_with_or_without_dead_entries(
-    network, architecture, tmp_path, dead_entries
+@pytest.mark.parametrize("unused_entries", [True, False])
+def test_a_file_becomes_the_network_with_or_without_unused_entries(
+    network, architecture, tmp_path, unused_entries
 ) -> None:
-    loaded = load_published(saved(contents(network, architecture, dead_entries=dead_entries), tmp_path))
+    loaded = load_published(saved(contents(network, architecture, unused_entries=unused_entries), tmp_path))
     assert loaded.config == network.config
     assert not loaded.training
     assert_same(loaded.state_dict(), network.state_dict())

@@ -1,4 +1,4 @@
-"""`openvima policies`: list networks and trained policies, look at one, and convert or export checkpoints."""
+"""`openvima policies`: list networks and trained policies, show one, and convert or export checkpoints."""
 
 import json
 import sys
@@ -18,13 +18,13 @@ FULL_WIDTH = 100  # columns of the terminal that all columns of the table need
 _NOTES = (
     "layers: self-attention, in vima and flamingo with cross-attention to the prompt before it",
     "positions: position tables and learned tokens; images: with the fusion of end effector and image",
-    "The sizes are named after the decoder. `openvima policies show NAME` tells more of one.",
+    "Sizes are named after the decoder parameters. `openvima policies show NAME` prints details.",
 )
 DEFAULT = "list"  # what `openvima policies` does without a further word
 
 
 def list_(*, as_json: Json = False) -> int:
-    """List the named networks with their parameters, part by part, and the trained policies of the package.
+    """List the presets with their parameter counts by part, and the bundled checkpoints.
 
     Example: openvima policies
 
@@ -43,17 +43,17 @@ def list_(*, as_json: Json = False) -> int:
     from openvima.policies.parameter_counts import policy_size
 
     sizes = {name: policy_size(preset(name)) for name in PRESETS}
-    here = {name: policy for name, policy in BUNDLED.items() if policy.is_installed}
-    trained = {name: policy_size(read_info(policy.folder).config) for name, policy in here.items()}
+    installed = {name: policy for name, policy in BUNDLED.items() if policy.is_installed}
+    trained = {name: policy_size(read_info(policy.folder).config) for name, policy in installed.items()}
     if as_json:
         records = [{"name": name, **_record(size)} for name, size in sizes.items()]
-        records += [{"name": name, **_record(trained[name]), **_facts(here[name])} for name in here]
+        records += [{"name": name, **_record(trained[name]), **_facts(installed[name])} for name in installed]
         print(json.dumps(records, indent=1))
         return 0
     _print_table(sizes)
-    for name, policy in here.items():
-        parameters = _millions(trained[name].whole.total)
-        print(f"\n{name}, a trained policy that comes with the package, {parameters} M parameters")
+    for name, policy in installed.items():
+        parameters = _millions(trained[name].parameters.total)
+        print(f"\n{name}, a bundled checkpoint, {parameters} M parameters")
         _print_facts(policy)
     return 0
 
@@ -61,13 +61,13 @@ def list_(*, as_json: Json = False) -> int:
 def show(
     policy: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="POLICY")], *, as_json: Json = False
 ) -> int:
-    """Show one policy: its parameters, part by part, and all of its sizes.
+    """Show one policy: parameter counts by part, and its config.
 
     Example: openvima policies show vima-200m
 
     Args:
-        policy: Name of a preset or of a trained policy of the package, a run folder or checkpoint folder, a
-            published file, or an id on the Hugging Face Hub.
+        policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a published
+            file, or an id on the Hugging Face Hub.
         as_json: Print JSON.
 
     Returns:
@@ -80,10 +80,10 @@ def show(
     from openvima.policies.config import config_to_dict
     from openvima.policies.parameter_counts import policy_size
 
-    config, packaged = _config(policy), BUNDLED.get(policy)
+    config, bundled = _config(policy), BUNDLED.get(policy)
     size = policy_size(config)
     if as_json:
-        facts = _facts(packaged) if packaged else {}
+        facts = _facts(bundled) if bundled else {}
         print(
             json.dumps({"name": policy, **_record(size), **facts, "config": config_to_dict(config)}, indent=1)
         )
@@ -91,10 +91,10 @@ def show(
     import yaml
 
     print(f"{policy}: {_summary(size)}")
-    if packaged:
-        _print_facts(packaged)
+    if bundled:
+        _print_facts(bundled)
     print(f"\n{'part':<10}{'trained':>14}{'frozen':>14}{'total':>14}")
-    for part, count in {**size.parts, "total": size.whole}.items():
+    for part, count in {**size.parts, "total": size.parameters}.items():
         print(f"{part:<10}{count.trainable:>14,}{count.frozen:>14,}{count.total:>14,}")
     print(f"\n{yaml.safe_dump(config_to_dict(config), sort_keys=False)}", end="")
     return 0
@@ -110,20 +110,20 @@ def convert(
 ) -> int:
     """Convert a published .ckpt file, or export the best checkpoint of a run, into a checkpoint folder.
 
-    Nothing in a file is executed. With a checkpoint folder as IN, add a tokenizer, or change the precision of
+    No code in a file is executed. With a checkpoint folder as IN, add a tokenizer, or change the precision of
     the stored weights.
 
     Examples: openvima policies convert 200M.ckpt published-200m --tokenizer t5-base;
     openvima policies convert runs/first mine --precision float16
 
     Args:
-        source: Published file, such as 200M.ckpt, a run folder, of which the best checkpoint is taken, a
-            checkpoint folder, or a trained policy of the package.
-        out: Folder to write to; every `--policy` takes it.
+        source: Published file, such as 200M.ckpt, a run folder, of which the best checkpoint is used, a
+            checkpoint folder, or a bundled checkpoint.
+        out: Folder to write; every `--policy` option accepts it.
         tokenizer: Folder of the tokenizer of T5, or its id on the Hugging Face Hub; stored with the policy.
-        precision: Of the stored weights, whatever the policy computes in later. float16 halves a file of
-            float32 and rounds weights by a part in 2,000; it is computed with in float64 or float32.
-        force: Replace a checkpoint that is there.
+        precision: Of the stored weights. float16 halves the file size of float32, with a relative rounding
+            error of 1/2,000; inference still runs in float64 or float32.
+        force: Replace an existing checkpoint.
 
     Returns:
         Exit status.
@@ -140,10 +140,10 @@ def convert(
 
     network, stored = load_network(source)
     found = tokenizer or stored
-    reader = tokenizer_for(network.config.prompt, found) if found else None
+    loaded_tokenizer = tokenizer_for(network.config.prompt, found) if found else None
     import torch
 
-    save_checkpoint(network, out, reader, dtype=getattr(torch, precision))
+    save_checkpoint(network, out, loaded_tokenizer, dtype=getattr(torch, precision))
     print(f"{source}: {_summary(policy_size(network.config))}")
     print(out)
     if network.config.prompt.tokenizer == "t5" and not found:
@@ -171,10 +171,10 @@ def _config(policy: str) -> "PolicyConfig":
 
 def _summary(size: "PolicySize") -> str:
     layers = "1 layer" if size.num_layers == 1 else f"{size.num_layers} layers"
-    whole = size.whole
+    total = size.parameters
     return (
         f"{size.architecture}, width {size.width}, {layers}, {size.num_heads} heads; "
-        f"{_millions(whole.total)} M parameters, of which {_millions(whole.trainable)} M are trained"
+        f"{_millions(total.total)} M parameters, of which {_millions(total.trainable)} M are trained"
     )
 
 
@@ -200,7 +200,7 @@ def _record(size: "PolicySize") -> dict[str, object]:
         "heads": size.num_heads,
         "parameters": {
             part: {"trainable": count.trainable, "frozen": count.frozen}
-            for part, count in {**size.parts, "total": size.whole}.items()
+            for part, count in {**size.parts, "total": size.parameters}.items()
         },
     }
 
@@ -233,16 +233,16 @@ def _print_table(sizes: dict[str, "PolicySize"]) -> None:
 
 
 def _cells(name: str, size: "PolicySize") -> dict[str, str]:
-    whole = size.whole
+    total = size.parameters
     return {
         "preset": name,
         "width": str(size.width),
         "layers": str(size.num_layers),
         "heads": str(size.num_heads),
         **{part: _millions(count.total) for part, count in size.parts.items()},
-        "total": _millions(whole.total),
-        "trained": _millions(whole.trainable),
-        "frozen": _millions(whole.frozen),
+        "total": _millions(total.total),
+        "trained": _millions(total.trainable),
+        "frozen": _millions(total.frozen),
     }
 
 

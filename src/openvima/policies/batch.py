@@ -1,7 +1,7 @@
-"""Batches as networks take them: padded prompts, observations and targets.
+"""Network inputs: padded batches of prompts, observations and targets.
 
-Images (crops of objects, or whole frames) are named by their index in a stack, so that each is encoded once.
-Index 0 is a blank image and stands for a hidden object.
+Images (crops of objects, or whole frames) are given by their index in a stack, so that each is encoded once.
+Index 0 is a blank image, for hidden objects.
 
 Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, V views, N objects of an
 observation.
@@ -19,7 +19,7 @@ WORD = -1  # object index at a position that holds a word
 
 
 class _Tensors:
-    """A record of tensors that can be moved as a whole."""
+    """A record of tensors that move between devices together."""
 
     __slots__ = ()
 
@@ -31,12 +31,12 @@ class _Tensors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PromptBatch(_Tensors):
-    """Prompts of a batch; image tokens are numbered through the batch.
+    """Padded prompts; image tokens are numbered across the batch.
 
     Args:
         word_ids_BL: Word ids.
-        object_index_BL: Image token at a position, numbered through the first tokens of all objects, then all
-            second ones, and so on; `WORD` for a word.
+        object_index_BL: Image token at a position, in the order of all first tokens, all second tokens, and
+            so on; `WORD` for a word.
         mask_BL: False for padding, and for tokens of objects hidden in their view.
         crop_index_VS: Index of each object's image in the stack.
         boxes_VS4: Boxes in pixels.
@@ -69,7 +69,7 @@ class HistoryBatch(_Tensors):
         positions_BTN2: Table points under the boxes, metres.
         grasps_BTN2: Table points under the most interior pixels, metres.
         end_effector_BT: 0 suction cup, 1 spatula.
-        steps_BT: Which steps exist.
+        steps_BT: False for padding.
     """
 
     crop_index_BTVN: torch.Tensor
@@ -84,7 +84,7 @@ class HistoryBatch(_Tensors):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FalsePositiveBatch:
-    """One false detection for each step and view of a batch, to augment with; all 0 with frames.
+    """One false detection per step and view, for augmentation; all 0 with frames.
 
     Args:
         crop_index: Indices of the crops, shape (B, T, 2).
@@ -106,8 +106,8 @@ class Batch:
         history: Their observations.
         targets: Their actions.
         false_positives: A false detection for each step and view.
-        images: The stack that image indices refer to, shape (K, 3, height, width), uint8; None where that is
-            a stack of all demonstrations.
+        images: The image stack, shape (K, 3, height, width), uint8; None if one stack holds the images of the
+            whole dataset.
     """
 
     prompts: PromptBatch
@@ -117,7 +117,7 @@ class Batch:
     images: torch.Tensor | None = None
 
     def to(self, device: torch.device | str) -> "Batch":
-        """Return the batch on another device; false positives, inserted before, stay."""
+        """Return the batch on another device, except false positives, which are inserted on the CPU."""
         return replace(
             self,
             prompts=self.prompts.to(device),

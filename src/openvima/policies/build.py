@@ -1,4 +1,4 @@
-"""Networks from their configs."""
+"""Build networks from their configs."""
 
 import torch
 
@@ -23,17 +23,16 @@ MODELS: dict[str, type[PolicyNetwork]] = {
 
 
 def build_network(config: PolicyConfig, *, seed: int) -> PolicyNetwork:
-    """Build a network with fresh weights that follow from the seed; global random state does not change."""
+    """Build a network with fresh weights from a seed, leaving the global random state unchanged."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MODELS[config.architecture](config)
 
 
 def outline_network(config: PolicyConfig) -> PolicyNetwork:
-    """Build a network on the meta device: names and shapes, to count parameters or to assign weights.
+    """Build a network on the meta device, to count parameters or to assign weights.
 
-    It takes no time and no memory, whatever the sizes. `network.load_state_dict(weights, assign=True)` makes
-    it usable.
+    It allocates no memory. `network.load_state_dict(weights, assign=True)` makes it usable.
     """
     with MetaInit():
         return MODELS[config.architecture](config)

@@ -189,14 +189,14 @@ def _check(
     """Compare names, shapes and dtypes with those of the network; `dtype` defaults to its own."""
     expected = network.state_dict()
     problems = _size_mismatch(tensors, expected)
-    problems += listed("missing", [name for name in expected if name not in tensors], most=_MAX_LISTED)
-    problems += listed("unexpected", [name for name in tensors if name not in expected], most=_MAX_LISTED)
+    problems += listed("missing", [name for name in expected if name not in tensors], limit=_MAX_LISTED)
+    problems += listed("unexpected", [name for name in tensors if name not in expected], limit=_MAX_LISTED)
     differing = []
     for name, wanted in expected.items():
         want = (dtype or wanted.dtype, tuple(wanted.shape))
         if name in tensors and (have := (tensors[name].dtype, tuple(tensors[name].shape))) != want:
             differing.append(f"{name} is {described(*have)} instead of {described(*want)}")
-    problems += listed("wrong", differing, most=_MAX_LISTED)
+    problems += listed("wrong", differing, limit=_MAX_LISTED)
     if problems:
         raise CheckpointError(
             f"{source} does not fit the network of its {CONFIG_FILE}: {'; '.join(problems)}. "
@@ -214,7 +214,7 @@ def _check_range(stored: Mapping[str, torch.Tensor], weights: Mapping[str, torch
     if overflown:
         dtype = stored[overflown[0]].dtype
         most = f"weights beyond {torch.finfo(dtype).max:.4g}, the most that {described(dtype)} holds"
-        raise CheckpointError(f"{listed(most, overflown, most=_MAX_LISTED)[0]}. Store them in float32.")
+        raise CheckpointError(f"{listed(most, overflown, limit=_MAX_LISTED)[0]}. Store them in float32.")
 
 
 def _size_mismatch(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Configs of all architectures: frozen records of sizes that check themselves."""
+"""Configs of all architectures, as validated frozen dataclasses."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
@@ -20,15 +20,15 @@ ARCHITECTURES: dict[str, type[PolicyConfig]] = {kind.architecture: kind for kind
 
 
 def config_to_dict(config: PolicyConfig) -> dict[str, Any]:  # Any: plain YAML values
-    """Return nested dictionaries of plain values, for files; the architecture comes first."""
+    """Convert to nested dictionaries of plain values, the architecture first."""
     return {"architecture": config.architecture, **asdict(config)}
 
 
 def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whatever a file holds
-    """Build a config from what `config_to_dict` returned.
+    """Inverse of `config_to_dict`.
 
     Raises:
-        ConfigError: A field is missing or unknown, or the sizes contradict each other.
+        ConfigError: A field is missing or unknown, or sizes are inconsistent.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"policy is {values!r}; it must be a mapping of architecture and sizes.")
@@ -49,12 +49,12 @@ def with_autoregression(config: PolicyConfig, wanted: bool = True) -> PolicyConf
     """Return the same network with autoregressive or with independent bins.
 
     Raises:
-        ConfigError: The network points, and has no bins.
+        ConfigError: A pointer network has no action bins.
     """
     if isinstance(config, PointerConfig):
         if not wanted:
             return config
-        raise ConfigError("the pointer models have no autoregressive head; take nano-bins or another preset.")
+        raise ConfigError("pointer models have no autoregressive head; use nano-bins or another preset.")
     head = config.head
     if wanted:
         head = AutoregressiveConfig(head.hidden_width, config.decoder.initial_std, head.action_width)
@@ -93,7 +93,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written 
 
 
 def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written in the dataclass
-    """How well the fields of a record fit a mapping; selects among the records that a field may hold."""
+    """Score how well a mapping matches the fields of a dataclass, to resolve unions."""
     if not is_dataclass(kind) or not isinstance(value, Mapping):
         return 0
     names = {field.name for field in fields(kind)}

@@ -1,4 +1,4 @@
-"""Where networks compute, and with how many threads."""
+"""Devices and number of threads."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +9,10 @@ from openvima.errors import PolicyError
 
 
 def usable_device(device: torch.device | str) -> torch.device:
-    """Return a device after trying it.
+    """Return a device after checking that it works.
 
     Raises:
-        PolicyError: There is no such device here.
+        PolicyError: The device is not available.
     """
     try:
         found = torch.device(device)
@@ -27,7 +27,7 @@ def usable_device(device: torch.device | str) -> torch.device:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Compute with so many threads: other numbers sum in another order, which changes the last bits."""
+    """Set the number of threads; it changes the summation order, and so the last bits of results."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -1,19 +1,19 @@
-"""How error messages tell what differs between weights and a network."""
+"""Error messages about mismatched weights."""
 
 from collections.abc import Sequence
 
 import torch
 
 
-def listed(what: str, names: Sequence[str], *, most: int) -> list[str]:
-    """Compose "what: first, second and 3 more", as a list of one; without names an empty list."""
+def listed(what: str, names: Sequence[str], *, limit: int) -> list[str]:
+    """Return ["what: first, second and 3 more"], or an empty list without names."""
     if not names:
         return []
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return [f"{what}: {', '.join(names[:most])}{more}"]
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return [f"{what}: {', '.join(names[:limit])}{more}"]
 
 
 def described(dtype: torch.dtype, shape: Sequence[int] | None = None) -> str:
-    """Tell a precision, and a shape if there is one, such as "float32 (768, 4)"."""
+    """Format a dtype, and a shape if given, such as "float32 (768, 4)"."""
     name = str(dtype).removeprefix("torch.")
     return name if shape is None else f"{name} {tuple(shape)}"

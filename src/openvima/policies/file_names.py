@@ -1,7 +1,7 @@
-"""Names of the files of a checkpoint folder, and where a run folder keeps such folders."""
+"""File names in checkpoint folders and run folders."""
 
 WEIGHTS_FILE = "model.safetensors"
 CONFIG_FILE = "config.yaml"
 TOKENIZER_FOLDER = "tokenizer"
 CHECKPOINTS_FOLDER = "checkpoints"
-BEST_FILE = "best.txt"  # in the checkpoints folder: name of the best one
+BEST_FILE = "best.txt"  # in the checkpoints folder; contains the name of the best one

@@ -1,4 +1,4 @@
-"""Policies on the Hugging Face Hub. Nothing is asked of it unless a name can only mean a repository there."""
+"""Policies on the Hugging Face Hub. No request is made unless a name can only be a repository id."""
 
 import re
 from importlib import import_module
@@ -10,23 +10,23 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 def is_hub_id(text: str) -> bool:
-    """Whether a text can only mean a repository on the Hub: "owner/name", and no folder here is that owner.
+    """Whether a text can only be a repository id: "owner/name", without a local folder named as the owner.
 
-    So "runs/frist" beside a folder "runs" is a mistyped path, and is not looked for on the Hub.
+    So "runs/frist" beside a folder "runs" is a mistyped path and causes no request.
     """
     owner = text.partition("/")[0]
     return _HUB_ID.fullmatch(text) is not None and not Path(text).exists() and not Path(owner).exists()
 
 
 def fetch_from_hub(hub_id: str, patterns: tuple[str, ...]) -> Path:
-    """Fetch the files of a repository that match the patterns; those fetched before are taken as they are.
+    """Download the files of a repository that match the patterns; cached files are reused.
 
     Args:
         hub_id: The repository, as "owner/name".
-        patterns: Names of files, with `*` for any part.
+        patterns: File names, with `*` as wildcard.
 
     Returns:
-        The folder that holds them.
+        The local folder with the files.
 
     Raises:
         MissingExtraError: `huggingface_hub` is not installed.
@@ -41,10 +41,9 @@ def fetch_from_hub(hub_id: str, patterns: tuple[str, ...]) -> Path:
         ) from error
     try:
         return Path(hub.snapshot_download(hub_id, allow_patterns=list(patterns)))
-    except (
-        Exception
-    ) as error:  # the hub's client passes on those of its HTTP library, which has changed before
+    except Exception as error:  # the client passes on those of its HTTP library, which has changed before
         first_line = str(error).strip().partition("\n")[0] or type(error).__name__
         raise CheckpointError(
-            f"there is no folder {hub_id!r} here, and the Hugging Face Hub did not give it: {first_line}"
+            f"there is no folder {hub_id!r} here, and the download from the Hugging Face Hub failed: "
+            f"{first_line}"
         ) from error

@@ -1,4 +1,4 @@
-"""What a network expects of its inputs."""
+"""Input format of a network."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,10 +8,10 @@ from openvima.perception.kernels import CROP_SIZE
 
 @dataclass(frozen=True, slots=True)
 class InputLayout:
-    """How images become tokens.
+    """How images are tokenized.
 
     Args:
-        tokens: What a token shows: an object in both views, an object in one view, or part of a whole frame.
+        tokens: What a token encodes: an object in both views, an object in one view, or part of a frame.
         image_size: Height and width of a crop or frame.
         tokens_per_frame_pair: With frames, the number of tokens of a pair of them.
     """

@@ -1,4 +1,4 @@
-"""How many parameters a policy has, part by part."""
+"""Parameter counts of a policy by part."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig
 from openvima.policies.nn.policy_network import PolicyNetwork
 
-# Part -> prefixes of its parameters; the first match counts. The published names of sizes, such as 200M,
-# count the blocks of the decoder alone.
+# Part -> prefixes of its parameters; the first match counts. Published size names, such as 200M, count the
+# decoder blocks only.
 PARTS = {
     "prompt": ("prompt.", "coreference."),
     "images": (
@@ -29,7 +29,7 @@ PARTS = {
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Numbers of parameters.
+    """Parameter counts.
 
     Args:
         trainable: Updated in training.
@@ -41,13 +41,13 @@ class Count:
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Trainable and frozen parameters."""
         return self.trainable + self.frozen
 
 
 @dataclass(frozen=True, slots=True)
 class PolicySize:
-    """How large a policy is.
+    """Size of a policy.
 
     Args:
         architecture: vima, gato, flamingo, gpt, midas or pointer.
@@ -64,14 +64,14 @@ class PolicySize:
     parts: Mapping[str, Count]
 
     @property
-    def whole(self) -> Count:
-        """Parameters of all parts together."""
+    def parameters(self) -> Count:
+        """Parameters of all parts."""
         counts = self.parts.values()
         return Count(sum(count.trainable for count in counts), sum(count.frozen for count in counts))
 
 
 def policy_size(config: PolicyConfig) -> PolicySize:
-    """Count the parameters of a network of these sizes without building it."""
+    """Count the parameters of a network without allocating it."""
     decoder = config.decoder
     return PolicySize(
         architecture=config.architecture,

@@ -1,4 +1,4 @@
-"""Named networks. A preset is a function that returns a config; configs check themselves."""
+"""Presets: named functions that return validated configs."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,8 +10,14 @@ from openvima.errors import UnknownPolicyError, unknown_name
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
 
-PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the papers, in all sizes
-# Written out, so that listing the names needs no torch; a test compares them with `sizes.SIZES`.
+PUBLISHED = (
+    "vima",
+    "gato",
+    "flamingo",
+    "gpt",
+    "midas",
+)  # architectures of the papers, available in all sizes
+# Repeats the keys of `sizes.SIZES`, so that listing presets does not import torch; a test compares them.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
 
 

@@ -1,8 +1,8 @@
-"""From prompts and observations to padded batches: one way for training and for acting.
+"""Processor: prompts and observations to padded batches, for training and inference.
 
 Inputs are first preprocessed into tables of objects (`openvima.perception.preprocessing`): by the object
-cache for training, here for acting. Acting is a batch with one step. All steps of a batch are laid out at
-once, without a loop over steps.
+cache in training, here in inference, whose batches have one step. All steps of a batch are padded at once,
+without a loop over steps.
 
 Shape suffixes: see `openvima.policies.batch`.
 """
@@ -35,7 +35,7 @@ from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
 
-if TYPE_CHECKING:  # acting needs no demonstrations
+if TYPE_CHECKING:  # inference needs no demonstrations
     from openvima.data.object_cache.episode import PreprocessedEpisode
 
 MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
@@ -45,15 +45,15 @@ _LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Processor:
-    """Makes the inputs of a network from prompts and observations.
+    """Encodes prompts and observations as network inputs.
 
     Args:
         layout: What a token encodes: "objects", an object in both views; "views", an object in one view (the
             published VIMA); "frames", part of a whole frame.
         image_size: Height and width of a crop or frame.
         tokens_per_frame_pair: With frames, number of tokens of the two frames of a step.
-        tokenizer: Splits text into word ids.
-        extractor: Finds the objects when acting; None takes the segmentation.
+        tokenizer: Tokenizer of prompt text.
+        extractor: Object extractor for inference; None uses the segmentation.
     """
 
     layout: Literal["objects", "views", "frames"]
@@ -69,7 +69,7 @@ class Processor:
         tokenizer: Tokenizer | None = None,
         extractor: ObjectExtractor | None = None,
     ) -> "Processor":
-        """Make the processor for a network that takes such inputs."""
+        """Return a `Processor` for a network with this input layout."""
         return Processor(
             inputs.tokens,
             inputs.image_size,
@@ -80,20 +80,20 @@ class Processor:
 
     @property
     def input_kind(self) -> InputKind:
-        """What the images contain: objects, or whole frames."""
+        """Kind of images: crops of objects, or whole frames."""
         return "frames" if self.layout == "frames" else "objects"
 
     def encode_prompts(
         self, prompts: Sequence[RenderedPrompt], stack: ImageStack | None = None
     ) -> tuple[PromptBatch, ImageStack]:
-        """Encode prompts to act on.
+        """Encode prompts for inference.
 
         Args:
             prompts: One for each episode.
-            stack: Images so far; None begins a new stack.
+            stack: Image stack to extend; None starts a new one.
 
         Returns:
-            The batch, and the stack that its image indices refer to.
+            The batch, and its image stack.
 
         Raises:
             PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
@@ -112,19 +112,19 @@ class Processor:
         num_slots: Sequence[int] | None = None,
         stack: ImageStack | None = None,
     ) -> tuple[HistoryBatch, ImageStack]:
-        """Encode observations to act on.
+        """Encode observations for inference.
 
         Args:
-            histories: Consecutive observations of each episode, just the last one when acting: `rgb` and
-                `segm`, each view name to array, and `ee`, the index of the end effector. `segm` only where it
-                is used.
+            histories: Consecutive observations of each episode, only the last one in inference: `rgb` and
+                `segm`, each view name to array, and `ee`, the index of the end effector. `segm` only if the
+                extractor uses it.
             num_slots: With layout "views", slots of each episode before these observations, the last of
                 `num_slots_BT`; None at the start of episodes. An object keeps its slot when it is hidden in
                 both views, so their number never falls within an episode, as in the published evaluation.
-            stack: Images so far; None begins a new stack.
+            stack: Image stack to extend; None starts a new one.
 
         Returns:
-            The batch, and the stack that its image indices refer to.
+            The batch, and its image stack.
 
         Raises:
             PolicyError: A part or a view is missing, there is no such end effector, or there are too many
@@ -152,7 +152,7 @@ class Processor:
     def batch_prompts(
         self, prompts: Sequence[PreprocessedPrompt], image_offsets: Sequence[int] | None = None
     ) -> PromptBatch:
-        """Pad prompts to equal length and number their objects through.
+        """Pad prompts to equal length and number objects across the batch.
 
         Args:
             prompts: The prompts.
@@ -209,7 +209,7 @@ class Processor:
         for b, t in np.argwhere(steps.exists & (slots_BT == 0))[:1]:
             raise DatasetError(
                 f"episode {episodes[b].seed} of {episodes[b].task} shows no object before action {t}, so "
-                "there is nothing to learn from it; leave it out."
+                "it cannot be trained on; exclude it."
             )
         objects = ObjectTable.concatenate([episode.objects for episode in episodes])
         step, slot = _steps_and_slots(counts)
@@ -239,7 +239,7 @@ class Processor:
         slots_BT: np.ndarray,
         end_effectors: np.ndarray,
     ) -> HistoryBatch:
-        """Lay the objects of all steps out in slots; counts and end effectors have one entry a step."""
+        """Pad the objects of all steps to slots; counts and end effectors have one entry per step."""
         step, slot = _steps_and_slots(counts)
         if self.layout == "views":
             objects = _visible_first(objects, step)
@@ -271,7 +271,7 @@ class Processor:
         return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
 
     def _num_slots(self, steps: "_Steps", counts: np.ndarray, before_B: np.ndarray) -> np.ndarray:
-        """Slots at each step, shape (B, T), int64; with layout "views" their number never falls."""
+        """Slots at each step, shape (B, T), int64; never decreasing with layout "views"."""
         slots_BT = steps.pad(counts)
         if self.layout != "views":
             return slots_BT
@@ -279,10 +279,10 @@ class Processor:
         return np.where(steps.exists, slots_BT, 0)
 
     def _check_count(self, count: int, num_slots: int) -> None:
-        """Refuse an observation without objects, or with more than a history has room for."""
+        """Reject an observation without objects, or with more than the decoder has positions for."""
         if not count and not num_slots:
             raise PolicyError(
-                "the observation shows no object; there is nothing to act on. Check its segmentation, or the "
+                "the observation contains no object. Check its segmentation, or the "
                 "detector and its min_score."
             )
         limit = MAX_POSITIONS // (len(VIEWS) if self.layout == "views" else 1) - 1
@@ -304,10 +304,10 @@ class Processor:
         return FalsePositiveBatch(steps.pad(crop_index), steps.pad(boxes), steps.pad(points))
 
     def _token_sequence(self, prompt: PreprocessedPrompt) -> "_TokenSequence":
-        """Lay out one prompt: words, and one token or several for each object of an image.
+        """Build the token sequence of a prompt: words, and one or more tokens per object of an image.
 
-        With layout "views" every image takes as many slots as the prompt's fullest one, as in the published
-        evaluation: T5 sees by them how far words and images are apart.
+        With layout "views" every image is padded to the slots of the prompt's largest one, as in the
+        published evaluation, where this affects T5's relative positions.
         """
         counts = tuple(prompt.objects_per_image.tolist())
         in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
@@ -327,7 +327,7 @@ class Processor:
         return _TokenSequence(layout, objects, is_scene, mask)
 
     def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
-        """Lay out a text whose images contain so many objects; few texts differ, so layouts are kept."""
+        """Return the cached layout of a text, given the number of objects per image."""
         key = (text, counts, slots)
         if key not in self._layouts:
             if len(self._layouts) >= MAX_LAYOUTS:
@@ -363,8 +363,8 @@ class Processor:
 class _Layout:
     """The tokens of a prompt: word, or row and part of its object.
 
-    `images` is the image of each row, counted in reading order; `order` the rows in reading order, None where
-    they are stored so.
+    `images` is the image of each row, counted in reading order; `order` the rows in reading order, None for
+    the stored order.
     """
 
     words: np.ndarray
@@ -377,7 +377,7 @@ class _Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _TokenSequence:
-    """One prompt: its layout, its objects, which images are scenes, and which tokens count (None: all)."""
+    """One prompt: layout, objects, which images are scenes, and the token mask (None: all valid)."""
 
     layout: _Layout
     objects: ObjectTable
@@ -387,7 +387,7 @@ class _TokenSequence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """Episode `b` and time `t` of each step, and which steps of a padded array exist, (B, T)."""
+    """Episode `b` and time `t` of each step, and the mask of a padded array, (B, T)."""
 
     b: np.ndarray
     t: np.ndarray
@@ -401,7 +401,7 @@ class _Steps:
         return _Steps(b, t, exists)
 
     def pad(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
-        """Spread one row a step over an array of shape (B, T, …)."""
+        """Scatter one row per step into a padded array of shape (B, T, …)."""
         result = np.full((*self.exists.shape, *column.shape[1:]), fill, column.dtype)
         result[self.b, self.t] = column
         return result
@@ -414,7 +414,7 @@ def _steps_and_slots(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _visible_first(objects: ObjectTable, step: np.ndarray) -> ObjectTable:
-    """Sort the objects of each step in each view by itself: visible ones first, then by id."""
+    """Sort the objects of each step separately in each view: visible ones first, then by id."""
     masks = objects.masks
     order = np.stack([np.lexsort((objects.ids, ~masks[:, v], step)) for v in (FRONT, TOP)], axis=1)
     return _reorder_views(objects, order)
@@ -424,7 +424,7 @@ def _compact(objects: ObjectTable, image: np.ndarray, num_images: int) -> tuple[
     """Move the visible objects of each image to the front of each view, in equally many slots.
 
     Returns:
-        Slots of all images, and how many of them the fullest image takes in each view.
+        Slots of all images, and the maximum number per image in each view.
     """
     rows = [np.flatnonzero(visible) for visible in objects.masks.T]
     counts = [np.bincount(image[of_view], minlength=num_images) for of_view in rows]
@@ -441,7 +441,7 @@ def _compact(objects: ObjectTable, image: np.ndarray, num_images: int) -> tuple[
 
 
 def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
-    """Reorder each view by itself, order (N, 2); a row need not be one object afterwards."""
+    """Reorder each view separately, order (N, 2); afterwards a row may mix objects."""
     views = np.arange(len(VIEWS))
     return ObjectTable(
         np.full(len(order), -1),
@@ -452,6 +452,6 @@ def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
 
 
 def _on_table(pixels: np.ndarray, from_top: np.ndarray) -> np.ndarray:
-    """Points under pixels of both views, shape (N, 2, 2): those of the top view where it shows the object."""
+    """Points under pixels of both views, shape (N, 2, 2): from the top view if it shows the object."""
     front = unproject(pixels[:, FRONT], CAMERAS["front"])
     return np.where(from_top[:, None], unproject(pixels[:, TOP], CAMERAS["top"]), front)

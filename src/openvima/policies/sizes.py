@@ -1,4 +1,4 @@
-"""The seven published sizes, and one that trains on a CPU."""
+"""The seven published model sizes, and one that trains on a CPU."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ TUNED_T5_LAYERS = 2  # as in the paper
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A size that every published architecture has.
+    """A model size, for every published architecture.
 
     Args:
         width: Width of the decoder.
@@ -26,7 +26,7 @@ class Size:
         image_width: Width of the image encoder.
         image_layers: Layers of the image encoder.
         image_heads: Heads of the image encoder.
-        resampler_layers: Self layers of VIMA-Flamingo's resampler, and how often they are repeated.
+        resampler_layers: Self-attention layers of VIMA-Flamingo's resampler, and the number of passes.
         hidden_width: Hidden width of the action heads.
         action_width: Width of the features of each part of a past action.
         dropout: Dropout probability.
@@ -54,7 +54,7 @@ class Size:
     def prefix_decoder(self) -> PrefixDecoderConfig:
         """Return the decoder with the prompt as prefix.
 
-        It has twice the layers, since a pair of blocks of the other decoder counts as one.
+        It has twice the layers, since the other decoder counts a pair of blocks as one.
         """
         return PrefixDecoderConfig(
             self.width, 2 * self.num_layers, self.num_heads, self.dropout, self.initial_std
@@ -103,7 +103,7 @@ def _nano() -> Size:
         resampler_layers=2,
         hidden_width=256,
         action_width=64,
-        initial_std=0.05,  # passes as much signal as at width 768; with 0.02 it nearly vanishes
+        initial_std=0.05,  # keeps the signal scale of width 768; with 0.02 it nearly vanishes
     )
 
 

@@ -1,7 +1,7 @@
-"""T5 as the reader of prompts: its tokenizer, and its encoder's weights.
+"""The T5 tokenizer and the pretrained weights of the T5 encoder.
 
-Both come from a local folder, as `save_pretrained` of transformers writes it, or from the Hugging Face Hub.
-Nothing is fetched from there unless an id is given.
+Both come from a local folder in the format of transformers' `save_pretrained`, or from the Hugging Face Hub.
+Nothing is downloaded unless an id is given.
 """
 
 import re
@@ -30,23 +30,23 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")  # T5 may be n
 _FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
 _TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
 _SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
-_SHOWN = 6  # differences that a message lists
+_MAX_LISTED = 6  # differences that a message lists
 
 
 class T5Tokenizer:
-    """The tokenizer of T5, read through transformers.
+    """The T5 tokenizer, loaded through transformers.
 
-    Every word is encoded on its own, with the marker of a word's beginning before it. So a full stop after a
-    placeholder is a word, "▁" and ".", and no marker is left over before a placeholder. That is how published
-    policies read; versions of transformers split whole texts in different ways, but not single words.
+    Every word is encoded separately with the word-start marker. A full stop after a placeholder becomes "▁"
+    and ".", and no marker is left before a placeholder, as in the published policies. Versions of
+    transformers differ in how they split whole texts, but not single words.
 
     Args:
         path_or_hub_id: A folder with `tokenizer.json` (or `spiece.model`, for which transformers needs the
             packages sentencepiece and protobuf), or an id on the Hugging Face Hub such as "t5-base".
 
     Raises:
-        CheckpointError: There is no such tokenizer, or it is not that of T5.
-        MissingExtraError: A package that reads it is not installed.
+        CheckpointError: There is no such tokenizer, or it is not a T5 tokenizer.
+        MissingExtraError: A required package is not installed.
     """
 
     end_id = END_ID
@@ -58,14 +58,14 @@ class T5Tokenizer:
 
     @property
     def vocabulary_size(self) -> int:
-        """Number of ids that `encode` may give."""
+        """Number of ids that `encode` may return."""
         return self._tokenizer.backend_tokenizer.get_vocab_size(with_added_tokens=False)
 
     def encode(self, text: str) -> list[int]:
-        """Turn a piece of text without placeholders into ids, without the end mark.
+        """Encode text without placeholders; no end token is added.
 
         Raises:
-            PromptError: T5 has no ids for a word.
+            PromptError: A word is not in the vocabulary of T5.
         """
         words = text.split()
         unknown = [word for word in words if not self._special_ids.isdisjoint(self._encode_word(word))]
@@ -78,7 +78,7 @@ class T5Tokenizer:
         return [piece for word in words for piece in self._encode_word(word)]
 
     def save(self, folder: str | Path) -> None:
-        """Write the tokenizer's files into a folder, from which `T5Tokenizer` reads it again."""
+        """Write the tokenizer files to a folder, for `T5Tokenizer` to load."""
         self._tokenizer.save_pretrained(str(folder))
 
     def _encode_word(self, word: str) -> list[int]:
@@ -89,22 +89,22 @@ class T5Tokenizer:
 
 
 def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None) -> Tokenizer:
-    """Return the tokenizer that a prompt encoder reads with.
+    """Return the tokenizer of a prompt encoder.
 
     Args:
         config: The prompt encoder.
-        source: Where T5's tokenizer is, for those that need it; see `T5Tokenizer`.
+        source: Folder or Hub id of the T5 tokenizer, where needed; see `T5Tokenizer`.
 
     Raises:
-        PolicyError: It needs T5's tokenizer, and no source is given or the vocabularies differ.
+        PolicyError: The T5 tokenizer is needed, and no source is given or the vocabularies differ.
         CheckpointError: The source has no such tokenizer.
-        MissingExtraError: A package that reads it is not installed.
+        MissingExtraError: A required package is not installed.
     """
     if config.tokenizer == "closed":
         return CLOSED_TOKENIZER
     if source is None:
         raise PolicyError(
-            "this policy reads prompts with the tokenizer of T5, which is not stored with it. Give it as "
+            "this policy needs the tokenizer of T5, which is not stored with it. Give it as "
             "tokenizer=T5Tokenizer(FOLDER), or store it: `openvima policies convert IN OUT --tokenizer "
             "FOLDER`; 't5-base' instead of a folder fetches it from the Hugging Face Hub."
         )
@@ -112,18 +112,18 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
     if tokenizer.vocabulary_size > config.vocabulary_size:
         raise PolicyError(
             f"the tokenizer of {source} has {tokenizer.vocabulary_size} ids, the policy "
-            f"{config.vocabulary_size}; take the tokenizer that belongs to it."
+            f"{config.vocabulary_size}; use the tokenizer of the policy."
         )
     return tokenizer
 
 
 def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
-    """Copy the word embedding and the encoder of T5 into the prompt encoder of a network.
+    """Copy the word embedding and the encoder of T5 into a network's prompt encoder.
 
     Args:
-        network: Its text encoder must have the sizes of the file's; that of the published presets is t5-base.
-        path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (of which only tensors are
-            read, no code), or an id on the Hugging Face Hub such as "t5-base".
+        network: Its text encoder must match the file in size; the published presets use t5-base.
+        path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (loaded with
+            `weights_only`), or an id on the Hugging Face Hub such as "t5-base".
 
     Raises:
         CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.
@@ -134,10 +134,10 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     expected = _expected(network)
     problems = _differences(tensors, expected)
     if problems:
-        more = f"; and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        more = f"; and {len(problems) - _MAX_LISTED} more" if len(problems) > _MAX_LISTED else ""
         raise CheckpointError(
-            f"{file} does not fit the text encoder: {'; '.join(problems[:_SHOWN])}{more}. "
-            "The published presets take t5-base; others a T5 of version 1.0 of their sizes."
+            f"{file} does not fit the text encoder: {'; '.join(problems[:_MAX_LISTED])}{more}. "
+            "The published presets use t5-base; others need a T5 1.0 of their size."
         )
     for name, tensor in expected.items():
         tensor.copy_(tensors[name])
@@ -146,7 +146,7 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
 def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
     folder = _folder(path_or_hub_id, _TOKENIZER_FILES)
     if not any((folder / name).is_file() for name in (_FAST_FILE, _SENTENCEPIECE_FILE)):
-        # Without this check transformers would make up a vocabulary of special tokens alone.
+        # Without this check transformers would return a vocabulary of special tokens only.
         raise CheckpointError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
     if not (folder / _FAST_FILE).is_file():
         _require("sentencepiece", f"{folder / _SENTENCEPIECE_FILE}", "sentencepiece protobuf")
@@ -170,7 +170,7 @@ def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
 
 
 def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
-    """The weights to be copied into, by their names in files of T5; published policies use these as well."""
+    """The network's weights by their names in T5 files, which the published policies share."""
     expected = {"shared.weight": network.prompt.words.weight.detach()}
     for ours, tensor in network.state_dict().items():
         named = to_theirs(PROMPT_RULES, ours) if ours.startswith("prompt.text.") else None
@@ -181,7 +181,7 @@ def _expected(network: PolicyNetwork) -> dict[str, torch.Tensor]:
 
 def _differences(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, torch.Tensor]) -> list[str]:
     missing = [f"it lacks {name}" for name in expected if name not in tensors]
-    unknown = [f"it has {name}, for which there is no place" for name in tensors if name not in expected]
+    unknown = [f"it has {name}, which the network lacks" for name in tensors if name not in expected]
     differing = [
         f"{name} is {tuple(tensors[name].shape)} instead of {tuple(wanted.shape)}"
         for name, wanted in expected.items()
@@ -191,7 +191,7 @@ def _differences(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, tor
 
 
 def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
-    """Read word embedding and encoder; decoder and language model head are left out."""
+    """Load word embedding and encoder, without decoder and language model head."""
     try:
         if file.name == _SAFE_FILE:
             with safe_open(file, framework="pt") as weights:
@@ -218,7 +218,7 @@ def _weights_file(path_or_hub_id: str | Path) -> Path:
 
 
 def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
-    """The folder itself; or, for an id, the folder into which these files are fetched."""
+    """The folder itself; for a Hub id, the folder of the downloaded files."""
     folder, name = Path(path_or_hub_id), str(path_or_hub_id)
     if folder.is_dir():
         return folder

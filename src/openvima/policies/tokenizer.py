@@ -1,7 +1,7 @@
-"""Words and image places of a prompt as numbers, over the benchmark's closed vocabulary.
+"""Tokenizer of prompts over the benchmark's closed vocabulary.
 
-The vocabulary ships with the package, one word a line in `vocabulary.txt`. New words go to its end: the line
-number is the word's id in every checkpoint.
+The vocabulary is in `vocabulary.txt`, one word a line. New words are appended: the line number is the word's
+id in every checkpoint.
 """
 
 import difflib
@@ -22,31 +22,31 @@ _PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|[0-9]+|\S")
 
 @cache
 def word_ids() -> dict[str, int]:
-    """Return every word and punctuation mark with its id; numbers from 0 to 360 lie below them."""
+    """Return the ids of all words and punctuation marks; ids below them are numbers from 0 to 360."""
     text = resources.files("openvima.policies").joinpath("vocabulary.txt").read_text(encoding="utf-8")
     return {word: _FIRST_WORD_ID + index for index, word in enumerate(text.split())}
 
 
 @cache
 def texture_word_ids() -> frozenset[int]:
-    """Return the ids of the words that textures are named by, such as "blue" and "stripe"."""
+    """Return the ids of words in texture names, such as "blue" and "stripe"."""
     words = {word for name in TEXTURES for word in name.split()} - {"and"}
     return frozenset(word_ids()[word] for word in words)
 
 
 def vocabulary_size() -> int:
-    """Number of ids: padding, the end mark, numbers and words."""
+    """Number of ids: padding, end token, numbers and words."""
     return _FIRST_WORD_ID + len(word_ids())
 
 
 def encode_text(text: str) -> list[int]:
-    """Turn a piece of text into ids; case does not matter.
+    """Encode text, ignoring case.
 
     Args:
         text: Words, whole numbers from 0 to 360 and punctuation, without placeholders.
 
     Returns:
-        One id for each word, number or mark; no end mark.
+        One id for each word, number or punctuation mark, without end token.
 
     Raises:
         PromptError: A word or number is not in the vocabulary.
@@ -68,7 +68,7 @@ def encode_text(text: str) -> list[int]:
 
 
 class Tokenizer(Protocol):
-    """Splits the text of prompts into word ids."""
+    """Encodes prompt text as word ids."""
 
     @property
     def end_id(self) -> int:
@@ -76,17 +76,17 @@ class Tokenizer(Protocol):
         ...
 
     def encode(self, text: str) -> list[int]:
-        """Turn a piece of text without placeholders into ids, without the end mark."""
+        """Encode text without placeholders; no end token is added."""
         ...
 
 
 class ClosedTokenizer:
-    """The benchmark's closed vocabulary: a few hundred ids, nothing to download. See `encode_text`."""
+    """The benchmark's closed vocabulary of a few hundred ids, with no download. See `encode_text`."""
 
     end_id = END_ID
 
     def encode(self, text: str) -> list[int]:
-        """Turn a piece of text without placeholders into ids, without the end mark."""
+        """Encode text without placeholders; no end token is added."""
         return encode_text(text)
 
 

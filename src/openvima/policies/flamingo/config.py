@@ -37,7 +37,7 @@ class FlamingoConfig:
 
     @property
     def inputs(self) -> InputLayout:
-        """What the processor makes of images."""
+        """Input format: how images are tokenized."""
         size = (self.frame.image_height, self.frame.image_width)
         return InputLayout("frames", size, tokens_per_frame_pair=self.resampler.num_latents)
 

@@ -34,7 +34,7 @@ class MidasConfig:
 
     @property
     def inputs(self) -> InputLayout:
-        """What the processor makes of images."""
+        """Input format: how images are tokenized."""
         return InputLayout("views")
 
 

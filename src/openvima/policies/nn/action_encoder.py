@@ -1,11 +1,11 @@
-"""Past actions to tokens."""
+"""Encoder of past actions."""
 
 import torch
 from torch import nn
 
 from openvima.policies.nn.mlp import mlp
 
-# Positions and quaternions of both poses in one vector, in this order, as everywhere in the policies.
+# Slices of the action vector: positions and quaternions of both poses, in this order in all policies.
 ACTION_PARTS = {
     "pose0_position": slice(0, 2),
     "pose0_rotation": slice(2, 6),
@@ -16,7 +16,7 @@ ACTION_WIDTH = 12
 
 
 class ActionEncoder(nn.Module):
-    """A past action -> one token: a stack for each of its four parts, then one linear layer."""
+    """A past action -> one token: an MLP for each of its four parts, then a linear layer."""
 
     def __init__(self, part_width: int, width: int) -> None:
         super().__init__()
@@ -26,6 +26,6 @@ class ActionEncoder(nn.Module):
 
     def forward(self, unit_actions: torch.Tensor) -> torch.Tensor:
         """Map actions in unit range, shape (..., 12), to tokens (..., D)."""
-        places = ACTION_PARTS.values()
-        parts = [stack(unit_actions[..., place]) for stack, place in zip(self.parts, places, strict=True)]
+        slices = ACTION_PARTS.values()
+        parts = [layers(unit_actions[..., part]) for layers, part in zip(self.parts, slices, strict=True)]
         return self.out(torch.cat(parts, dim=-1))

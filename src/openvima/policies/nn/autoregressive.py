@@ -80,7 +80,7 @@ class AutoregressiveHead(nn.Module):
         has_previous_BT: torch.Tensor,
         strategy: DecodingStrategy = greedy,
     ) -> tuple[torch.Tensor, KVCache]:
-        """Decode the next action component by component.
+        """Decode the next action autoregressively.
 
         The returned cache ends with the observation: the action joins it with the next one, as it was sent.
         """

@@ -1,4 +1,4 @@
-"""A linear layer that is quick for a few rows, too."""
+"""A linear layer that is fast for few rows."""
 
 from typing import Any
 
@@ -6,22 +6,22 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-# Measured in float32 on one core with AVX-512, at widths of 768: matrices packed for oneDNN take 0.65 of the
-# time of the default kernel with 6 rows, 0.7 with 17, 0.8 with 34 and 0.9 with 90: that kernel rearranges the
-# whole matrix at every call. With more rows there is little to gain, and one row is quick anyway.
+# Measured in float32 on one core with AVX-512 at width 768: weights prepacked for oneDNN take 0.65× the time
+# of the default kernel for 6 rows, 0.7× for 17, 0.8× for 34 and 0.9× for 90, since that kernel repacks the
+# matrix at every call. More rows gain little, and a single row is fast anyway.
 _MAX_ROWS = 128
 _MIN_WEIGHTS = 500_000  # smaller matrices stay in the cache of a core
 _PACKED_FOR_ROWS = 16
 
-# The operations that torch's own compiler uses; there is no public name for them.
+# Private operations that torch.compile uses; there is no public API for them.
 _CAN_PACK = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 class Linear(nn.Linear):
-    """`nn.Linear` that multiplies a few rows on a processor by a packed copy of a large matrix.
+    """`nn.Linear` with prepacked weights for few rows on a CPU, as in inference with a dozen tokens per step.
 
-    Acting is like that: a step has a dozen tokens. The copy is made at the first such call in inference mode,
-    renewed when the weights change, and dropped for training. Results are the same but for rounding.
+    Weights are packed at the first such call in inference mode, repacked when they change, and dropped for
+    training. Results are equal up to rounding.
     """
 
     _packed: torch.Tensor | None = None
@@ -48,13 +48,13 @@ class Linear(nn.Linear):
         return super().train(mode)
 
     def __getstate__(self) -> dict[str, Any]:  # Any: attributes of all kinds
-        """Return what copies and files hold: all but the packed copy."""
+        """Exclude the packed copy from copies and pickles."""
         return {**self.__dict__, "_packed": None, "_packed_version": None}
 
     def _has_few_rows(self, x: torch.Tensor) -> bool:
         return (
             _CAN_PACK
-            and not torch.compiler.is_compiling()  # the compiler packs by itself
+            and not torch.compiler.is_compiling()  # torch.compile packs weights itself
             and torch.is_inference_mode_enabled()
             and self.in_features < x.numel() <= _MAX_ROWS * self.in_features
             and x.dtype == self.weight.dtype == torch.float32

@@ -1,4 +1,4 @@
-"""Layers without initial values, for networks that get their weights from elsewhere or are only counted."""
+"""Construct networks on the meta device, to load weights into or to count parameters."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,8 +7,8 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
-# Draws, and arithmetic on what was drawn. On tensors without values it would be quick but for the first call,
-# at which torch loads its compiler: one to four seconds.
+# Initialisers and the arithmetic on their results. On meta tensors their first call would import torch's
+# compiler, which takes one to four seconds.
 _SKIPPED = {
     nn.init.kaiming_uniform_,
     nn.init.normal_,
@@ -23,7 +23,7 @@ _SKIPPED = {
 
 
 class MetaInit(TorchFunctionMode):
-    """A context in which parameters get shapes but no values; tensors on a device of their own have both."""
+    """A context that creates tensors on the meta device, except those with an explicit device."""
 
     def __torch_function__(
         self,
@@ -32,7 +32,7 @@ class MetaInit(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        """Leave out what fills tensors, and make new ones without values."""
+        """Skip initialisers, and create new tensors on the meta device."""
         kwargs = kwargs or {}
         if func in _SKIPPED:
             return args[0] if args else kwargs["tensor"]

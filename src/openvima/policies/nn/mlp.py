@@ -1,4 +1,4 @@
-"""Stacks of linear layers with ReLU between them, and how layers start."""
+"""MLPs and weight initialisation."""
 
 from collections.abc import Sequence
 
@@ -7,13 +7,13 @@ from torch import nn
 
 
 def mlp(widths: Sequence[int]) -> nn.Sequential:
-    """Build linear layers of the given widths, ReLU between them and nothing after the last.
+    """Build linear layers of the given widths with ReLU between them.
 
     Args:
         widths: Width of the input, of each hidden layer and of the output.
 
     Returns:
-        The stack; weights orthogonal with gain √2, biases 0.
+        The MLP, with orthogonal weights of gain √2 and zero biases.
     """
     layers: list[nn.Module] = []
     for i in range(len(widths) - 1):
@@ -25,7 +25,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
 
 
 def normal_weights(module: nn.Module, std: float) -> None:
-    """Draw all matrices and tables of a module anew, normal with this standard deviation; biases become 0."""
+    """Reinitialise linear and embedding weights with a normal distribution, biases with 0."""
     for part in module.modules():
         if isinstance(part, nn.Linear | nn.Embedding):
             nn.init.normal_(part.weight, std=std)
@@ -34,7 +34,7 @@ def normal_weights(module: nn.Module, std: float) -> None:
 
 
 def scale_last(stack: nn.Sequential, gain: float) -> nn.Sequential:
-    """Make the last layer of a stack orthogonal with another gain; heads start near zero that way."""
+    """Reinitialise the last layer orthogonally with another gain, so that heads start near zero."""
     last = stack[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():

@@ -35,10 +35,10 @@ class ObjectEncoderConfig:
         width: Width of an object token.
         fuse_views: One token for both views of an object, instead of one for each.
         appearance_width: Length of the embedding by which prompt and scene objects are matched; 0 for none.
-        crop_dropout: Probability of dropping an object's crop features from its token in training, against
-            overfitting to the training objects: box and appearance embedding serve unknown objects as well.
+        crop_dropout: Probability of dropping an object's crop features in training, against overfitting to
+            training objects: boxes and appearance embeddings generalise to novel objects.
         rotation_bins: Classes of the relative rotation between two images of an object, 72 for steps of 5
-            degrees; 0 for no such estimate.
+            degrees; 0 disables it.
     """
 
     crop: VitConfig | ConvConfig
@@ -68,7 +68,7 @@ class ObjectEncoder(nn.Module):
     """Crops -> features (`encode_images`), then features and boxes -> tokens (`forward`).
 
     Three objects, views apart: [front 1, front 2, front 3, top 1, top 2, top 3]; fused: [1, 2, 3].
-    The two parts are apart so that the features of crops that never change can be computed once.
+    They are separate so that features of unchanged crops are computed once.
     """
 
     box_units: torch.Tensor
@@ -77,7 +77,7 @@ class ObjectEncoder(nn.Module):
         super().__init__()
         self.config = config
         features = config.crop.output_width
-        # A constant has a device of its own, so that a network without weights has it, too.
+        # A constant is created on the CPU, so that it exists under `MetaInit`, too.
         self.register_buffer("box_units", torch.tensor(_BOX_UNITS, device="cpu"), persistent=False)
         self.crop_encoder = _crop_encoder(config.crop)
         box_widths = (4, config.box_width, config.box_width, config.box_width)
@@ -97,12 +97,12 @@ class ObjectEncoder(nn.Module):
     def forward(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
     ) -> torch.Tensor:
-        """Make tokens.
+        """Encode objects as tokens.
 
         Args:
             features_VNF: Crop features, shape (..., 2, N, F).
             boxes_VN4: Boxes in pixels, shape (..., 2, N, 4), integers.
-            masks_VN: Whether the object is visible in the view, shape (..., 2, N). Only fusing looks at it.
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N). Used for fused views only.
 
         Returns:
             Shape (..., N, D) with fused views, else (..., 2 · N, D), all front slots first.
@@ -119,21 +119,21 @@ class ObjectEncoder(nn.Module):
         if not self.config.fuse_views:
             return torch.cat([self.fusion[v](view) for v, view in enumerate(views)], dim=-2)
         visible = [masks_VN[..., v, :, None].to(features_VNF.dtype) for v in range(NUM_VIEWS)]
-        seen = [view * mask for view, mask in zip(views, visible, strict=True)]
-        return self.fusion[0](torch.cat([*seen, *visible], dim=-1))
+        masked = [view * mask for view, mask in zip(views, visible, strict=True)]
+        return self.fusion[0](torch.cat([*masked, *visible], dim=-1))
 
     def embed_appearance(self, features_VNF: torch.Tensor, masks_VN: torch.Tensor) -> torch.Tensor:
-        """Embed the appearance of objects, independent of where they are.
+        """Embed the appearance of objects, independent of position.
 
         Args:
             features_VNF: Crop features, shape (..., 2, N, F).
             masks_VN: Whether the object is visible in the view, shape (..., 2, N).
 
         Returns:
-            Vectors of length 1, shape (..., N, appearance width); their products are similarities.
+            Unit vectors, shape (..., N, appearance width); dot products are cosine similarities.
         """
-        seen_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
-        both = torch.cat([seen_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
+        masked_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
+        both = torch.cat([masked_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
         return F.normalize(self.appearance(both), dim=-1)
 
     def rotation_between(

@@ -18,13 +18,13 @@ from openvima.policies.nn.text_encoder import TextEncoder, TextEncoderConfig
 
 @dataclass(frozen=True, slots=True)
 class PromptEncoderConfig:
-    """Sizes of the prompt encoder, and what of it is trained.
+    """Config of the prompt encoder.
 
     Args:
         text: The text encoder.
         image_width: Hidden width of the MLP that projects image tokens into the prompt.
         vocabulary_size: Number of word ids.
-        tokenizer: "closed", the benchmark's own vocabulary; or "t5", that of T5, which needs its files.
+        tokenizer: "closed", the benchmark's vocabulary; or "t5", which needs the files of the tokenizer.
         train_words: Whether the word embedding is trained.
         trained_layers: How many of the last layers of the text encoder are trained, with its final norm; 0
             freezes it. None trains all of it, position biases included.
@@ -72,7 +72,7 @@ class PromptEncoder(nn.Module):
         """Encode prompts.
 
         Args:
-            prompts: Word ids, and which image token stands where.
+            prompts: Word ids and positions of image tokens.
             image_tokens_IE: Image tokens.
 
         Returns:
@@ -82,7 +82,7 @@ class PromptEncoder(nn.Module):
         return self.encode(tokens_BLW, images_BLW, prompts.mask_BL)
 
     def embed(self, prompts: PromptBatch, image_tokens_IE: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Embed words and images: the input of the text encoder, and the images of it alone, (B, L, W)."""
+        """Embed words and images: the input of the text encoder, and its image part alone, (B, L, W)."""
         words_BLW = self.words(prompts.word_ids_BL)
         if not len(image_tokens_IE):
             return words_BLW, torch.zeros_like(words_BLW)
@@ -93,7 +93,7 @@ class PromptEncoder(nn.Module):
     def encode(
         self, tokens_BLW: torch.Tensor, images_BLW: torch.Tensor, mask_BL: torch.Tensor
     ) -> torch.Tensor:
-        """Run the text encoder on what `embed` returned, (B, L, D)."""
+        """Run the text encoder on the output of `embed`, (B, L, D)."""
         encoded_BLW = self.text(tokens_BLW, mask_BL)
         return self.out(encoded_BLW + images_BLW if self.visual_residual else encoded_BLW)
 

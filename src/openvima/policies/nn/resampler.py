@@ -1,4 +1,4 @@
-"""The resampler of VIMA-Flamingo: a few learned latents look at many patches.
+"""The resampler of VIMA-Flamingo: a few learned latents attend to many patches.
 
 Source: Perceiver IO (Jaegle et al. 2021), in the shape that the published VIMA-Flamingo code has.
 
@@ -19,11 +19,11 @@ class ResamplerConfig:
     """Sizes of the resampler.
 
     Args:
-        num_latents: Tokens that come out.
-        num_blocks: How often the self layers are run through, with the same weights.
-        num_layers: Self layers.
+        num_latents: Number of output tokens.
+        num_blocks: Passes through the self-attention layers, with shared weights.
+        num_layers: Self-attention layers.
         num_heads: Heads of each layer.
-        dropout: Share of attention weights dropped in training.
+        dropout: Dropout probability of attention weights.
         initial_std: Standard deviation of fresh weights.
     """
 
@@ -36,18 +36,18 @@ class ResamplerConfig:
 
 
 class Resampler(nn.Module):
-    """One look of the latents at the patches, then self-attention among the latents."""
+    """Cross-attention from latents to patches, then self-attention among the latents."""
 
     def __init__(self, config: ResamplerConfig, width: int) -> None:
         super().__init__()
         self.num_blocks = config.num_blocks
         self.latents = nn.Parameter(torch.randn(config.num_latents, width) * config.initial_std)
-        self.cross_layer = ResamplerLayer(width, config, looks_elsewhere=True)
+        self.cross_layer = ResamplerLayer(width, config, cross_attention=True)
         self.self_layers = nn.ModuleList(ResamplerLayer(width, config) for _ in range(config.num_layers))
         normal_weights(self, config.initial_std)
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        """Sum up patches, shape (..., P, D), in latents, shape (..., M, D)."""
+        """Resample patches, shape (..., P, D), to latents, shape (..., M, D)."""
         patches_NPD = patches.flatten(0, -3)
         x_NMD = self.cross_layer(self.latents.expand(len(patches_NPD), -1, -1), patches_NPD)
         for _ in range(self.num_blocks):
@@ -57,13 +57,13 @@ class Resampler(nn.Module):
 
 
 class ResamplerLayer(nn.Module):
-    """Pre-norm attention and a feed-forward that does not widen, both added to their input."""
+    """Pre-norm attention and feed-forward of equal width, both residual."""
 
-    def __init__(self, width: int, config: ResamplerConfig, *, looks_elsewhere: bool = False) -> None:
+    def __init__(self, width: int, config: ResamplerConfig, *, cross_attention: bool = False) -> None:
         super().__init__()
         self.num_heads, self.dropout = config.num_heads, config.dropout
         self.norm_attention = nn.LayerNorm(width)
-        self.norm_source = nn.LayerNorm(width) if looks_elsewhere else None
+        self.norm_source = nn.LayerNorm(width) if cross_attention else None
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width)
         self.value = nn.Linear(width, width)

@@ -1,4 +1,4 @@
-"""A T5-style encoder over words and image tokens: relative positions, RMS norms, no scaling of scores.
+"""T5-style encoder over words and image tokens: relative positions, RMSNorm, unscaled attention scores.
 
 Shape suffixes: B batch, L prompt positions, N those of all prompts up to their ends, H heads, W width, K
 width of one head.
@@ -47,15 +47,15 @@ class TextEncoder(nn.Module):
         nn.init.normal_(self.position_bias.weight, std=config.width**-0.5)
 
     def forward(self, tokens_BLW: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
-        """Let all positions attend to all valid ones.
+        """Encode the sequence with full attention to valid positions.
 
         Args:
             tokens_BLW: Word embeddings and image tokens, shape (B, L, W).
             mask_BL: Which positions are valid, shape (B, L), bool.
 
         Returns:
-            Shape (B, L, W); masked positions are finite and carry no meaning. Those after the last valid
-            one, which pad the batch, are not computed; there it is zero.
+            Shape (B, L, W); masked positions are finite and carry no meaning. Padding after the last valid
+            position is not computed and zero.
         """
         unpadder = Unpadder(mask_BL.flip(1).cumsum(dim=1).flip(1) > 0)
         numbers_L = torch.arange(tokens_BLW.shape[1], device=tokens_BLW.device)
@@ -102,9 +102,9 @@ class TextBlock(nn.Module):
 
 
 class RmsNorm(nn.Module):
-    """Division by the root mean square, and a weight per channel; no mean is subtracted.
+    """RMSNorm: division by the root mean square, and a weight per channel.
 
-    Squares are taken in float32 at least: in half precision they overflow, or lose most of their digits.
+    Squares are computed in float32 at least: in half precision they overflow or lose most of their digits.
     """
 
     def __init__(self, width: int) -> None:

@@ -1,4 +1,4 @@
-"""The vision transformer that turns a crop, or a whole frame, into features.
+"""Vision transformer over a crop or a whole frame.
 
 Shape suffixes: N images, C channels, P patches (after the class token, if there is one), H heads, W width, K
 width of one head.
@@ -30,7 +30,7 @@ class VitConfig:
         patch_size: Side of a patch in pixels.
         image_height: Height of an image in pixels.
         image_width: Width of an image in pixels.
-        class_token: Whether a class token sums up the image in one vector; else each patch gives one.
+        class_token: Whether to return the class token, one vector per image, instead of one per patch.
     """
 
     width: int
@@ -55,7 +55,7 @@ class VitConfig:
 
     @property
     def num_patches(self) -> int:
-        """How many patches tile an image."""
+        """Number of patches of an image."""
         return (self.image_height // self.patch_size) * (self.image_width // self.patch_size)
 
 
@@ -71,7 +71,7 @@ class VisionTransformer(nn.Module):
     def __init__(self, config: VitConfig) -> None:
         super().__init__()
         width, scale = config.width, config.width**-0.5
-        # Constants have a device of their own, so that a network without weights has them, too.
+        # Constants are created on the CPU, so that they exist under `MetaInit`, too.
         mean, std = torch.tensor(PIXEL_MEAN, device="cpu"), torch.tensor(PIXEL_STD, device="cpu")
         self.register_buffer("pixel_mean", mean.view(3, 1, 1), persistent=False)
         self.register_buffer("pixel_std", std.view(3, 1, 1), persistent=False)
@@ -94,7 +94,7 @@ class VisionTransformer(nn.Module):
             Shape (N, output_width), or (N, P, output_width) without a class token, in the precision of the
             weights.
         """
-        pixels = images_NCYX.to(self.positions.dtype) / 255  # a copy, so that what follows can be in place
+        pixels = images_NCYX.to(self.positions.dtype) / 255  # a copy, so the next operations can be in place
         x_NPW = self.patches(pixels.sub_(self.pixel_mean).div_(self.pixel_std)).flatten(2).transpose(1, 2)
         if self.class_token is not None:
             x_NPW = torch.cat([self.class_token.expand(len(x_NPW), 1, -1), x_NPW], dim=1)
@@ -104,7 +104,7 @@ class VisionTransformer(nn.Module):
             x_NPW = block(x_NPW)
         if self.class_token is None:
             return self.projection(self.norm_after(last_block(x_NPW)))
-        return self.projection(self.norm_after(last_block(x_NPW, num_read=1)[:, 0]))
+        return self.projection(self.norm_after(last_block(x_NPW, num_queries=1)[:, 0]))
 
 
 class VitBlock(nn.Module):
@@ -120,13 +120,13 @@ class VitBlock(nn.Module):
         self.widen = Linear(width, 4 * width)
         self.narrow = Linear(4 * width, width)
 
-    def forward(self, x_NPW: torch.Tensor, *, num_read: int | None = None) -> torch.Tensor:
-        """Map tokens to tokens, shape (N, P, W); only the first few of them if no more are read."""
+    def forward(self, x_NPW: torch.Tensor, *, num_queries: int | None = None) -> torch.Tensor:
+        """Map tokens to tokens, shape (N, P, W); only the first `num_queries` if given."""
         packed = self.query_key_value(self.norm_attention(x_NPW))
         # (N, P, 3·W) -> (3, N, H, P, K)
         query, key, value = packed.unflatten(-1, (3, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(query[:, :, :num_read], key, value)
-        x_NPW = x_NPW[:, :num_read] + self.attention_out(mixed.transpose(1, 2).flatten(2))
+        mixed = F.scaled_dot_product_attention(query[:, :, :num_queries], key, value)
+        x_NPW = x_NPW[:, :num_queries] + self.attention_out(mixed.transpose(1, 2).flatten(2))
         hidden = self.widen(self.norm_mlp(x_NPW))
         return x_NPW + self.narrow(hidden * torch.sigmoid(1.702 * hidden))  # QuickGELU
 

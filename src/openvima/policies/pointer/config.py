@@ -124,7 +124,7 @@ class PointerConfig:
 
     @property
     def inputs(self) -> InputLayout:
-        """What the processor makes of images."""
+        """Input format: how images are tokenized."""
         return InputLayout("objects")
 
 

@@ -1,4 +1,4 @@
-"""Reading a published checkpoint file, without executing anything that is in it."""
+"""Load published checkpoint files without executing code from them."""
 
 import pickle
 import re
@@ -15,26 +15,26 @@ from openvima.policies.build import outline_network
 from openvima.policies.differences import described, listed
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.config import config_from_published
-from openvima.policies.published.names import from_published, is_dead, to_published, without_prefix
+from openvima.policies.published.names import from_published, is_unused, to_published, without_prefix
 
 _ZIP_START = b"PK\x03\x04"
-_SHOWN = 20  # names of each kind of problem that a message lists
+_MAX_LISTED = 20  # names that a message lists per kind of problem
 
 
 def load_published(file: str | Path) -> PolicyNetwork:
-    """Read a network from a published file, such as `2M.ckpt`.
+    """Load a network from a published file, such as `2M.ckpt`.
 
     Args:
-        file: A torch archive that holds `state_dict` and `cfg`, of VIMA or one of its baselines. Entries
-            without effect may be there or not.
+        file: A torch archive that holds `state_dict` and `cfg`, of VIMA or one of its baselines. Unused
+            entries are optional.
 
     Returns:
         The network, in float32 and in evaluation mode.
 
     Raises:
-        CheckpointError: The file is missing, damaged or something else, it wants code to be executed, or
-            its weights do not fit its `cfg`. One message tells the names that are missing or too many and
-            the wrong shapes, up to 20 of each.
+        CheckpointError: The file is missing, damaged or of another format, it would execute code, or its
+            weights do not match its `cfg`. One message lists missing and unexpected names and wrong shapes,
+            up to 20 of each.
     """
     file = Path(file)
     weights, cfg = _contents(file, _unpickled(file))
@@ -53,7 +53,7 @@ def _unpickled(file: Path) -> Any:  # Any: whatever the file holds
         return torch.load(file, map_location="cpu", weights_only=True)
     except MemoryError:
         raise
-    except Exception as error:  # a file made to do harm can fail in any way
+    except Exception as error:  # a malicious file can fail in any way
         raise CheckpointError(f"{file} {_refusal(error)}") from error
 
 
@@ -69,7 +69,7 @@ def _refusal(error: Exception) -> str:
 
 
 def _check_archive(file: Path) -> None:
-    """Refuse what is no whole zip archive; torch itself does not notice damaged weights."""
+    """Reject incomplete or damaged zip archives; torch itself does not detect damaged weights."""
     if not file.is_file():
         raise CheckpointError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
     if not zipfile.is_zipfile(file):
@@ -95,22 +95,24 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
         not isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
     ):
         keys = list(map(str, values)) if isinstance(values, Mapping) else []
-        found = listed("the keys", keys, most=_SHOWN) or [f"a {type(values).__name__}"]
+        found = listed("the keys", keys, limit=_MAX_LISTED) or [f"a {type(values).__name__}"]
         raise CheckpointError(
             f"{file} holds {found[0]}; a published checkpoint holds the mappings state_dict and cfg. "
-            "Weights alone do not tell the number of heads."
+            "The number of heads cannot be inferred from weights alone."
         )
     weights = values["state_dict"]
     others = [str(name) for name, value in weights.items() if not isinstance(value, torch.Tensor)]
     if others or not all(isinstance(name, str) for name in weights):
-        raise CheckpointError(f"{file}: state_dict holds more than weights: {', '.join(others[:_SHOWN])}.")
+        raise CheckpointError(
+            f"{file}: state_dict holds more than weights: {', '.join(others[:_MAX_LISTED])}."
+        )
     return weights, values["cfg"]
 
 
 def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> None:
     """Compare published names and shapes with what the network expects."""
     expected = to_published(network)
-    given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_dead(name)}
+    given = {name: tensor for name, tensor in without_prefix(weights).items() if not is_unused(name)}
     wrong = [
         f"{name} is {described(given[name].dtype, given[name].shape)} instead of "
         f"{described(wanted.dtype, wanted.shape)}"
@@ -118,9 +120,9 @@ def _check_fit(network: PolicyNetwork, weights: Mapping[str, torch.Tensor]) -> N
         if name in given and (given[name].shape != wanted.shape or not given[name].is_floating_point())
     ]
     problems = [
-        *listed("missing", [name for name in expected if name not in given], most=_SHOWN),
-        *listed("unexpected", [name for name in given if name not in expected], most=_SHOWN),
-        *listed("wrong", wrong, most=_SHOWN),
+        *listed("missing", [name for name in expected if name not in given], limit=_MAX_LISTED),
+        *listed("unexpected", [name for name in given if name not in expected], limit=_MAX_LISTED),
+        *listed("wrong", wrong, limit=_MAX_LISTED),
     ]
     if problems:
         raise CheckpointError(f"the weights do not fit the network of their cfg: {'; '.join(problems)}.")

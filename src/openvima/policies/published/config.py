@@ -1,4 +1,4 @@
-"""Sizes of a published network, as far as its weights and its `cfg` tell them."""
+"""Config of a published network, inferred from its weights and `cfg`."""
 
 import re
 from collections.abc import Mapping
@@ -15,40 +15,40 @@ from openvima.policies.published.names import adapter_of, without_prefix
 from openvima.policies.published.rules import T5, PublishedAdapter
 from openvima.policies.sizes import SIZES, TUNED_T5_LAYERS, Size
 
-_USUAL = SIZES["2m"]  # what a size is taken from where its weight is missing
+_DEFAULTS = SIZES["2m"]  # sizes to use where a weight is missing
 
 
 @dataclass(frozen=True, slots=True)
 class _Shapes:
-    """Shapes of weights by published name; some may be missing, which is given when they are loaded."""
+    """Shapes of weights by published name; missing ones are reported on loading."""
 
     shapes: Mapping[str, tuple[int, ...]]
 
-    def length(self, name: str, axis: int, *, otherwise: int) -> int:
-        """Length of one axis of a weight, or what to take if there is no such weight."""
+    def length(self, name: str, axis: int, *, default: int) -> int:
+        """Length of one axis of a weight, or the default if it is missing."""
         shape = self.shapes.get(name, ())
-        return shape[axis] if axis < len(shape) else otherwise
+        return shape[axis] if axis < len(shape) else default
 
-    def count(self, stem: str, *, otherwise: int) -> int:
-        """How many numbers follow the stem of a name, or what to take if there are none."""
+    def count(self, stem: str, *, default: int) -> int:
+        """Number of layers with this name stem, or the default if there are none."""
         pattern = re.compile(re.escape(stem) + r"\.(\d+)\.")
         found = {match[1] for name in self.shapes if (match := pattern.match(name))}
-        return len(found) or otherwise
+        return len(found) or default
 
 
 def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str, object]) -> PolicyConfig:
-    """Find out the sizes of a published network.
+    """Infer the config of a published network.
 
     Args:
-        weights: Its weights by published name, with or without `policy.` before it.
-        cfg: What lies beside them in the file. Heads are known from here only.
+        weights: Weights by published name, with or without the prefix `policy.`.
+        cfg: The `cfg` entry of the file, the only source of the number of heads.
 
     Returns:
         The config; as in the paper, words are frozen and the last two layers of T5 are trained.
 
     Raises:
-        CheckpointError: The weights are of none of the four policies, or `cfg` lacks an entry or contradicts
-            the weights.
+        CheckpointError: The weights belong to none of the four policies, or `cfg` lacks an entry or
+            contradicts them.
     """
     adapter = adapter_of(weights)
     shapes = _Shapes({name: tuple(tensor.shape) for name, tensor in without_prefix(weights).items()})
@@ -62,14 +62,14 @@ def config_from_published(weights: Mapping[str, torch.Tensor], cfg: Mapping[str,
             num_layers=decoder.num_layers,
             num_heads=decoder.num_heads,
             prompt=_prompt(shapes),
-            image_width=shapes.length(f"{vit}.conv1.weight", 0, otherwise=_USUAL.image_width),
-            image_layers=shapes.count(f"{vit}.blocks", otherwise=_USUAL.image_layers),
-            hidden_width=shapes.length(classifier, 0, otherwise=_USUAL.hidden_width),
-            action_width=shapes.length(action, 0, otherwise=_USUAL.action_width),
+            image_width=shapes.length(f"{vit}.conv1.weight", 0, default=_DEFAULTS.image_width),
+            image_layers=shapes.count(f"{vit}.blocks", default=_DEFAULTS.image_layers),
+            hidden_width=shapes.length(classifier, 0, default=_DEFAULTS.hidden_width),
+            action_width=shapes.length(action, 0, default=_DEFAULTS.action_width),
         )
         return replace(adapter.build(size), decoder=decoder)
     except ConfigError as error:
-        raise CheckpointError(f"these weights make no network: {error}") from error
+        raise CheckpointError(f"the weights give no valid config: {error}") from error
 
 
 def _decoder(
@@ -79,8 +79,8 @@ def _decoder(
     width, num_layers, *heads = given.values()
     name = adapter.decoder
     found = (
-        shapes.length(f"{name}.positions_embed.weight", 1, otherwise=width),
-        shapes.count(f"{name}.h", otherwise=num_layers),
+        shapes.length(f"{name}.positions_embed.weight", 1, default=width),
+        shapes.count(f"{name}.h", default=num_layers),
     )
     wrong = [
         f"{entry} {given[entry]}, but the weights have {value}"
@@ -88,7 +88,7 @@ def _decoder(
         if given[entry] != value
     ]
     if wrong:
-        raise CheckpointError(f"cfg says {'; '.join(wrong)}. They do not belong together.")
+        raise CheckpointError(f"cfg says {'; '.join(wrong)}. They do not match.")
     try:
         kind = PrefixDecoderConfig if adapter.architecture in ("gato", "gpt") else DecoderConfig
         return kind(width, num_layers, *heads)
@@ -106,25 +106,25 @@ def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, in
 
 
 def _prompt(shapes: _Shapes) -> PromptEncoderConfig:
-    usual, words = _USUAL.prompt, "prompt_embedding._embed_layer.weight"
+    defaults, words = _DEFAULTS.prompt, "prompt_embedding._embed_layer.weight"
     attention = f"{T5}.block.0.layer.0.SelfAttention"
     num_heads = shapes.length(
-        f"{attention}.relative_attention_bias.weight", 1, otherwise=usual.text.num_heads
+        f"{attention}.relative_attention_bias.weight", 1, default=defaults.text.num_heads
     )
-    inner = usual.text.num_heads * usual.text.head_width
+    inner = defaults.text.num_heads * defaults.text.head_width
     text = TextEncoderConfig(
-        width=shapes.length(words, 1, otherwise=usual.text.width),
-        num_layers=shapes.count(f"{T5}.block", otherwise=usual.text.num_layers),
+        width=shapes.length(words, 1, default=defaults.text.width),
+        num_layers=shapes.count(f"{T5}.block", default=defaults.text.num_layers),
         num_heads=num_heads,
-        head_width=shapes.length(f"{attention}.q.weight", 0, otherwise=inner) // max(num_heads, 1),
+        head_width=shapes.length(f"{attention}.q.weight", 0, default=inner) // max(num_heads, 1),
         hidden_width=shapes.length(
-            f"{T5}.block.0.layer.1.DenseReluDense.wi.weight", 0, otherwise=usual.text.hidden_width
+            f"{T5}.block.0.layer.1.DenseReluDense.wi.weight", 0, default=defaults.text.hidden_width
         ),
     )
     return PromptEncoderConfig(
         text,
-        image_width=shapes.length("prompt_obj_post_layer.0.weight", 0, otherwise=usual.image_width),
-        vocabulary_size=shapes.length(words, 0, otherwise=usual.vocabulary_size),
+        image_width=shapes.length("prompt_obj_post_layer.0.weight", 0, default=defaults.image_width),
+        vocabulary_size=shapes.length(words, 0, default=defaults.vocabulary_size),
         tokenizer="t5",
         train_words=False,
         trained_layers=min(TUNED_T5_LAYERS, text.num_layers),

@@ -1,4 +1,4 @@
-"""Weights from published names to ours, and back."""
+"""Convert weights between published names and ours."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -16,10 +16,10 @@ from openvima.policies.published.rules import T5, PublishedAdapter, to_ours, to_
 from openvima.policies.vima.published import ADAPTER as VIMA
 
 PREFIX = "policy."  # before every name in a file
-_UNUSED_VOCABULARY_SIZE = 40478  # words of the first GPT: Gato and GPT carry an embedding of them along
+_UNUSED_VOCABULARY_SIZE = 40478  # of the first GPT, whose unused embedding Gato and GPT contain
 ADAPTERS = {adapter.architecture: adapter for adapter in (VIMA, GATO, FLAMINGO, GPT)}
-# Counters, masks and embeddings that are in the files and that nothing looks at.
-_DEAD = re.compile(
+# Unused position counters, masks and embeddings of the files.
+_UNUSED = re.compile(
     r"(xattn_gpt|transformer\.lm)\.(position_ids|xattn_position_ids|h\.\d+\.attn\.bias)"
     r"|xattn_gpt\.xattns\.\d+\.kv_position_ids"
     r"|transformer\.lm\.tokens_embed\.weight"
@@ -27,13 +27,13 @@ _DEAD = re.compile(
 )
 
 
-def is_dead(name: str) -> bool:
-    """Whether a published name, without prefix, is that of an entry without effect."""
-    return _DEAD.fullmatch(name) is not None
+def is_unused(name: str) -> bool:
+    """Whether a published name, without prefix, is an unused entry."""
+    return _UNUSED.fullmatch(name) is not None
 
 
 def without_prefix(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return published weights without the `policy.` that stands before every name in a file."""
+    """Remove the prefix `policy.` from the names of published weights."""
     return {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
 
 
@@ -41,7 +41,7 @@ def adapter_of(weights: Iterable[str]) -> PublishedAdapter:
     """Recognise the architecture of weights by their published names.
 
     Raises:
-        CheckpointError: To none of the four.
+        CheckpointError: It is none of the four.
     """
     names = {name.removeprefix(PREFIX) for name in weights}
     if any(name.startswith("obj_encoder.bbox_mlp.") for name in names):
@@ -60,11 +60,10 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     """Rename published weights to their names in this package.
 
     Args:
-        weights: Weights by published name, with or without `policy.` before it.
+        weights: Weights by published name, with or without the prefix `policy.`.
 
     Returns:
-        Weights in float32, matrices as (out, in). Entries without effect are left out; names that no
-        published policy has stay as they are.
+        Weights in float32, matrices as (out, in). Unused entries are dropped; unknown names are unchanged.
 
     Raises:
         CheckpointError: The names are not those of VIMA or one of its baselines.
@@ -72,13 +71,13 @@ def from_published(weights: Mapping[str, torch.Tensor]) -> dict[str, torch.Tenso
     adapter = adapter_of(weights)
     result = {}
     for name, tensor in without_prefix(weights).items():
-        if not is_dead(name):
+        if not is_unused(name):
             ours, transposed = to_ours(adapter.rules, name) or (name, False)
             result[ours] = _converted(tensor, transposed)
     return result
 
 
-def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[str, torch.Tensor]:
+def to_published(network: PolicyNetwork, *, unused_entries: bool = False) -> dict[str, torch.Tensor]:
     """Give the weights of a network their published names, without `policy.` before them.
 
     Numbers of heads are not in the weights; a file gives those of the decoder in its `cfg`, and all image
@@ -86,7 +85,7 @@ def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[
 
     Args:
         network: Of the published architecture, in any size, with or without weights.
-        dead_entries: Add the entries without effect, which the published code demands.
+        unused_entries: Add the entries without effect, which the published code demands.
 
     Returns:
         Weights in float32, matrices as they are published. They may share memory with the network.
@@ -108,10 +107,10 @@ def to_published(network: PolicyNetwork, *, dead_entries: bool = False) -> dict[
             f"this network has parts that no published policy has: {', '.join(without_name)}. "
             "Only presets of the form vima-…, gato-…, flamingo-… and gpt-… have published names."
         )
-    return {**result, **_dead_entries(network)} if dead_entries else result
+    return {**result, **_unused_entries(network)} if unused_entries else result
 
 
-def _dead_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
+def _unused_entries(network: PolicyNetwork) -> dict[str, torch.Tensor]:
     """Entries without effect; unused embeddings are those in use, or zero."""
     words = _converted(network.prompt.words.weight, transposed=False)
     positions = torch.arange(MAX_POSITIONS, device=words.device)

@@ -30,7 +30,7 @@ class Rule:
 
 
 def stack_rules(published: str, ours: str, num_layers: int) -> tuple[Rule, ...]:
-    """A stack of linear layers: there two layers without weights lie between them, here one."""
+    """An MLP: two layers without weights between linear ones there, one here."""
     return tuple(Rule(f"{published}.{3 * i}", f"{ours}.{2 * i}") for i in range(num_layers))
 
 
@@ -125,7 +125,7 @@ PREFIX_RULES = (
 
 @dataclass(frozen=True, slots=True)
 class PublishedAdapter:
-    """How published files of one architecture are read.
+    """How to load published files of one architecture.
 
     Args:
         architecture: Its name.

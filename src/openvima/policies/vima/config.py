@@ -38,7 +38,7 @@ class VimaConfig:
 
     @property
     def inputs(self) -> InputLayout:
-        """What the processor makes of images."""
+        """Input format: how images are tokenized."""
         return InputLayout("objects" if self.images.fuse_views else "views")
 
 
