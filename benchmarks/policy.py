@@ -1,18 +1,17 @@
-"""How fast the policies decide and learn: on one core, and on a GPU where there is one.
+"""Speed of inference and training of the policies, on one CPU core and on a GPU if available.
 
     python benchmarks/policy.py [--quick] [--decisions] [--rounds R] [--json FILE]
 
-Weights are random and words are numbered by a hash; neither changes the time. Observations are those of
-episodes that the oracle plays. The processor computes in float32, as the original does; what one decision of
-a preset takes is measured in float64, too, in which `openvima evaluate` computes.
+Weights are random and word ids are hashes; neither affects the time. Observations come from oracle rollouts.
+The CPU benchmarks run in float32, as the original does; single steps of a preset are also measured in
+float64, the default of `openvima evaluate`.
 
-A decision at history 5 is the fifth of an episode, from images to action. Against it stand reading everything
-anew (the prompt with T5-base, the crops of prompt and all steps, the decoder over all steps), the same with
-equal crops encoded once, and the original's way (prompt and tokens are kept, the decoder reads all steps
-again). None of these three is charged for cutting out crops, which the first one is. Ways take turns; medians
-are reported. Times of one decision are given as processor time as well, which other work on the machine
-lengthens less than that of a clock, and with the 90th percentile over episodes and rounds. `--decisions`
-measures nothing else.
+A step at history length 5 is the fifth of an episode, from images to action. It is compared with inference
+without caches (prompt with T5-base, crops of the prompt and all steps, decoder over all steps), the same with
+equal crops encoded once, and the original implementation (cached prompt and tokens, decoder over all steps).
+Only the first one includes cropping. Alternatives run in alternating rounds; medians are reported. Times of a
+single step are also given as CPU time, which is less sensitive to other load, and with the 90th percentile
+over episodes and rounds. `--decisions` measures nothing else.
 """
 
 import argparse

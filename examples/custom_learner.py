@@ -4,10 +4,10 @@
     PYTHONPATH=examples openvima train --data demos --preset custom_learner:make --out run
     PYTHONPATH=examples python examples/custom_learner.py run
 
-The training loop gives it recipes, exact resuming, validation, several processes and half precision. Two
-methods are needed: `collator` says how demonstrations become a batch, `forward` what its loss is. This one
-embeds crops of objects, picks what looks most like the first image of the prompt, and puts it down on what
-looks most like the last.
+The training loop provides recipes, exact resuming, validation, multi-process training and mixed precision. A
+learner needs two methods: `collator` makes batches of demonstrations, `forward` returns the loss. This one
+embeds object crops, picks the object most similar to the first prompt image, and places it on the object
+most similar to the last one.
 """
 
 import sys
@@ -26,7 +26,7 @@ from openvima.training.learner import Learner, PolicyCollate
 
 
 class Matcher(Learner):
-    """Points at objects in view by their likeness to the first and the last image of the prompt."""
+    """Points at the objects most similar to the first and the last prompt image."""
 
     score = "pick_accuracy"
 
@@ -36,30 +36,32 @@ class Matcher(Learner):
         self.embed = nn.Sequential(*layers, nn.Linear(256, 64))
 
     def collator(self):
-        """The crops, boxes and targets that policies of the package learn from; 5 % false detections."""
+        """The crops, boxes and targets of the built-in policies, with 5 % false detections."""
         return PolicyCollate(Processor("objects"), 0.05, with_images=True)
 
     def forward(self, batch):
-        """Cross-entropy of the object to pick and of the one to place it on."""
-        looks = self.looks(batch.images, batch.history.crop_index_BTVN.movedim(2, -1))  # (B, T, N, 64)
-        wanted = self.looks(batch.images, batch.prompts.crop_index_VS.T)  # one row an object of the prompts
-        rows = batch.prompts.object_index_BL  # which of them stands where in each prompt; negative for words
-        first, last = (wanted[torch.stack([row[row >= 0][end] for row in rows])] for end in (0, -1))
+        """Cross-entropy of the object to pick and of the object to place it on."""
+        appearance = self.embed_objects(
+            batch.images, batch.history.crop_index_BTVN.movedim(2, -1)
+        )  # (B, T, N, 64)
+        prompt_objects = self.embed_objects(batch.images, batch.prompts.crop_index_VS.T)
+        rows = batch.prompts.object_index_BL  # prompt object at each position; negative for words
+        first, last = (prompt_objects[torch.stack([row[row >= 0][end] for row in rows])] for end in (0, -1))
         hidden = ~batch.history.masks_BTVN.any(dim=2)
         losses, metrics = [], {}
         for name, image, slots in (
             ("pick", first, batch.targets.pick_BT),
             ("place", last, batch.targets.place_BT),
         ):
-            scores = torch.einsum("btnd,bd->btn", looks, image).masked_fill(hidden, -1e4)[slots >= 0]
+            scores = torch.einsum("btnd,bd->btn", appearance, image).masked_fill(hidden, -1e4)[slots >= 0]
             losses.append(F.cross_entropy(scores, slots[slots >= 0]))
             metrics[f"{name}_accuracy"] = (scores.argmax(-1) == slots[slots >= 0]).float().mean()
         return sum(losses), metrics
 
-    def looks(self, images, numbers):
-        """Embed objects by their crops in both views: (..., 2) numbers of images to (..., 64)."""
-        crops = images[numbers].flatten(-4, -3).float() / 255  # the views become channels
-        return 8 * F.normalize(self.embed(crops.flatten(0, -4)), dim=-1).unflatten(0, numbers.shape[:-1])
+    def embed_objects(self, images, crop_index):
+        """Embed objects from their crops in both views: crop indices (..., 2) to (..., 64)."""
+        crops = images[crop_index].flatten(-4, -3).float() / 255  # views as channels
+        return 8 * F.normalize(self.embed(crops.flatten(0, -4)), dim=-1).unflatten(0, crop_index.shape[:-1])
 
 
 class MatcherPolicy:
@@ -71,30 +73,30 @@ class MatcherPolicy:
         self.network.eval()
 
     def reset(self, prompts):
-        """Begin a batch of episodes."""
+        """Start a batch of episodes."""
         images = [[part for part in prompt.sequence() if not isinstance(part, str)] for prompt in prompts]
-        self.wanted = [[observe_prompt_image(shown[end]) for end in (0, -1)] for shown in images]
+        self.targets = [[observe_prompt_image(each[end]) for end in (0, -1)] for each in images]
 
     @torch.no_grad()
     def act(self, observations):
-        """Decide for every episode that is not over."""
-        pairs = zip(self.wanted, observations, strict=True)
-        return [None if seen is None else self._decide(wanted, observe(seen)) for wanted, seen in pairs]
+        """Return an action for every running episode."""
+        pairs = zip(self.targets, observations, strict=True)
+        return [None if each is None else self._action(targets, observe(each)) for targets, each in pairs]
 
-    def _decide(self, wanted, objects):
-        looks = self._looks(objects)
-        pick, place = ((looks @ self._looks(image)[0]).argmax().item() for image in wanted)
+    def _action(self, targets, objects):
+        appearance = self._embed(objects)
+        pick, place = ((appearance @ self._embed(image)[0]).argmax().item() for image in targets)
         points = objects.grasp_points()[pick], objects.positions()[place]
         return Action.planar(*(tuple(point) for point in points), 0.0).to_arrays()
 
-    def _looks(self, objects):
+    def _embed(self, objects):
         images = torch.from_numpy(objects.crops).flatten(0, 1)  # front views, then top views
-        numbers = torch.arange(len(images)).view(2, -1).T
-        return self.network.looks(images, numbers)
+        crop_index = torch.arange(len(images)).view(2, -1).T
+        return self.network.embed_objects(images, crop_index)
 
 
 def make():
-    """What `--preset custom_learner:make` calls."""
+    """Entry point of `--preset custom_learner:make`."""
     return Matcher()
 
 

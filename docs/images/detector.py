@@ -1,4 +1,4 @@
-"""Make detector.png beside this file: the stages of the detector on one frame, with ground-truth boxes."""
+"""Draw detector.png: the stages of the detector on one frame, with ground-truth boxes."""
 
 from pathlib import Path
 from typing import Any  # the type of matplotlib's axes is not public
@@ -36,7 +36,7 @@ def frame() -> Frame:
 
 
 def draw_anchors(axes: Any, annotated: Frame) -> None:
-    """The foreground anchors, in the colour of their level."""
+    """Draw the foreground anchors, coloured by level."""
     sizes = small()
     shapes = [(FRONT.height // (4 * 2**k), FRONT.width // (4 * 2**k)) for k in range(len(sizes.anchor_sizes))]
     levels = pyramid_anchors(sizes.anchor_sizes, shapes, first_stride=FIRST_STRIDE)
@@ -56,7 +56,7 @@ def draw_anchors(axes: Any, annotated: Frame) -> None:
 
 
 def draw_grids(axes: Any, annotated: Frame) -> None:
-    """The RoIAlign grids of the box head, in the colour of their level."""
+    """Draw the RoIAlign grids of the box head, coloured by level."""
     sizes = small()
     boxes = torch.from_numpy(annotated.boxes)
     levels = box_levels(
@@ -71,7 +71,7 @@ def draw_grids(axes: Any, annotated: Frame) -> None:
 
 
 def draw_masks(axes: Any, annotated: Frame) -> None:
-    """Masks resampled on the grid of the mask head and pasted back."""
+    """Draw masks resampled to the grid of the mask head and pasted back."""
     sizes = small()
     boxes = torch.from_numpy(annotated.boxes)
     grids = crop_masks(torch.from_numpy(annotated.masks), boxes, size=2 * sizes.mask_pool_size)

@@ -1,6 +1,6 @@
-"""Make midas.png beside this file: a step token by token, and a demonstration read as a motion.
+"""Draw midas.png: the token sequence of a step, and a demonstration relabelled for inverse dynamics.
 
-Words, crops and bins are those that the network gets.
+Words, crops and bins are the network's inputs.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ from policy import (
     ACTION,
     FAINT,
     LAYERS,
-    READ,
+    OUTPUT,
     STYLE,
     VIEWS,
     Token,
@@ -41,14 +41,14 @@ from policy import (
 
 SEED = 21  # a scene whose objects differ in colour; any other will do
 MOTION_SEED = 1
-WIDTH, HEIGHT = 13.6, 6.6  # inches, as all places below, from the upper left corner
-LEFT, SIZE = 0.25, 0.34  # where rows begin; side of a crop
+WIDTH, HEIGHT = 13.6, 6.6  # inches, as all coordinates below, from the upper left corner
+LEFT, SIZE = 0.25, 0.34  # left margin; side of a crop
 NAMES = ("x", "y", "qx", "qy", "qz", "qw")
 RESIDUAL = "#b3541e"
 
 
 def demonstration(task: str, seed: int) -> Demonstration:
-    """Let the oracle play an episode."""
+    """Return an oracle rollout."""
     return rollout_oracle(TabletopEnv(task, level="train"), seed)
 
 
@@ -68,15 +68,15 @@ def component_tokens(action: Action) -> list[Token]:
 def draw_step(axes: Any, demo: Demonstration) -> None:
     """Draw prompt, first observation and first action as one sequence."""
     processor = Processor.of(preset("midas-nano").inputs)
-    text = "one decoder over encoded prompt and history; actions component by component"
+    text = "decoder over encoded prompt and history; autoregressive action decoding"
     draw_title(axes, 0.25, "MIDAS", text)
     draw_text(axes, LEFT, 0.62, f"“{demo.prompt.text}”", family="DejaVu Sans Mono", fontsize=8)
-    asked = prompt_tokens(processor, demo.prompt)
-    shown = [token if isinstance(token.content, str) else _unnamed(token) for token in asked]
+    tokens = prompt_tokens(processor, demo.prompt)
+    shown = [token if isinstance(token.content, str) else _unnamed(token) for token in tokens]
     *middles, end = draw_tokens(axes, shown, LEFT, 1.1, SIZE)
     draw_box(axes, LEFT, 1.42, (end - LEFT, 0.34), facecolor=LAYERS)
     draw_text(axes, (middles[4] + middles[5]) / 2, 1.59, "text encoder", ha="center")
-    for token, middle in zip(asked, middles, strict=True):
+    for token, middle in zip(tokens, middles, strict=True):
         draw_arrow(axes, (middle, 1.29), (middle, 1.42))
         draw_arrow(axes, (middle, 1.76), (middle, 2.22))
         if not isinstance(token.content, str):
@@ -89,27 +89,27 @@ def draw_step(axes: Any, demo: Demonstration) -> None:
     *slots, right = draw_tokens(axes, seen, start, 1.1, SIZE)
     for name, colour, at in ((*VIEWS[0], start), (*VIEWS[1], slots[len(slots) // 2] - SIZE / 2)):
         draw_text(axes, at, 0.82, f"step 1, {name}", fontsize=8, color=colour)
-    *places, right = draw_tokens(axes, component_tokens(demo.actions[0]), right + 0.12, 1.1, SIZE)
-    draw_text(axes, places[0] - 0.1, 0.62, "action 1: pick, then place", fontsize=8, color=ACTION)
-    for middle in (separator, *slots, *places):
+    *actions, right = draw_tokens(axes, component_tokens(demo.actions[0]), right + 0.12, 1.1, SIZE)
+    draw_text(axes, actions[0] - 0.1, 0.62, "action 1: pick, then place", fontsize=8, color=ACTION)
+    for middle in (separator, *slots, *actions):
         draw_arrow(axes, (middle, 1.29), (middle, 2.22))
     draw_box(axes, LEFT, 2.22, (right - LEFT, 0.4), facecolor=LAYERS)
-    note = "decoder: 2n × causal self-attention; each token sees itself and what came before"
+    note = "decoder: 2n × causal self-attention"
     draw_text(axes, LEFT + 0.1, 2.42, note)
     names = [token.name for token in component_tokens(demo.actions[0])]
-    for middle, name in zip((slots[-1], *places[:-1]), names, strict=True):
-        draw_arrow(axes, (middle, 2.62), (middle, 2.86), colour=READ, width=1.5)
-        draw_text(axes, middle, 2.98, name, ha="center", fontsize=8.5, color=READ)
-    note = "one component after the other: each is chosen, read as a token, and then the next one is"
-    draw_text(axes, slots[-1] - 0.15, 3.0, note, ha="right", fontsize=8, color=READ)
+    for middle, name in zip((slots[-1], *actions[:-1]), names, strict=True):
+        draw_arrow(axes, (middle, 2.62), (middle, 2.86), colour=OUTPUT, width=1.5)
+        draw_text(axes, middle, 2.98, name, ha="center", fontsize=8.5, color=OUTPUT)
+    note = "autoregressive: each decoded component is the input token for the next one"
+    draw_text(axes, slots[-1] - 0.15, 3.0, note, ha="right", fontsize=8, color=OUTPUT)
 
 
 def draw_motion(axes: Any, demo: Demonstration) -> None:
-    """Draw a demonstration, and the prompt that it becomes."""
+    """Draw a demonstration and its inverse-dynamics prompt."""
     axes.plot((0.2, WIDTH - 0.25), (3.3, 3.3), color=FAINT, linewidth=0.8)
-    title = "Any demonstration is also the motion that it shows"
+    title = "Inverse dynamics: predict the actions between frames"
     draw_text(axes, 0.2, 3.52, title, fontsize=11, fontweight="bold")
-    draw_text(axes, 5.2, 3.52, f"its own prompt was “{demo.prompt.text}”", fontsize=8, color=FAINT)
+    draw_text(axes, 5.2, 3.52, f"original prompt: “{demo.prompt.text}”", fontsize=8, color=FAINT)
     width = 2.6
     for t in range(demo.num_steps + 1):
         x = LEFT + t * (width + 1.5)
@@ -124,13 +124,13 @@ def draw_motion(axes: Any, demo: Demonstration) -> None:
     tokens = [_unnamed(token) for token in prompt_tokens(processor, motion_prompt(frames, demo.objects))]
     draw_text(axes, LEFT, 5.4, "prompt", fontweight="bold")
     *_, end = draw_tokens(axes, tokens, LEFT, 5.72, 0.26)
-    draw_text(axes, LEFT, 6.12, "answer", fontweight="bold")
+    draw_text(axes, LEFT, 6.12, "target", fontweight="bold")
     x = LEFT + 0.8
     for number, action in enumerate(demo.actions, 1):
         draw_text(axes, x, 6.12, f"action {number}:", fontsize=8.5, color=ACTION)
         plain = [Token(token.content, ACTION) for token in component_tokens(action)]
         x = draw_tokens(axes, plain, x + 0.75, 6.12, 0.26)[-1] + 0.35
-    assert end < WIDTH  # all of the prompt is in the picture
+    assert end < WIDTH  # the whole prompt fits
 
 
 def _unnamed(token: Token) -> Token:
@@ -138,7 +138,7 @@ def _unnamed(token: Token) -> Token:
 
 
 def draw() -> Figure:
-    """Draw all of it; `draw().savefig("midas.pdf")` gives it in a form for print."""
+    """Draw the figure; for print, use `draw().savefig("midas.pdf")`."""
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, HEIGHT))
         axes = figure.add_axes((0, 0, 1, 1))
@@ -150,5 +150,5 @@ def draw() -> Figure:
 
 
 if __name__ == "__main__":
-    # without the version of matplotlib, so that the bytes change with the picture only
+    # without the matplotlib version, so that bytes depend on the picture only
     draw().savefig(Path(__file__).with_suffix(".png"), dpi=140, metadata={"Software": None})

@@ -1,6 +1,6 @@
-"""Make openvima_small_network.png beside this file: what it reads, and where places come from.
+"""Draw openvima_small_network.png: the inputs of openvima-small, and its place candidates.
 
-Words, crops, boxes and free points are those that the network gets; actions are the oracle's.
+Words, crops, boxes and grid candidates are the network's inputs; actions are the oracle's.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ from policy import (
     FAINT,
     INK,
     LAYERS,
+    OUTPUT,
     PAPER,
-    READ,
     STYLE,
     VIEWS,
     draw_arrow,
@@ -38,24 +38,24 @@ from policy import (
     picture,
 )
 
-TASK, SEED = "rearrange_then_restore", 10  # one object is brought to its place, and back
-WIDTH, HEIGHT = 11.0, 8.42  # inches, as all places below, from the upper left corner
-LEFT, SIZE = 0.95, 0.36  # where rows begin; side of a crop
-SHOWN, AT_FIRST = "#d98200", "#8250c4"  # places in the prompt, and those at the first step
+TASK, SEED = "rearrange_then_restore", 10  # one object is moved to a goal position, and back
+WIDTH, HEIGHT = 11.0, 8.42  # inches, as all coordinates below, from the upper left corner
+LEFT, SIZE = 0.95, 0.36  # left margin; side of a crop
+PROMPT, AT_FIRST = "#d98200", "#8250c4"  # candidates from the prompt, and from the first step
 
 
 def demonstration() -> Demonstration:
-    """Let the oracle play the episode."""
+    """Return an oracle rollout."""
     return rollout_oracle(TabletopEnv(TASK, level="train"), SEED)
 
 
 def prompt_scene(demo: Demonstration) -> PromptImage:
-    """Return the picture of a scene in the prompt."""
+    """Return the scene image of the prompt."""
     return next(p for p in demo.prompt.sequence() if isinstance(p, PromptImage) and p.kind == "scene")
 
 
 def draw_word(axes: Any, text: str, x: float, y: float) -> float:
-    """Draw a word as a token with its middle at y; return its width."""
+    """Draw a word token centred at y; return its width."""
     width = max(0.24, 0.13 + 0.078 * len(text))
     draw_box(axes, x, y - 0.18, (width, 0.36), facecolor=PAPER)
     draw_text(axes, x + width / 2, y, text, ha="center", fontsize=8.5)
@@ -63,7 +63,7 @@ def draw_word(axes: Any, text: str, x: float, y: float) -> float:
 
 
 def draw_object(axes: Any, crops: np.ndarray, slot: int, x: float, y: float) -> float:
-    """Draw an object as a token, the front view above the top view; return its width."""
+    """Draw an object token, the front crop above the top crop; return its width."""
     for view, (_, colour) in enumerate(VIEWS):
         top = y - SIZE + view * SIZE
         draw_picture(axes, picture(crops[view, slot]), x, top, (SIZE, SIZE))
@@ -72,7 +72,7 @@ def draw_object(axes: Any, crops: np.ndarray, slot: int, x: float, y: float) -> 
 
 
 def draw_prompt(axes: Any, demo: Demonstration) -> None:
-    """Draw the prompt, its encoder, and the scene that it shows."""
+    """Draw the prompt, its encoder, and its scene image."""
     batch, stack = Processor.of(preset("small").inputs).encode_prompts([demo.prompt])
     crops = stack.images()[batch.crop_index_VS]
     words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
@@ -88,9 +88,7 @@ def draw_prompt(axes: Any, demo: Demonstration) -> None:
         x += width + 0.06
     end = x - 0.06
     draw_box(axes, LEFT, 1.78, (end - LEFT, 0.34), facecolor=LAYERS)
-    draw_text(
-        axes, (LEFT + end) / 2, 1.95, "comparisons with earlier images, then a text encoder", ha="center"
-    )
+    draw_text(axes, (LEFT + end) / 2, 1.95, "correspondence with earlier images, text encoder", ha="center")
     for middle in middles:
         draw_arrow(axes, (middle, 1.6), (middle, 1.78))
     way = ((LEFT, 1.95), (0.55, 1.95), (0.55, 4.76), (LEFT, 4.76))
@@ -99,12 +97,12 @@ def draw_prompt(axes: Any, demo: Demonstration) -> None:
     shown = picture(prompt_scene(demo).rgb["top"])
     left, width = WIDTH - 0.25 - 2.4, 2.4
     draw_picture(axes, shown, left, 0.75, (width, width / 2))
-    draw_frame(axes, left, 0.75, (width, width / 2), edgecolor=SHOWN)
-    draw_text(axes, left, 0.62, "the scene in the prompt, top view", fontsize=8, color=SHOWN)
+    draw_frame(axes, left, 0.75, (width, width / 2), edgecolor=PROMPT)
+    draw_text(axes, left, 0.62, "prompt scene, top view", fontsize=8, color=PROMPT)
 
 
 def draw_step(axes: Any, demo: Demonstration) -> None:
-    """Draw the first step: views, tokens, comparisons, decoder and what is read."""
+    """Draw the first step: views, tokens, correspondence, decoder and outputs."""
     objects = observe(demo.observation(0))
     draw_text(axes, LEFT, 2.42, "step 1", fontweight="bold")
     width = 2.2
@@ -121,10 +119,10 @@ def draw_step(axes: Any, demo: Demonstration) -> None:
         x += SIZE + 0.1
     right = WIDTH - 0.9
     middles.append(right + draw_word(axes, "query", right, 3.1) / 2)
-    note = "one token an object: both crops, both boxes,\nthe end effector"
+    note = "one token per object: crops and boxes of both\nviews, end effector"
     draw_text(axes, start, 2.5, note, fontsize=8, color=FAINT, linespacing=1.3)
-    note = "+ comparisons: how it differs from what looks most\nlike it, in view and in the prompt: "
-    note += "place, turn, size"
+    note = "+ correspondence: attention by appearance to objects\nin view and prompt; relative "
+    note += "position, rotation, size"
     draw_box(axes, start - 0.1, 3.68, (right - start - 0.05, 0.46), facecolor=LAYERS)
     draw_text(axes, start, 3.91, note, fontsize=8.5, linespacing=1.3)
     for middle in middles[:-1]:
@@ -135,58 +133,58 @@ def draw_step(axes: Any, demo: Demonstration) -> None:
         axes,
         LEFT,
         4.32,
-        "history: earlier steps and actions, as tokens before these",
+        "history: tokens of previous steps and actions",
         fontsize=8,
         color=FAINT,
     )
     draw_box(axes, LEFT, 4.55, (WIDTH - LEFT - 0.25, 0.42), facecolor=LAYERS)
     draw_text(axes, LEFT + 0.15, 4.76, "decoder: 4 × (cross-attention to the prompt, causal self-attention)")
-    draw_arrow(axes, (middles[-1], 4.97), (middles[-1], 5.3), colour=READ, width=2)
-    note = "read here: which object to pick · which place to copy · offset · turn"
-    draw_text(axes, middles[-1] - 0.12, 5.13, note, ha="right", fontsize=8, color=READ)
+    draw_arrow(axes, (middles[-1], 4.97), (middles[-1], 5.3), colour=OUTPUT, width=2)
+    note = "output: object to pick · place candidate · offset · relative rotation"
+    draw_text(axes, middles[-1] - 0.12, 5.13, note, ha="right", fontsize=8, color=OUTPUT)
 
 
 def draw_boxes(
-    axes: Any, objects: ObjectViews, view: int, place: tuple[float, float, float], **style: Any
+    axes: Any, objects: ObjectViews, view: int, region: tuple[float, float, float], **style: Any
 ) -> None:
-    """Draw boxes of objects over a picture that was drawn at a place: left, upper edge, width."""
-    left, top, width = place
+    """Draw object boxes over a view with this left edge, upper edge and width."""
+    left, top, width = region
     for slot in np.flatnonzero(objects.masks[view]):
         centre_x, centre_y, box_height, box_width = objects.boxes[view, slot] * width / TOP.width
         corner = (left + centre_x - box_width / 2, top + centre_y - box_height / 2)
         draw_frame(axes, *corner, (box_width, box_height), **style)
 
 
-def draw_places(axes: Any, demo: Demonstration, step: int, x: float, title: str) -> None:
-    """Draw the candidates for a place at one step over the top view, and the action."""
+def draw_candidates(axes: Any, demo: Demonstration, step: int, x: float, title: str) -> None:
+    """Draw the place candidates of one step over the top view, and the action."""
     top, width = 5.85, 4.35
-    place = (x, top, width)
+    region = (x, top, width)
     draw_text(axes, x, top - 0.17, title, fontsize=9, fontweight="bold")
     draw_picture(axes, picture(demo.rgb["top"][step]), x, top, (width, width / 2))
     points_mm = GridCandidates(1).points_mm.numpy() / 1000
     points = np.concatenate([points_mm, np.zeros((len(points_mm), 1))], axis=1)
-    for column, row in on_picture(points, place):
+    for column, row in on_picture(points, region):
         axes.plot([column], [row], ".", color="white", alpha=0.55, markersize=3, zorder=3)
-    draw_boxes(axes, observe(demo.observation(step)), 1, place, edgecolor="#4aa8e0", linewidth=1.6)
+    draw_boxes(axes, observe(demo.observation(step)), 1, region, edgecolor="#4aa8e0", linewidth=1.6)
     scene = observe_prompt_image(prompt_scene(demo))
-    draw_boxes(axes, scene, 1, place, edgecolor=SHOWN, linewidth=1.6, linestyle="--")
+    draw_boxes(axes, scene, 1, region, edgecolor=PROMPT, linewidth=1.6, linestyle="--")
     if step:
         first = observe(demo.observation(0))
-        draw_boxes(axes, first, 1, place, edgecolor="#b794f6", linewidth=1.6, linestyle=":")
+        draw_boxes(axes, first, 1, region, edgecolor="#b794f6", linewidth=1.6, linestyle=":")
     action = demo.actions[step]
     ends = [[*action.pose0_position[:2], 0.0], [*action.pose1_position[:2], 0.0]]
-    start, end = (tuple(point) for point in on_picture(np.array(ends), place))
+    start, end = (tuple(point) for point in on_picture(np.array(ends), region))
     draw_arrow(axes, start, end, colour="#3ddc97", width=2.2)
 
 
-def on_picture(points: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
-    """Return where positions in the world lie on a picture of the top view."""
-    left, top, width = place
+def on_picture(points: np.ndarray, region: tuple[float, float, float]) -> np.ndarray:
+    """Project world positions onto a drawn top view."""
+    left, top, width = region
     return project(points, TOP) * width / TOP.width + (left, top)
 
 
 def draw_legend(axes: Any, entries: Sequence[tuple[str, str, str]]) -> None:
-    """Write what the frames mean: text, colour and style of the line of each."""
+    """Draw the legend: text, colour and line style of each entry."""
     x, y = LEFT, HEIGHT - 0.2
     for text, colour, line in entries:
         if line == ".":
@@ -198,24 +196,24 @@ def draw_legend(axes: Any, entries: Sequence[tuple[str, str, str]]) -> None:
 
 
 def draw() -> Figure:
-    """Draw all of it; `draw().savefig("network.pdf")` gives it in a form for print."""
+    """Draw the figure; for print, use `draw().savefig("network.pdf")`."""
     demo = demonstration()
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, HEIGHT))
         axes = figure.add_axes((0, 0, 1, 1))
         draw_title(axes, 0.25, "openvima-small", "")
-        draw_text(axes, 2.1, 0.25, "it points at an object, and at a place that it has seen")
+        draw_text(axes, 2.1, 0.25, "pointer network over objects and place candidates")
         draw_prompt(axes, demo)
         draw_step(axes, demo)
-        draw_places(axes, demo, 0, LEFT, "“rearrange”: a place that the prompt shows")
+        draw_candidates(axes, demo, 0, LEFT, "“rearrange”: candidate from the prompt")
         last = demo.num_steps - 1
-        draw_places(axes, demo, last, LEFT + 4.35 + 0.65, "“restore”: a place of the first step")
+        draw_candidates(axes, demo, last, LEFT + 4.35 + 0.65, "“restore”: candidate from the first step")
         entries = (
-            ("in view", "#4aa8e0", "-"),
-            ("in the prompt", SHOWN, "--"),
-            ("at the first step", "#b794f6", ":"),
-            ("free points", FAINT, "."),
-            ("the action", "#3ddc97", "-"),
+            ("objects in view", "#4aa8e0", "-"),
+            ("prompt objects", PROMPT, "--"),
+            ("objects at the first step", "#b794f6", ":"),
+            ("grid candidates", FAINT, "."),
+            ("action", "#3ddc97", "-"),
         )
         draw_legend(axes, entries)
         axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
@@ -224,5 +222,5 @@ def draw() -> Figure:
 
 
 if __name__ == "__main__":
-    # without the version of matplotlib, so that the bytes change with the picture only
+    # without the matplotlib version, so that bytes depend on the picture only
     draw().savefig(Path(__file__).with_suffix(".png"), dpi=140, metadata={"Software": None})

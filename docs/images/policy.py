@@ -1,6 +1,6 @@
-"""Make policy.png beside this file: one prompt and two steps, token by token, as the policies read them.
+"""Draw policy.png: the token sequences of the policies for one prompt and two steps.
 
-Words, crops, patches and bins are those that the networks get: the readers of openvima make them.
+Words, crops, patches and bins are the networks' inputs, from their processors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,27 +28,27 @@ from openvima.render import channels_last
 from openvima.scene import PromptImage, RenderedPrompt
 
 SEED = 21  # a scene whose objects differ in colour; any other will do
-MISS_M = -0.2  # the first action places so far beside its goal, along y, so that there is a second one
+MISS_M = -0.2  # offset of the first place position along y, so that a second step follows
 PATCH, PATCHES_IN_ROW, PATCHES = 32, 4, 8  # of a frame of 64 × 128 pixels
 
-WIDTH, HEIGHT = 11.0, 13.1  # of the figure in inches; all places below are inches from its upper left corner
-LEFT, SECOND = 0.95, 6.1  # where rows begin, and the second step
+WIDTH, HEIGHT = 11.0, 13.1  # inches, as all coordinates below, from the upper left corner
+LEFT, SECOND = 0.95, 6.1  # left margin, and left edge of the second step
 GAP = 0.06  # between groups of small tokens
 INK, FAINT, PAPER, SUMMARY = "#1f2933", "#77818c", "#eef1f4", "#5b6773"
-FRONT, TOP, ACTION, READ, LAYERS = "#0072b2", "#d98200", "#00805c", "#9b2393", "#e9e4f1"
+FRONT, TOP, ACTION, OUTPUT, LAYERS = "#0072b2", "#d98200", "#00805c", "#9b2393", "#e9e4f1"
 VIEWS = (("front", FRONT), ("top", TOP))
 COMPONENTS = ("x", "y", "rotation x", "rotation y", "rotation z", "rotation w")
 BASELINES = {
-    "gato": ("VIMA-Gato", "16 tokens for a pair of frames, one a patch; the prompt begins the sequence"),
-    "flamingo": ("VIMA-Flamingo", "4 tokens sum up a pair of frames; cross-attention to the prompt"),
-    "gpt": ("VIMA-GPT", "1 token sums up a pair of frames; the prompt begins the sequence"),
+    "gato": ("VIMA-Gato", "16 tokens per pair of frames, one per patch; decoder with the prompt as prefix"),
+    "flamingo": ("VIMA-Flamingo", "4 resampled tokens per pair of frames; cross-attention to the prompt"),
+    "gpt": ("VIMA-GPT", "1 token per pair of frames; decoder with the prompt as prefix"),
 }
 STYLE = {"font.family": "DejaVu Sans", "font.size": 9, "text.color": INK}
 
 
 @dataclass(frozen=True)
 class Token:
-    """A word or an image (an empty text: features that sum up frames), its colour, and its name."""
+    """A word or an image (an empty text: pooled frame features), its colour, and its label."""
 
     content: str | np.ndarray
     colour: str = FAINT
@@ -81,7 +81,7 @@ def play() -> Story:
     return Story(env.prompt, observations, bins)
 
 
-# From what the processors give to what is drawn.
+# From processor outputs to drawn tokens.
 
 
 def prompt_tokens(processor: Processor, prompt: RenderedPrompt) -> list[Token]:
@@ -108,7 +108,7 @@ def step_tokens(processor: Processor, observation: Mapping[str, Any]) -> list[To
 
 
 def image_token(processor: Processor, crops: np.ndarray, entry: int, part: int) -> Token:
-    """Return one token of an image: a crop, a patch, or a blank where frames are summed up."""
+    """Return one token of an image: a crop, a patch, or a blank for pooled frames."""
     if processor.layout == "views":
         name, colour = VIEWS[part]
         return Token(picture(crops[part, entry]), colour, f"{chr(ord('A') + entry)} {name}")
@@ -129,7 +129,7 @@ def picture(image: np.ndarray) -> np.ndarray:
 
 
 def draw_text(axes: Any, x: float, y: float, text: str, **style: Any) -> None:
-    """Write text, by default to the right of a point at half its height."""
+    """Write text, by default left-aligned and vertically centred."""
     axes.text(x, y, text, **{"va": "center"} | style)
 
 
@@ -163,7 +163,7 @@ def draw_tokens(axes: Any, tokens: Sequence[Token], x: float, y: float, size: fl
     """Draw tokens from left to right, images as squares with their middle at y.
 
     Returns:
-        The middle of each token, then the right end of the last one.
+        The centre of each token, then the right edge of the last one.
     """
     large = size > 0.3
     gap = 0.06 if large else 0.025
@@ -190,39 +190,39 @@ def draw_tokens(axes: Any, tokens: Sequence[Token], x: float, y: float, size: fl
 
 
 def draw_title(axes: Any, y: float, name: str, text: str) -> None:
-    """Write the name of a policy and what is particular to it."""
+    """Write the name of a policy and its summary."""
     draw_text(axes, 0.2, y, name, fontsize=11, fontweight="bold")
     draw_text(axes, 1.75, y, text)
 
 
 def draw_vima(axes: Any, story: Story) -> None:
-    """Draw the way of a prompt and two steps through VIMA."""
+    """Draw prompt, two steps and outputs of VIMA."""
     processor = Processor.of(preset("vima-nano").inputs)
-    draw_title(axes, 0.25, "VIMA", "one token for each object in each view; cross-attention to the prompt")
+    draw_title(axes, 0.25, "VIMA", "one token per object and view; cross-attention to the prompt")
     draw_prompt(axes, processor, story.prompt)
     draw_text(axes, LEFT, 2.68, "history", fontweight="bold")
     steps = zip((LEFT, SECOND), story.observations, story.bins, strict=True)
     for number, (left, observation, bins) in enumerate(steps, 1):
         draw_views(axes, observation, left, number)
-        note = "cut out of the views: 32 × 32 pixels and the box of each object"
+        note = "per object: 32 × 32 crop and bounding box"
         draw_text(axes, left, 4.25, note, fontsize=8, color=FAINT)
         *middles, end = draw_tokens(axes, step_tokens(processor, observation), left, 4.9, 0.58)
-        draw_text(axes, left, 5.3, "each with the end effector: suction cup", fontsize=8, color=FAINT)
+        draw_text(axes, left, 5.3, "fused with the end effector: suction cup", fontsize=8, color=FAINT)
         for middle in middles:
             draw_arrow(axes, (middle, 5.4), (middle, 5.6))
-        draw_answer(axes, bins, left, middles[-1], number)
+        draw_action(axes, bins, left, middles[-1], number)
         if number == 1:
             draw_past_action(axes, end)
     draw_box(axes, LEFT, 5.6, (WIDTH - LEFT - 0.25, 0.46), facecolor=LAYERS)
     draw_text(axes, LEFT + 0.15, 5.83, "decoder: n × (cross-attention to the prompt, self-attention)")
-    draw_text(axes, SECOND, 5.83, "causal: each token sees itself and what came before")
+    draw_text(axes, SECOND, 5.83, "causal self-attention")
 
 
 def draw_prompt(axes: Any, processor: Processor, prompt: RenderedPrompt) -> None:
     """Draw the prompt and its encoder."""
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
     draw_text(axes, SECOND + 0.3, 1.1, f"“{prompt.text}”", family="DejaVu Sans Mono", fontsize=8.5)
-    note = "A, B: the objects in the prompt’s two images,\nin the front view and in the top view."
+    note = "A, B: objects of the two prompt images,\nin front and top view"
     draw_text(axes, SECOND + 0.3, 1.5, note, fontsize=8.5, linespacing=1.4)
     *middles, end = draw_tokens(axes, prompt_tokens(processor, prompt), LEFT, 1.15, 0.58)
     draw_box(axes, LEFT, 1.65, (end - LEFT, 0.38), facecolor=LAYERS)
@@ -231,7 +231,7 @@ def draw_prompt(axes: Any, processor: Processor, prompt: RenderedPrompt) -> None
         draw_arrow(axes, (middle, 1.45), (middle, 1.65))
         draw_arrow(axes, (middle, 2.03), (middle, 2.2))
         draw_box(axes, middle - 0.09, 2.2, (0.18, 0.18), facecolor=LAYERS)
-    draw_text(axes, end + 0.12, 2.29, "keys and values, computed once an episode", fontsize=8)
+    draw_text(axes, end + 0.12, 2.29, "keys and values, computed once per episode", fontsize=8)
     way = ((middles[0] - 0.12, 2.29), (0.55, 2.29), (0.55, 5.83), (LEFT, 5.83))
     draw_arrow(axes, *way, colour=INK, width=1.2)
     draw_text(axes, 0.42, 4.1, "cross-attention", rotation=90, ha="center", fontsize=8)
@@ -255,27 +255,27 @@ def draw_views(axes: Any, observation: Mapping[str, Any], x: float, number: int)
             draw_text(axes, corner[0] + 0.02, corner[1] - 0.09, str(k + 1), **style)
 
 
-def draw_answer(axes: Any, bins: np.ndarray, x: float, middle: float, number: int) -> None:
-    """Draw the output that is read, and the bins that it stands for."""
-    draw_arrow(axes, (middle, 6.06), (middle, 6.5), colour=READ, width=2)
-    note = "read here: 12 choices of a bin"
-    draw_text(axes, middle - 0.12, 6.28, note, ha="right", fontsize=8, color=READ)
-    draw_box(axes, x, 6.5, (4.6, 1.45), facecolor="white", edgecolor=READ)
+def draw_action(axes: Any, bins: np.ndarray, x: float, middle: float, number: int) -> None:
+    """Draw the output token and its action bins."""
+    draw_arrow(axes, (middle, 6.06), (middle, 6.5), colour=OUTPUT, width=2)
+    note = "output: 12 action bins"
+    draw_text(axes, middle - 0.12, 6.28, note, ha="right", fontsize=8, color=OUTPUT)
+    draw_box(axes, x, 6.5, (4.6, 1.45), facecolor="white", edgecolor=OUTPUT)
     for component, (count, chosen) in enumerate(zip(NUM_BINS, bins, strict=True)):
         pose, row = divmod(component, len(COMPONENTS))
         left, y, width = x + 0.12 + 2.3 * pose, 6.82 + 0.19 * row, 0.9
         if row == 0:
             title = f"action {number}, {('pick', 'place')[pose]}"
-            draw_text(axes, left, y - 0.18, title, fontsize=8, color=READ)
+            draw_text(axes, left, y - 0.18, title, fontsize=8, color=OUTPUT)
         draw_text(axes, left, y, COMPONENTS[row], fontsize=7.5)
         draw_box(axes, left + 0.68, y - 0.05, (width, 0.1), linewidth=0.4)
         mark = left + 0.68 + (width - 0.04) * chosen / (count - 1)
-        axes.add_patch(Rectangle((mark, y - 0.07), 0.04, 0.14, color=READ, zorder=3))
+        axes.add_patch(Rectangle((mark, y - 0.07), 0.04, 0.14, color=OUTPUT, zorder=3))
         draw_text(axes, left + 1.64, y, f"{chosen} / {count}", fontsize=7.5)
 
 
 def draw_past_action(axes: Any, end: float) -> None:
-    """Draw the token of the first action, and how it comes into the history."""
+    """Draw the token of the first action in the history."""
     middle, end = draw_tokens(axes, [Token("action\n1", ACTION)], end + 0.06, 4.9, 0.58)
     draw_arrow(axes, (middle, 5.4), (middle, 5.6))
     way = ((LEFT + 4.6, 7.2), (end + 0.15, 7.2), (end + 0.15, 4.9), (end + 0.01, 4.9))
@@ -283,8 +283,8 @@ def draw_past_action(axes: Any, end: float) -> None:
 
 
 def draw_baselines(axes: Any, story: Story) -> None:
-    """Draw what the baselines make of the same prompt and steps."""
-    heading = "The same episode as the baselines see it: whole frames, front and top, of 64 × 128 pixels"
+    """Draw the token sequences of the baselines."""
+    heading = "Baselines on the same episode: whole frames, front and top, of 64 × 128 pixels"
     axes.plot((0.2, WIDTH - 0.25), (8.2, 8.2), color=FAINT, linewidth=0.8)
     draw_text(axes, 0.2, 8.4, heading, fontweight="bold")
     for y, (architecture, (name, text)) in zip((8.82, 10.25, 11.65), BASELINES.items(), strict=True):
@@ -317,8 +317,10 @@ def draw_baseline(axes: Any, story: Story, architecture: str, y: float) -> None:
         *middles, end = draw_group(
             axes, step_tokens(processor, observation), x, y, stacked(observation["rgb"])
         )
-        draw_arrow(axes, (middles[-1], y + 0.12), (middles[-1], y + 0.36), colour=READ, width=1.5)
-        draw_text(axes, middles[-1] - 0.08, y + 0.25, f"action {number}", ha="right", fontsize=8, color=READ)
+        draw_arrow(axes, (middles[-1], y + 0.12), (middles[-1], y + 0.36), colour=OUTPUT, width=1.5)
+        draw_text(
+            axes, middles[-1] - 0.08, y + 0.25, f"action {number}", ha="right", fontsize=8, color=OUTPUT
+        )
         if number == 1:
             *_, end = draw_group(axes, [Token("action 1", ACTION)], end + GAP, y)
         x = end + GAP
@@ -327,7 +329,7 @@ def draw_baseline(axes: Any, story: Story, architecture: str, y: float) -> None:
 def draw_group(
     axes: Any, tokens: Sequence[Token], x: float, y: float, frames: np.ndarray | None = None
 ) -> list[float]:
-    """Draw words, patches, or a pair of frames above the tokens that sum them up; return as `draw_tokens`."""
+    """Draw words, patches, or a pair of frames above their tokens; return as `draw_tokens`."""
     is_summary = frames is not None and isinstance(tokens[0].content, str)
     if not is_summary:
         return draw_tokens(axes, tokens, x, y, 0.205)
@@ -342,12 +344,12 @@ def draw_group(
 
 
 def stacked(rgb: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Put both frames, as the baselines see them, one above the other."""
+    """Stack both frames of the baselines' input vertically."""
     return picture(np.concatenate(list(whole_frames(rgb).crops[:, 0]), axis=1))
 
 
 def draw() -> Figure:
-    """Draw all of it; `draw().savefig("policy.pdf")` gives it in a form for print."""
+    """Draw the figure; for print, use `draw().savefig("policy.pdf")`."""
     with rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, HEIGHT))
         axes = figure.add_axes((0, 0, 1, 1))
@@ -360,5 +362,5 @@ def draw() -> Figure:
 
 
 if __name__ == "__main__":
-    # without the version of matplotlib, so that the bytes change with the picture only
+    # without the matplotlib version, so that bytes depend on the picture only
     draw().savefig(Path(__file__).with_suffix(".png"), dpi=160, metadata={"Software": None})

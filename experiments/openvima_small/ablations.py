@@ -58,7 +58,7 @@ class Variant:
         what: In a few words.
         sizes: Makes the network's sizes.
         settings: Settings of training that differ.
-        crops: Whether it begins with crops that another run has matched.
+        crops: Whether the crop encoder is initialised from another run's contrastive pretraining.
     """
 
     what: str
@@ -98,39 +98,33 @@ def _vima() -> PolicyConfig:
 
 
 VARIANTS = {
-    "full": Variant("the preset as it is"),
+    "full": Variant("full model"),
     "pointing": Variant(
-        "object head: places only relative to objects in view",
+        "object head: place positions relative to visible objects only",
         lambda: replace(small(), head=ObjectHeadConfig()),
     ),
     "no-correspondence": Variant(
-        "no correspondence between objects of different images",
+        "no correspondence between images",
         lambda: replace(small(), correspondence=None),
     ),
     "no-appearance-loss": Variant("no appearance loss", _without_appearance_loss),
     "no-coreference": Variant("no coreference", _without_coreference),
     "no-rotation": Variant("no relative rotation", _without_rotations),
-    "no-motions": Variant(
-        "no demonstrations as motions", settings={"augmentation.inverse_dynamics_prob": 0.0}
+    "no-inverse-dynamics": Variant(
+        "no inverse dynamics", settings={"augmentation.inverse_dynamics_prob": 0.0}
     ),
-    "no-names": Variant(
-        "no invented nouns but those of the tasks", settings={"augmentation.rename_objects_prob": 0.0}
-    ),
-    "no-reordering": Variant(
-        "prompts in the order of the tasks", settings={"augmentation.shuffle_sentences_prob": 0.0}
-    ),
-    "no-strangers": Variant(
-        "no objects of other demonstrations in view", settings={"augmentation.distractor_prob": 0.0}
-    ),
-    "no-dropout": Variant("crops always shown", lambda: _with_dropout(0.0)),
-    "short-matching": Variant("looks matched in 1,000 steps of its own", settings=_PRETRAINING, crops=False),
-    "no-random-looks": Variant(
-        "the same without random looks",
+    "no-renaming": Variant("no renamed objects", settings={"augmentation.rename_objects_prob": 0.0}),
+    "no-shuffling": Variant("no shuffled sentences", settings={"augmentation.shuffle_sentences_prob": 0.0}),
+    "no-distractors": Variant("no inserted distractors", settings={"augmentation.distractor_prob": 0.0}),
+    "no-dropout": Variant("no crop dropout", lambda: _with_dropout(0.0)),
+    "short-pretraining": Variant("own pretraining of 1,000 steps", settings=_PRETRAINING, crops=False),
+    "no-appearance-randomization": Variant(
+        "the same without appearance randomization",
         settings={**_PRETRAINING, "pretraining.appearance_randomization_prob": 0.0},
         crops=False,
     ),
     "vima": Variant(
-        "VIMA's architecture, table bins, vision transformer trained along",
+        "VIMA architecture with action bins, vision transformer trained jointly",
         _vima,
         {"optimizer.learning_rate": 5e-4, "augmentation.inverse_dynamics_prob": 0.0},
         crops=False,
@@ -139,14 +133,14 @@ VARIANTS = {
 
 
 def main() -> int:
-    """Train and score what is asked for, one after the other."""
+    """Train and evaluate the selected variants."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
-    parser.add_argument("--crops", type=Path, required=True, help="run of `small` that has matched looks")
+    parser.add_argument("--crops", type=Path, required=True, help="run of `small` after pretraining")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", default=",".join(VARIANTS), help="variants, with commas in between")
     parser.add_argument("--name", default="", help="name in the table, instead of the variant's")
-    parser.add_argument("--what", default="", help="what it is, in a few words, instead of the variant's")
+    parser.add_argument("--what", default="", help="short description, instead of the variant's")
     parser.add_argument("--seed", type=int, default=0, help="of first weights, order and augmentation")
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--episodes", type=int, default=40, help="for each task and level")

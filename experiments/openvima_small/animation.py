@@ -2,10 +2,10 @@
 
     python experiments/openvima_small/animation.py [--policy NAME] [--show TASK:LEVEL,...] [--out FILE]
 
-Of each task the first episode is shown that the policy solves, counting from `--seed` (domain "user", neither
-training nor evaluation); TASK:LEVEL:SEED shows that very one, solved or not. All that are shown are printed.
-The panels play their episodes one after the other, in real time, and all of them end together. Films of
-single episodes, failures included, come from `openvima demo` and from the report of `openvima evaluate`.
+Each task shows the first solved episode from `--seed` on (domain "user", neither training nor evaluation);
+TASK:LEVEL:SEED selects an episode, solved or not. All shown episodes are printed. Panels play their episodes
+in sequence, in real time, and end together. For videos of single episodes, failures included, see `openvima
+demo` and the report of `openvima evaluate`.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from openvima.video.prompt_strip import draw_prompt_strip, font
 from openvima.video.recorder import SceneRenderer
 
 OUT = Path("docs/images/openvima_small.webp")
-SHOWN = (  # every level; pictures of objects and of scenes, words, turns, sequences; prompts of two lines
+SHOWN = (  # every level; object and scene images, words, rotations, sequences; prompts of two lines
     "rearrange_then_restore:L1",
     "pick_in_order_then_restore:L2",
     "follow_order:L3",
@@ -40,7 +40,7 @@ SHOWN = (  # every level; pictures of objects and of scenes, words, turns, seque
     "rotate:L3",
     "scene_understanding:L3",
 )
-STRIDE = 2  # frames are filmed 30 times a second; every second one is smooth enough
+STRIDE = 2  # of 30 frames a second; every second one is smooth enough
 START_S, END_S = 1.2, 1.0  # s; time to read the prompt, and to see how it ended
 ENLARGE = 3  # of the picture before it is scaled down to its panel, which smooths its edges
 GAP, TITLE_PX, ROUND_PX = 10, 30, 8
@@ -79,13 +79,13 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenes:
-    """An episode as it was played.
+    """A recorded episode.
 
     Args:
-        wanted: What was asked for, with its seed.
-        prompt: What the policy was told.
+        wanted: The requested episode, with its seed.
+        prompt: The prompt.
         pictures: The front view, each of shape (height, width, 3), uint8.
-        outcome: How it ended.
+        outcome: The outcome.
     """
 
     wanted: Wanted
@@ -94,13 +94,13 @@ class Scenes:
     outcome: EpisodeOutcome
 
 
-def play_shown(player: RolloutPolicy, wanted: Wanted, *, first_seed: int, width: int) -> Scenes:
-    """Play one episode and draw it.
+def record_episode(policy: RolloutPolicy, wanted: Wanted, *, first_seed: int, width: int) -> Scenes:
+    """Roll out and render one episode.
 
     Args:
-        player: Who decides.
+        policy: The policy.
         wanted: The episode.
-        first_seed: Where the search for one that is solved begins.
+        first_seed: First seed of the search for a solved episode.
         width: Of the pictures in pixels.
 
     Raises:
@@ -116,7 +116,7 @@ def play_shown(player: RolloutPolicy, wanted: Wanted, *, first_seed: int, width:
         def record(env: TabletopEnv, frames: list[VideoFrame] = frames) -> None:
             frames += env.frames
 
-        (outcome,) = play([env], [seed], player, after_step=record)
+        (outcome,) = play([env], [seed], policy, after_step=record)
         if outcome.success or wanted.seed is not None:
             chosen = [*frames[:-1:STRIDE], frames[-1]]
             pictures = [scaled(artist.draw(frame.scene, frame.joints), width) for frame in chosen]
@@ -212,18 +212,18 @@ def compose(played: Sequence[Scenes], *, columns: int, rows: int, width: int) ->
     lengths = [len(scenes.pictures) + sum(still) for scenes in played]
     tracks = tracks_of(lengths, columns * rows)
     total = max(sum(lengths[k] for k in track) for track in tracks)
-    films = []
+    track_frames = []
     for number, track in enumerate(tracks):
         of_row = [k for other in tracks[number // columns * columns :][:columns] for k in other]
         head_px = max(len(prompt_strip(played[k].prompt, width)) for k in of_row)
         spare = total - sum(lengths[k] for k in track)
-        film: list[Image.Image] = []
+        panels: list[Image.Image] = []
         for place, k in enumerate(track):  # what a track lacks in length it rests, before and after
             share = spare // len(track) + (place < spare % len(track))
             rest = (still[0] + share // 3, still[1] + share - share // 3)
-            film += panels_of(played[k], width=width, head_px=head_px, still=rest)
-        films.append(film)
-    return [_beside([film[time] for film in films], columns) for time in range(total)]
+            panels += panels_of(played[k], width=width, head_px=head_px, still=rest)
+        track_frames.append(panels)
+    return [_beside([panels[time] for panels in track_frames], columns) for time in range(total)]
 
 
 def _beside(panels: Sequence[Image.Image], columns: int) -> Image.Image:
@@ -294,8 +294,8 @@ def main() -> None:
             episodes=1,
             env_config=EnvConfig(),
         )
-        player = load_rollout_policy(batch)
-        played = [play_shown(player, entry, first_seed=options.seed, width=width) for entry in wanted]
+        policy = load_rollout_policy(batch)
+        played = [record_episode(policy, entry, first_seed=options.seed, width=width) for entry in wanted]
     except OpenVimaError as error:
         parser.error(str(error))
     frames = compose(played, columns=options.columns, rows=options.rows, width=width)

@@ -1,4 +1,4 @@
-"""What is known of the policy of the package: its evaluation, and those of smaller trainings beside it."""
+"""Evaluations of the bundled checkpoint and of smaller trainings."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,24 +12,24 @@ from openvima.evaluation.merging import merge
 from openvima.evaluation.results import LevelMean, Results
 
 POLICY = "openvima-small"
-DEMONSTRATIONS = 52_000  # that the policy of the package learnt from
-PUBLISHED_DEMONSTRATIONS = 650_000  # of the papers' models, all of the data
+DEMONSTRATIONS = 52_000  # of the bundled checkpoint
+PUBLISHED_DEMONSTRATIONS = 650_000  # of the papers' models, the full dataset
 LEVELS = ("L1", "L2", "L3", "L4")
 _VIMA = "vima"  # names of trainings of its architecture begin so
 
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """One training that was scored.
+    """One evaluated training.
 
     Args:
         name: Short and unique.
-        what: What is particular to it, in one line.
-        demonstrations: It learnt from.
-        steps: Of cloning.
-        minutes: Of processor time.
+        what: Description, in one line.
+        demonstrations: Number of training demonstrations.
+        steps: Steps of behaviour cloning.
+        minutes: CPU minutes.
         results: Its evaluation, with the training's name for the policy.
-        parameters: Of the network; 0 where it is not known.
+        parameters: Parameters of the network; 0 if unknown.
     """
 
     name: str
@@ -52,14 +52,14 @@ class Training:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """Everything that tables and figures show.
+    """Data of tables and figures.
 
     Args:
-        policy: Name of the policy of the package in `results`.
+        policy: Name of the bundled checkpoint in `results`.
         results: Its evaluation, ablations included.
-        demonstrations: It learnt from.
-        trainings: Smaller trainings, to be compared with each other.
-        baseline: The one of them with all parts.
+        demonstrations: Number of its training demonstrations.
+        trainings: Smaller trainings, compared with each other.
+        baseline: The one with the full model.
         differences: Of each training with as many demonstrations and steps minus the baseline.
     """
 
@@ -85,7 +85,7 @@ class Findings:
         return sorted(chosen, key=lambda training: (training.demonstrations, training.steps))
 
     def means(self) -> dict[str, LevelMean]:
-        """Success of the policy of the package by level."""
+        """Success rate of the bundled checkpoint by level."""
         return {
             mean.level: mean
             for mean in self.results.level_means()

@@ -297,7 +297,7 @@ def main() -> None:
     """Read evaluations, write record, figures and tables."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("evaluation", type=Path, help="folder or results.json of the policy of the package")
+    parser.add_argument("evaluation", type=Path, help="folder or results.json of the bundled checkpoint")
     parser.add_argument("--trainings", type=Path, nargs="*", default=[], help="records of smaller trainings")
     parser.add_argument("--policy", default=POLICY, help="its name in the evaluation")
     parser.add_argument("--baseline", default="full", help="the training that others are compared with")

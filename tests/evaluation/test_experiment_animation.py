@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from animation import SHOWN, Scenes, Wanted, compose, encoded, play_shown, tracks_of
+from animation import SHOWN, Scenes, Wanted, compose, encoded, record_episode, tracks_of
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy
@@ -52,7 +52,7 @@ def test_an_animation_runs_without_end_and_equal_frames_are_stored_once() -> Non
 
 
 def test_an_episode_is_played_and_drawn() -> None:
-    played = play_shown(OracleRolloutPolicy(), Wanted("rotate", "L1"), first_seed=0, width=WIDTH)
+    played = record_episode(OracleRolloutPolicy(), Wanted("rotate", "L1"), first_seed=0, width=WIDTH)
     assert played.outcome.success and played.wanted.seed is not None
     assert len(played.pictures) > 20
     assert {picture.shape for picture in played.pictures} == {(100, WIDTH, 3)}
@@ -81,5 +81,5 @@ class Idle:
 def test_a_policy_that_solves_nothing_is_named_and_a_seed_shows_a_failure(monkeypatch) -> None:
     monkeypatch.setattr("animation.MAX_TRIES", 1)
     with pytest.raises(ConfigError, match="solves none of seeds 3 to 3"):
-        play_shown(Idle(), Wanted("rotate", "L1"), first_seed=3, width=WIDTH)
-    assert not play_shown(Idle(), Wanted("rotate", "L1", 3), first_seed=0, width=WIDTH).outcome.success
+        record_episode(Idle(), Wanted("rotate", "L1"), first_seed=3, width=WIDTH)
+    assert not record_episode(Idle(), Wanted("rotate", "L1", 3), first_seed=0, width=WIDTH).outcome.success

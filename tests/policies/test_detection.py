@@ -243,7 +243,7 @@ def test_impossible_detections_are_refused_at_once(make, error: type, message: s
         (plain((0, 0, 256, 9)), DetectionError, r"box 0 of view 'front'.*0 … 255.*0 … 127"),
         (plain((0, 0, 9, 9), (0, -1, 9, 9)), DetectionError, "box 1 of view 'front'"),
         (Detections(boxes((0, 0, 9, 9)), np.ones((1, 64, 64), bool)), ShapeError, r"not \(N, 128, 256\)"),
-        (boxes((0, 0, 9, 9)), PolicyError, "gave a ndarray for view 'front'"),
+        (boxes((0, 0, 9, 9)), PolicyError, "returned a ndarray for view 'front'"),
     ],
 )
 def test_detections_that_do_not_fit_the_image_are_refused(found, error: type, message: str) -> None:

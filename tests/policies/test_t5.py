@@ -304,7 +304,7 @@ def test_gated_encoders_of_later_versions_are_refused(reference, small_sizes, tm
         "encoder.block.1.layer.1.DenseReluDense.wi.weight"
     )
     torch.save(values, tmp_path / "pytorch_model.bin")
-    with pytest.raises(CheckpointError, match=r"lacks .*wi\.weight; it has .*wi_0\.weight.* version 1\.0"):
+    with pytest.raises(CheckpointError, match=r"lacks .*wi\.weight; it has .*wi_0\.weight.* T5 1\.0"):
         loaded(small_sizes, tmp_path)
 
 
