@@ -214,8 +214,7 @@ def draw_vima(axes: Any, story: Story) -> None:
         if number == 1:
             draw_past_action(axes, end)
     draw_box(axes, LEFT, 5.6, (WIDTH - LEFT - 0.25, 0.46), facecolor=LAYERS)
-    draw_text(axes, LEFT + 0.15, 5.83, "decoder: n × (cross-attention to the prompt, self-attention)")
-    draw_text(axes, SECOND, 5.83, "causal self-attention")
+    draw_text(axes, LEFT + 0.15, 5.83, "decoder: n × (cross-attention to the prompt, causal self-attention)")
 
 
 def draw_prompt(axes: Any, processor: Processor, prompt: RenderedPrompt) -> None:

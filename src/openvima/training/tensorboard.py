@@ -13,7 +13,7 @@ class Board:
 
     Args:
         run: The run folder.
-        first: Step, counted through all stages, from which on a resumed run tells what it told before.
+        first: Step, counted through all stages, from which a resumed run logs again.
         wanted: False writes nothing either.
     """
 
