@@ -163,7 +163,7 @@ def test_the_progress_report_ends_at_the_total(settings):
     train(TrainingConfig.of(settings), lambda done, total, note: seen.append((done, total, note)))
     assert seen[-1][:2] == (10, 10)
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
-    assert "drawing scenes" in seen[0][2]
+    assert "rendering scenes" in seen[0][2]
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_widths_are_those_of_the_episodes(case) -> None:
 @pytest.mark.parametrize("is_motion", [False, True])
 def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
     cache, _, processor = case
-    prompt, whole = sequence_lengths._at_most(cache, processor, is_motion)
+    prompt, whole = sequence_lengths._upper_bounds(cache, processor, is_motion)
     episodes = [with_motion_prompt(tokens) if is_motion else tokens for tokens in cache]
     found = np.array([num_places(tokens, processor) for tokens in episodes])
     assert (found <= prompt).all() and (prompt < whole).all()

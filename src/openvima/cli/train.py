@@ -17,16 +17,17 @@ if TYPE_CHECKING:
 DESCRIPTION = """Train a policy on demonstrations by behaviour cloning, or resume an interrupted run.
 
 With nano, nano-bins and small, contrastive pretraining of the crop encoder on rendered scenes comes first.
-The same command resumes an interrupted run exactly where its last checkpoint stands.
+The same command resumes an interrupted run from its last checkpoint.
 
 Example: openvima train --data demos --preset nano --out run
 
---recipe names settings to begin with: "paper" trains as the VIMA paper does, "workstation" on one GPU with
-less data, "nano" for minutes on a few cores, "small" for a policy like the bundled openvima-small. By
-default it is "small" for the preset of that name, "nano" for nano presets and learners of your own, else
-"paper". With --init-from no recipe or file brings pretraining; --pretraining.steps does.
+--recipe selects default settings: "paper" (as in the VIMA paper), "workstation" (one GPU, less data), "nano"
+(minutes on a few cores), "small" (for a policy like the bundled openvima-small), "midas-pretrain",
+"midas-finetune" or "midas-in-context". The default is "small" for the preset of that name, "nano" for nano
+presets and your own learners, else "paper". --init-from disables the pretraining of recipe and file; set
+--pretraining.steps to pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
-the file, and the file over the recipe. The defaults below are those of the chosen recipe and file.
+the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 
 Several GPUs or machines: torchrun --nproc-per-node 8 -m openvima train --data demos --out run ...
 """
@@ -36,7 +37,7 @@ def run(words: Sequence[str]) -> int:
     """Parse the settings, and train.
 
     Args:
-        words: The words after the verb.
+        words: Arguments after the verb.
 
     Returns:
         Exit status.
@@ -62,7 +63,7 @@ def run(words: Sequence[str]) -> int:
     if known.init_from not in (None, "None"):
         settings = overridden(settings, {"init_from": known.init_from})
     if preset:
-        settings["preset"] = preset  # so that the defaults fit together even before it is parsed again
+        settings["preset"] = preset  # so that the defaults are consistent before it is parsed again
     config = tyro.cli(
         TrainingConfig,
         prog="openvima train",
@@ -70,7 +71,7 @@ def run(words: Sequence[str]) -> int:
         args=rest,
         default=TrainingConfig.of({"data": tyro.MISSING, "out": tyro.MISSING, **settings}),
     )
-    is_first = os.environ.get("RANK", "0") == "0"  # among those that torchrun starts
+    is_first = os.environ.get("RANK", "0") == "0"  # of the processes of torchrun
     with progress_bar("training") if is_first else nullcontext() as report:
         folder = train(config, report, _rollout(config) if config.rollout.every else None)
     if not is_first:
@@ -82,7 +83,7 @@ def run(words: Sequence[str]) -> int:
 
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":
-    """What rolls a checkpoint out in the simulator, on the tasks of the data."""
+    """Return rollouts of a checkpoint on the tasks of the data."""
     from openvima.data.reader import read_manifest
     from openvima.env import EnvConfig
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval

@@ -20,21 +20,21 @@ from openvima.training.parallel import Parallel
 from openvima.training.pretraining.stage import crop_parameters
 from openvima.training.source import ExampleSource, Parts, by_length, order_of
 
-CHUNK = 64  # demonstrations whose images are encoded together
-MAX_FEATURES = 2_000_000  # images that are encoded once and kept, rather than in every step
+CHUNK = 64  # demonstrations per batch of precomputed features
+MAX_FEATURES = 2_000_000  # images; above, features are computed in every step
 
 
 class BehaviourCloning:
-    """Minimises the loss of a learner over whole demonstrations, read from the object cache.
+    """Minimises the loss of a learner on whole demonstrations from the object cache.
 
     Args:
-        learner: What is trained.
-        module: What to call for its loss: the learner, perhaps wrapped for several processes.
+        learner: The trained module.
+        module: The learner, wrapped for distributed training if needed.
         config: All settings.
         training: Demonstrations to train on.
-        validation: Held-out demonstrations, which choose the best checkpoint.
+        validation: Held-out demonstrations.
         parallel: The processes of the run.
-        detected: Those to train on, with the boxes of a detector, if they are to be mixed in.
+        detected: The training demonstrations with detected boxes, if some are used.
     """
 
     name = "2-cloning"
@@ -66,7 +66,7 @@ class BehaviourCloning:
         self._next_step = -1
 
     def backward(self, step: int) -> Metrics:
-        """Take the step's demonstrations, in parts of similar length, and add their gradients."""
+        """Add the gradients of one batch, in parts of similar length."""
         if step != self._next_step:
             self._batches = self._from(step)
         self._next_step = step + 1
@@ -74,9 +74,9 @@ class BehaviourCloning:
         total = self._training.num_steps(self._order.rows_of_all(step))
         sums: Metrics = {}
         for number, (batch, num_steps) in enumerate(parts):
-            # Processes average their gradients: each counts by its fraction of the steps of all.
+            # Gradients are averaged over processes: each counts by its fraction of all steps.
             weight = num_steps * self._parallel.num_ranks / total
-            with self._parallel.shares(self._module, last=number == len(parts) - 1):
+            with self._parallel.synchronized(self._module, last=number == len(parts) - 1):
                 loss, metrics = self._call(batch, self._module)
                 (loss * weight).backward()
             _add(sums, {"loss": loss, **metrics}, weight)
@@ -84,7 +84,7 @@ class BehaviourCloning:
 
     @torch.no_grad()
     def validate(self) -> Metrics:
-        """Return loss and metrics on held-out demonstrations; the learner names the one that is the score."""
+        """Return loss and metrics on held-out demonstrations; `Learner.score` names the score."""
         source, collate = self._validation, self._learner.collator()
         if not len(source):
             return {}
@@ -97,7 +97,7 @@ class BehaviourCloning:
         for number, start in enumerate(range(0, len(rows), size)):
             examples = [source[int(row)] for row in rows[start : start + size]]
             mine = number % ranks == self._parallel.rank
-            if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes at once
+            if not (mine or self._parallel.is_sharded):  # a sharded network needs all processes
                 continue
             for group in by_length(examples):
                 loss, metrics = self._call(collate(group, None), self._validated)
@@ -118,7 +118,7 @@ class BehaviourCloning:
                 self._learner.collator(),
                 config.seed,
                 largest=-(-ours // parts),
-                # Sharded weights are gathered at every pass, so all processes must make equally many.
+                # Sharded weights are gathered at every pass, so all processes make equally many passes.
                 count=min(parts, ours) if self._parallel.is_sharded else None,
                 detected=self._detected,
                 detected_prob=config.loader.detected_prob or 0.0,
@@ -134,7 +134,7 @@ class BehaviourCloning:
         device = self._parallel.device
         with self._parallel.autocast(self._config.runtime.precision):
             loss, metrics = module(batch if device.type == "cpu" else batch.to(device))
-        if self._learner.score not in metrics:  # said at the first step, not at the first checkpoint
+        if self._learner.score not in metrics:  # at the first step, not at the first checkpoint
             raise ConfigError(
                 f"the learner's score is {self._learner.score!r}, but its forward returns "
                 f"{', '.join(sorted(metrics)) or 'no metrics'}; name one of them as its score."
@@ -143,7 +143,7 @@ class BehaviourCloning:
 
 
 def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
-    """Whether the crop encoder stays frozen: it was pretrained, here or where the weights come from."""
+    """Whether the crop encoder is frozen, since this run or that of the initial weights pretrained it."""
     encoder, pretraining = network.object_encoder, config.pretraining
     has_appearance = encoder is not None and encoder.config.appearance_width > 0
     is_pretrained = bool(pretraining.steps or config.init_from)
@@ -151,11 +151,11 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
 
 
 def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
-    """Freeze the crop encoder; unless there are too many images, encode each once for the whole run.
+    """Freeze the crop encoder, and precompute the features of all images unless there are too many.
 
     Args:
-        learner: Whose encoder.
-        caches: All that is trained on; their images are numbered one cache after the other.
+        learner: Its crop encoder is frozen.
+        caches: All training data; image indices count through all of them.
     """
     for parameter in crop_parameters(learner.network):
         parameter.requires_grad_(False)
@@ -164,7 +164,7 @@ def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
         return
     device = next(learner.parameters()).device
     height, width = learner.processor.image_size
-    parts = [np.zeros((1, 3, height, width), np.uint8)]  # number 0 is black
+    parts = [np.zeros((1, 3, height, width), np.uint8)]  # index 0 is black
     features = []
     with torch.no_grad():
         for cache in caches:
@@ -177,7 +177,7 @@ def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
 
 
 def _num_cpus() -> int:
-    """How many this process may use; more workers than these would compete."""
+    """Return the CPUs available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -1,4 +1,4 @@
-"""What a run trains: the network of a preset, with parts switched on or off, or a learner of your own."""
+"""Builds the learner of a run: the network of a preset, or a learner of your own."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,10 +32,10 @@ _FOR_OBJECTS = ("drop_unused_objects_prob", "rename_objects_prob", "distractor_p
 
 
 def resolved(config: TrainingConfig) -> TrainingConfig:
-    """Fill in what the settings leave to the preset, and check that both fit together.
+    """Fill in settings that depend on the preset, and check them against it.
 
     Raises:
-        ConfigError: They do not.
+        ConfigError: Settings contradict the preset.
     """
     loader, augmentation = config.loader, config.augmentation
     if loader.detected_prob and loader.boxes is None:
@@ -61,7 +61,7 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
             "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
         )
     if config.t5 is not None and not needs_t5:
-        raise ConfigError(f"preset {config.preset!r} has its own words and no T5; leave t5 out.")
+        raise ConfigError(f"preset {config.preset!r} has its own vocabulary and no T5; leave t5 out.")
     for name in _FOR_OBJECTS:
         if getattr(augmentation, name) and sizes.inputs.tokens == "frames":
             raise ConfigError(
@@ -82,7 +82,7 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
 
 def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
     augmentation = {f"augmentation.{n}": v for n, v in flattened(config.identity()["augmentation"]).items()}
-    augmentation.pop("augmentation.false_positive_prob")  # which does nothing unless its collator has it
+    augmentation.pop("augmentation.false_positive_prob")  # ignored unless its collator uses it
     given = {
         "pretraining.steps": config.pretraining.steps,
         **{name: getattr(config, name) for name in _OF_PRESETS},
@@ -94,7 +94,7 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
 
 
 def _sizes(config: TrainingConfig) -> PolicyConfig:
-    """The sizes of the preset, with what is switched on or off."""
+    """Return the config of the preset with its overrides."""
     sizes = preset(config.preset)
     if config.autoregressive is not None:
         sizes = with_autoregression(sizes, config.autoregressive)
@@ -104,10 +104,10 @@ def _sizes(config: TrainingConfig) -> PolicyConfig:
 
 
 def build_learner(config: TrainingConfig) -> Learner:
-    """Build what a run trains, with fresh weights or those of `init_from`.
+    """Build the learner of a run, with fresh weights or those of `init_from`.
 
     Args:
-        config: All settings, as `resolved` returned them.
+        config: All settings, `resolved`.
 
     Raises:
         CheckpointError: T5 or the initial weights are not where the settings say.
@@ -143,7 +143,7 @@ def build_learner(config: TrainingConfig) -> Learner:
 
 
 def _load_weights_of(network: PolicyNetwork, source: str) -> Path | None:
-    """Copy the weights of another network, and return the folder of its tokenizer, if it has one."""
+    """Load the weights of another network, and return the folder of its tokenizer, if it has one."""
     other, tokenizer = load_network(source)
     ours, theirs = flattened(config_to_dict(network.config)), flattened(config_to_dict(other.config))
     differing = [

@@ -1,4 +1,4 @@
-"""Everything that decides a training run, as nested frozen records that are checked together."""
+"""Settings of a training run, as nested frozen dataclasses that are validated together."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -11,7 +11,7 @@ from openvima.training.validation import Count, Probability, Range, Steps, from_
 
 PRETRAINING_STEPS = 400  # of presets with an appearance embedding
 DETECTED_PROB = 0.5  # where a detector is named
-# Where files are, and how the work is done, does not make it another run.
+# Paths and execution do not identify a run.
 _NOT_IDENTITY = {
     "": ("data", "out", "force", "object_cache", "t5", "rollout"),
     "loader": ("num_workers",),
@@ -22,7 +22,7 @@ _NOT_IDENTITY = {
 
 @dataclass(frozen=True, slots=True)
 class LoaderConfig:
-    """Which demonstrations a step reads.
+    """Batches and held-out demonstrations.
 
     Args:
         batch_size: Demonstrations a step, of all processes together; at most as many as there are.
@@ -30,7 +30,7 @@ class LoaderConfig:
         bucket_batches: Batches among which demonstrations are sorted by length, to reduce padding; 0 draws
             each batch from all.
         validation_fraction: Fraction of the demonstrations held out to choose the best checkpoint.
-        validation_episodes: At most so many of them.
+        validation_episodes: Maximum number of held-out demonstrations.
         boxes: Detector that replaces the true boxes of some demonstrations: "detector" for the bundled one,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which
             makes an `ObjectExtractor`.
@@ -167,7 +167,7 @@ class AugmentationConfig:
 
 @dataclass(frozen=True, slots=True)
 class RuntimeConfig:
-    """How the work is done.
+    """Execution.
 
     Args:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
@@ -188,12 +188,12 @@ class RuntimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class RunConfig:
-    """What every training run has.
+    """Settings common to all training runs.
 
     Args:
         data: Folder of demonstrations, as `openvima generate` writes it.
         out: Run folder: checkpoints, settings, metrics.
-        seed: Decides weights, order and augmentation.
+        seed: Seed of weights, order and augmentation.
         force: Replace a run with other settings.
         optimizer: The optimizer.
         schedule: Length, learning rate, checkpoints.
@@ -221,7 +221,7 @@ class RunConfig:
         return from_settings(cls, settings)
 
     def identity(self) -> dict[str, Any]:  # Any: YAML
-        """Return the settings that decide the weights, nested, as plain values."""
+        """Return the settings that identify the run, nested, as plain values."""
         values = {"": asdict(self)}
         values |= {name: section for name, section in values[""].items() if isinstance(section, dict)}
         for section, names in _NOT_IDENTITY.items():
@@ -230,7 +230,7 @@ class RunConfig:
         return {name: str(v) if isinstance(v, Path) else v for name, v in values[""].items()}
 
     def _unknown(self) -> Iterator[str]:
-        """Say what else is wrong."""
+        """Yield further problems."""
         yield from ()
 
 

@@ -1,4 +1,4 @@
-"""What `train` fits: something that makes batches of demonstrations and a loss of a batch."""
+"""`Learner`, the trained module: it makes batches of demonstrations, and computes a loss."""
 
 import importlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,40 +23,40 @@ from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, Demon
 from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example, stack_images
 
-# From examples and, while training, one generator for each of them, to a batch.
+# From examples and, in training, one generator for each, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
 
 
 class Learner(nn.Module):
-    """Base of all that can be trained; a policy of your own needs two methods.
+    """Base class of trained modules; your own needs `collator` and `forward`.
 
     Attributes:
-        input_kind: What its images show: "objects" or "frames".
-        score: The metric that chooses the best checkpoint, the larger the better, a share of 1.
+        input_kind: "objects" or "frames".
+        score: Metric that selects the best checkpoint, from 0 to 1; larger is better.
     """
 
     input_kind: InputKind = "objects"
     score = "accuracy"
 
     def collator(self) -> Collate:
-        """Return what makes a batch of demonstrations; it is sent to processes that read ahead.
+        """Return the function that makes a batch of demonstrations; it is pickled to loader workers.
 
-        It is called with examples and one random generator for each, or None when validating, where nothing
-        may be drawn. What it draws must follow from the example's generator alone, so that neither the other
-        examples of the batch nor the number of processes matter. A batch is a tensor, or has a method `to`.
+        It is called with examples and one random generator for each, or None in validation. Draws of an
+        example must come from its generator alone, so that they depend neither on the rest of the batch nor
+        on the number of processes. A batch is a tensor, or has a method `to`.
         """
         raise NotImplementedError
 
     def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: its own batch
-        """Return the loss, a mean over all steps of the batch, and metrics by name, likewise."""
+        """Return the loss and metrics by name, means over all steps of the batch."""
         raise NotImplementedError
 
     def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
-        """Write a checkpoint into a folder that is still being filled.
+        """Write a checkpoint.
 
         Args:
             folder: The folder.
-            weights: The state of the learner; gathered, if several processes each hold a part.
+            weights: State dict of the learner, gathered if sharded.
         """
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
         save_file(tensors, folder / WEIGHTS_FILE)
@@ -74,16 +74,16 @@ class Learner(nn.Module):
             raise CheckpointError(f"{file} does not fit: {error}") from None
 
     def description(self) -> dict[str, Any]:  # Any: plain YAML values
-        """Return what decides the network, for the run's `config.yaml`."""
+        """Return the sizes of the network, for the run's `config.yaml`."""
         return {"learner": f"{type(self).__module__}:{type(self).__qualname__}"}
 
 
 class PolicyLearner(Learner):
-    """A network of the family, by behaviour cloning.
+    """A policy of this package, trained by behaviour cloning.
 
     Args:
         network: The network; it is trained in place.
-        processor: How it sees prompts and observations.
+        processor: Its processor.
         false_positive_prob: Probability that a view of a step contains a false detection.
         augmentation: Transforms of demonstrations.
     """
@@ -101,11 +101,11 @@ class PolicyLearner(Learner):
         self.processor = processor
         self.input_kind = processor.input_kind
         self.score = network.score
-        self.features: torch.Tensor | None = None  # of all images, where their encoder stays as it is
+        self.features: torch.Tensor | None = None  # of all images, if their encoder is frozen
         self._false_positive_prob, self._augmentation = false_positive_prob, augmentation
 
     def collator(self) -> "PolicyCollate":
-        """Return what makes batches; see `Learner`."""
+        """Return a `PolicyCollate`."""
         with_images = self.features is None
         return PolicyCollate(
             self.processor,
@@ -119,7 +119,7 @@ class PolicyLearner(Learner):
         network, features = self.network, self.features
         if batch.images is not None:
             features = network.encode_images(batch.images)
-        assert features is not None  # batches without images are made only where there are features
+        assert features is not None  # batches lack images only where there are features
         prompt = network.encode_prompt(batch.prompts, features)
         return network.loss(prompt, batch.history, features, batch.targets)
 
@@ -140,13 +140,13 @@ class PolicyLearner(Learner):
 
 
 class PolicyCollate:
-    """Makes batches for a network of the family.
+    """Makes batches for a policy of this package.
 
     Args:
-        processor: How the network sees prompts and observations.
+        processor: That of the network.
         false_positive_prob: Probability that a view of a step contains a false detection.
-        with_images: Put the images that are used into the batch, each once. Without, numbers count through
-            the images of all demonstrations.
+        with_images: Add the images in use to the batch, each once. Otherwise indices count through the
+            images of all demonstrations.
         augmentation: Transforms of demonstrations; not in validation, unless all are inverse dynamics.
     """
 
@@ -178,10 +178,10 @@ class PolicyCollate:
 
 
 def make_learner(name: str) -> Learner:
-    """Make a learner of one's own.
+    """Make a learner by the name of its function.
 
     Args:
-        name: "module:function"; the function takes nothing and returns a `Learner`.
+        name: "module:function"; the function takes no arguments and returns a `Learner`.
 
     Raises:
         ConfigError: There is no such module or function, or it returns something else.
@@ -218,7 +218,7 @@ def read_tensors(file: Path) -> dict[str, torch.Tensor]:
 
 
 def _stacked(examples: Sequence[Example], processor: Processor) -> tuple[list[Example], torch.Tensor]:
-    """Put the images of demonstrations into one stack, and of those from which they borrow objects."""
+    """Stack the images of demonstrations, and of the sources of their distractors."""
     others = [example.other for example in examples if example.other is not None]
     stacked, stack = stack_images([example.episode for example in (*examples, *others)], processor)
     own, behind = stacked[: len(examples)], iter(stacked[len(examples) :])
@@ -229,17 +229,17 @@ def _stacked(examples: Sequence[Example], processor: Processor) -> tuple[list[Ex
 
 
 def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:
-    """Keep the blank image and those that the batch contains, and number them anew."""
+    """Keep the blank image and those in use, and renumber them."""
     prompts, history = batch.prompts, batch.history
     blank = torch.zeros(1, dtype=torch.int64)
     index = torch.cat([blank, prompts.crop_index_VS.flatten(), history.crop_index_BTVN.flatten()])
-    used, places = index.unique(return_inverse=True)
-    _, prompt_places, history_places = places.split(
+    used, positions = index.unique(return_inverse=True)
+    _, prompt_index, history_index = positions.split(
         [1, prompts.crop_index_VS.numel(), history.crop_index_BTVN.numel()]
     )
     return replace(
         batch,
-        prompts=replace(prompts, crop_index_VS=prompt_places.view_as(prompts.crop_index_VS)),
-        history=replace(history, crop_index_BTVN=history_places.view_as(history.crop_index_BTVN)),
+        prompts=replace(prompts, crop_index_VS=prompt_index.view_as(prompts.crop_index_VS)),
+        history=replace(history, crop_index_BTVN=history_index.view_as(history.crop_index_BTVN)),
         images=stack[used],
     )

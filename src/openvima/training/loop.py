@@ -1,7 +1,7 @@
 """The training loop: stages in turn, metrics, checkpoints, and exact resuming.
 
 Contrastive pretraining, behaviour cloning and the training of detectors are stages of this one loop. A stage
-says what a step minimises; the loop does the rest.
+computes gradients; the loop does the rest.
 """
 
 import math
@@ -34,19 +34,19 @@ from openvima.training.tensorboard import Board
 Metrics = dict[str, float]
 # Called with steps done, steps in all, and a note.
 Report = Callable[[int, int, str], None]
-# From a checkpoint folder to metrics. It is handed in, since training needs no simulation.
+# From a checkpoint folder to metrics. It is passed in, since training does not import the simulator.
 Rollout = Callable[[Path], Metrics]
 
 LOG_EVERY = 20  # steps
 
 
 class Stage(Protocol):
-    """One loss to be minimised for a number of steps.
+    """A loss that is minimised for a number of steps.
 
     Attributes:
-        name: In file names and metrics; names sort in the order of the stages.
+        name: Used in file names and metrics; names sort in the order of the stages.
         learning_rate: Peak learning rate.
-        parameters: What is trained.
+        parameters: The trained parameters.
     """
 
     name: str
@@ -58,17 +58,17 @@ class Stage(Protocol):
         ...
 
     def validate(self) -> Metrics:
-        """Return metrics on held-out data: "score", the larger the better, and perhaps "score_error"."""
+        """Return metrics on held-out data: "score" (larger is better), and optionally "score_error"."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
-    """A stage that is made when its turn comes.
+    """A stage that is built when it starts.
 
     Args:
         num_steps: Its length.
-        make: Makes it.
+        make: Builds it.
     """
 
     num_steps: int
@@ -76,7 +76,7 @@ class PlannedStage:
 
 
 def num_steps(schedule: ScheduleConfig, num_examples: Callable[[], int], batch_size: int) -> int:
-    """Return the steps of a run, from its epochs if they are set."""
+    """Return the number of steps of a run, computed from epochs if they are set."""
     if schedule.epochs is None:
         return schedule.steps
     count = num_examples()
@@ -89,12 +89,12 @@ class Trainer:
     Args:
         config: All settings.
         dataset: The demonstrations.
-        learner: What is trained; a resumed run loads its weights here.
+        learner: The trained module; a resumed run loads its weights.
         parallel: The processes of the run.
         report: Called with the progress.
         rollout: Called with checkpoints of the last stage.
-        rollout_every: Steps between these.
-        demonstrations: What else identifies the data.
+        rollout_every: Steps between rollouts.
+        demonstrations: Further values that identify the data.
 
     Raises:
         CheckpointError: The last checkpoint is damaged.
@@ -131,7 +131,7 @@ class Trainer:
         self._stages: Sequence[PlannedStage] = ()
 
     def train(self, stages: Sequence[PlannedStage]) -> Path:
-        """Run what is left of the stages, and return the run folder.
+        """Run the remaining stages, and return the run folder.
 
         Raises:
             ConfigError: The loss diverged.
@@ -139,7 +139,7 @@ class Trainer:
         self._stages, first = stages, self.parallel.is_first
         self._board = Board(self.run.path, self._done() + 1, wanted=self.config.runtime.tensorboard and first)
         if first:
-            self.run.go_back_to(self.progress)
+            self.run.rewind_to(self.progress)
             origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
             self.run.append(SESSIONS_FILE, {**self._here(), **origin})
         try:
@@ -174,7 +174,7 @@ class Trainer:
                 self._save(stage, optimizer)
 
     def _saves_at(self, step: int) -> bool:
-        """Whether a checkpoint is due, be it to resume from, to keep, or to roll out."""
+        """Whether a checkpoint is due."""
         schedule = self.config.schedule
         return any(
             every and step % every == 0
@@ -191,9 +191,11 @@ class Trainer:
         device, rank = self.parallel.device, self.parallel.rank
         purpose = f"dropout of {stage.name}" + (f" in process {rank}" if rank else "")
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-            torch.manual_seed(step_seed(config.seed, purpose, step))  # from it dropout draws
+            torch.manual_seed(step_seed(config.seed, purpose, step))  # for dropout
             metrics = stage.backward(step)
-        norm = nn.utils.clip_grad_norm_(stage.parameters, config.optimizer.max_grad_norm)  # of all processes
+        norm = nn.utils.clip_grad_norm_(
+            stage.parameters, config.optimizer.max_grad_norm
+        )  # over all processes
         if not math.isfinite(norm):
             raise ConfigError(
                 f"the gradient is {norm:g} at step {step} of {stage.name}, with learning rate {rate:g} and "
@@ -218,8 +220,8 @@ class Trainer:
     def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
         """Validate, update the best checkpoint, and write one.
 
-        With few held-out demonstrations scores are noisy, and later checkpoints were trained at smaller
-        rates: a later one counts as the best unless it is worse by more than the score's standard error.
+        A later checkpoint, trained at a lower rate, is the best unless its noisy score is worse by more than
+        the standard error.
         """
         self.learner.eval()
         metrics = stage.validate()
@@ -259,13 +261,13 @@ class Trainer:
         return {"stage": self.progress.stage, "step": self.progress.step}
 
     def _done(self) -> int:
-        """Steps that are done, counted through all stages."""
+        """Return the steps done, counted through all stages."""
         done = [stage.num_steps for stage in self._stages[: self.progress.stage]]
         return sum(done) + self.progress.step
 
 
 def _optimizer(learner: Learner, stage: Stage, weight_decay: float) -> torch.optim.Optimizer:
-    """AdamW; vectors (biases, norms) and embedding tables do not decay."""
+    """Build AdamW; biases, norms and embedding tables have no weight decay."""
     tables = {id(m.weight) for m in learner.modules() if isinstance(m, nn.Embedding)}
     decayed = [p for p in stage.parameters if p.ndim > 1 and id(p) not in tables]
     others = [p for p in stage.parameters if p.ndim <= 1 or id(p) in tables]

@@ -1,4 +1,4 @@
-"""The state of an optimizer by the names of parameters, as checkpoints contain it."""
+"""Optimizer state by parameter name, as checkpoints contain it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,9 +18,9 @@ def named_state(
 def load_named_state(
     module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Any]
 ) -> None:  # Any: as above
-    """Undo `named_state`; the optimizer may have its parameters in another order.
+    """Load what `named_state` returned; the optimizer may have its parameters in another order.
 
-    Moments get the memory format of their parameters: the fused optimizer walks through both in memory order.
+    Moments get the memory format of their parameters, as the fused optimizer requires.
     """
     names = {id(parameter): name for name, parameter in module.named_parameters()}
     ordered = [p for group in optimizer.param_groups for p in group["params"]]
@@ -34,5 +34,5 @@ def load_named_state(
 
 def _like(parameter: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
     if value.shape != parameter.shape:
-        return value  # the number of steps
+        return value  # the step count
     return torch.empty_like(parameter, dtype=value.dtype, device=value.device).copy_(value)

@@ -1,7 +1,6 @@
-"""One process or many: who this process is, how gradients are shared, and what only one of them does.
+"""Distributed training: data parallel (DDP) or sharded (FSDP2), over the processes of `torchrun`.
 
-`torchrun` starts the processes and tells each its number; without it there is one. Data parallel keeps the
-whole network in every process (DDP); sharded, each keeps a part of weights, gradients and optimizer (FSDP2).
+DDP replicates the network in every process. FSDP2 shards weights, gradients and optimizer state.
 """
 
 import contextlib
@@ -18,9 +17,9 @@ from torch import nn
 from openvima.errors import ConfigError
 
 Sharding = Literal["ddp", "fsdp"]
-ENTRANCES = ("keys_values",)  # methods besides `forward` by which layers are called
-# How long processes wait for the first one, which makes the object cache and plays trials.
-PATIENCE = datetime.timedelta(days=1)
+FORWARD_METHODS = ("keys_values",)  # methods of layers that are called besides `forward`
+# Processes wait for the first one, which builds the object cache and runs rollouts.
+TIMEOUT = datetime.timedelta(days=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +27,9 @@ class Parallel:
     """The processes of a run.
 
     Args:
-        rank: Number of this process.
-        num_ranks: How many there are.
-        device: Where this process computes.
+        rank: Rank of this process.
+        num_ranks: World size.
+        device: Device of this process.
         sharding: "ddp" or "fsdp".
     """
 
@@ -46,26 +45,26 @@ class Parallel:
 
     @property
     def is_sharded(self) -> bool:
-        """Whether each process holds but a part of the weights."""
+        """Whether each process holds a shard of the weights."""
         return self.sharding == "fsdp" and self.num_ranks > 1
 
     def wrap(self, module: nn.Module) -> nn.Module:
-        """Return what to call for training: it shares gradients between the processes."""
+        """Wrap a module for training, so that gradients are synchronized between processes."""
         if self.num_ranks == 1:
             return module
         if self.is_sharded:
             return _sharded(module, self.device)
         ids = [self.device.index] if self.device.type == "cuda" else None
-        # Without broadcasts processes may call it different numbers of times; no buffer changes in training.
+        # Processes may call it different numbers of times; no buffer changes in training.
         return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
     @contextlib.contextmanager
-    def shares(self, module: nn.Module, *, last: bool) -> Iterator[None]:
-        """Share gradients with the last backward pass of a step only.
+    def synchronized(self, module: nn.Module, *, last: bool) -> Iterator[None]:
+        """Synchronize gradients in the last backward pass of a step only.
 
         Args:
-            module: What `wrap` returned.
-            last: Whether the passes of this step end with the block.
+            module: The wrapped module.
+            last: Whether the block is the last pass of the step.
         """
         if self.num_ranks == 1:
             yield
@@ -79,12 +78,12 @@ class Parallel:
                 yield
 
     def autocast(self, precision: str) -> torch.autocast:
-        """Return a context in which matrix products have that precision, "float32" or "bfloat16"."""
+        """Return a context for mixed precision, "float32" or "bfloat16"."""
         is_half = precision == "bfloat16"
         return torch.autocast(self.device.type, torch.bfloat16 if is_half else None, enabled=is_half)
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Average named numbers over all processes; one that lacks a name counts as 0."""
+        """Average metrics over all processes; a missing metric counts as 0."""
         if self.num_ranks == 1:
             return dict(values)
         everywhere: list[dict[str, float]] = [{}] * self.num_ranks
@@ -93,14 +92,14 @@ class Parallel:
         return {name: sum(part.get(name, 0.0) for part in everywhere) / self.num_ranks for name in names}
 
     def wait(self) -> None:
-        """Wait until all processes have come here."""
+        """Wait for all processes."""
         if self.num_ranks > 1:
             dist.barrier()
 
 
 @contextlib.contextmanager
 def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
-    """Join the processes that `torchrun` has started, if it has.
+    """Join the process group of `torchrun`, if there is one.
 
     Args:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
@@ -127,29 +126,28 @@ def joined(device: str, sharding: Sharding) -> Iterator[Parallel]:
     if num_ranks == 1:
         yield Parallel(0, 1, chosen, sharding)
         return
-    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=PATIENCE)
+    dist.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=TIMEOUT)
     try:
         yield Parallel(rank, num_ranks, chosen, sharding)
-        dist.barrier()  # else gloo aborts where one process ends earlier than another
+        dist.barrier()  # gloo aborts if one process ends earlier
     finally:
         dist.destroy_process_group()
 
 
 def compile_layers(module: nn.Module) -> None:
-    """Compile the layers of all stacks with torch.compile; those that are alike are compiled once.
+    """Compile the layers of all stacks with torch.compile; equal layers are compiled once.
 
-    What lies between them is called once a step, and would take many times as long to compile.
+    The rest of the network is called once per step, and would take many times as long to compile.
     """
     for layer in _layers(module):
         layer.compile(dynamic=True)
 
 
 def whole_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Collect the weights and the optimizer's state of a sharded module; every process must call it.
+    """Gather weights and optimizer state of a sharded module; every process must call it.
 
     Returns:
-        Name of the parameter to tensor, and name of the parameter to its state; on the first process. Others
-        get empty ones.
+        Tensors and optimizer state by name of the parameter, on the first process; elsewhere empty.
     """
     from torch.distributed.checkpoint.state_dict import (
         StateDictOptions,
@@ -166,7 +164,7 @@ def whole_state(module: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[di
 def set_whole_state(
     module: nn.Module, optimizer: torch.optim.Optimizer, state: Mapping[str, Mapping[str, torch.Tensor]]
 ) -> None:
-    """Give a sharded module's optimizer its state; every process must call it with the whole."""
+    """Load the full optimizer state of a sharded module; every process must call it."""
     from torch.distributed.checkpoint.state_dict import (
         StateDictOptions,
         get_optimizer_state_dict,
@@ -179,20 +177,20 @@ def set_whole_state(
 
 
 def _sharded(module: nn.Module, device: torch.device) -> Any:  # Any: the module, of a class made for it
-    """Shard the layers of the largest stacks one by one, and the rest together."""
+    """Shard the layers of stacks one by one, and the rest together."""
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
     mesh = init_device_mesh(device.type, (dist.get_world_size(),))
     for layer in _layers(module):
         fully_shard(layer, mesh=mesh)
-        for method in ENTRANCES:
+        for method in FORWARD_METHODS:
             if hasattr(layer, method):
                 register_fsdp_forward_method(layer, method)
     return fully_shard(module, mesh=mesh)
 
 
 def _layers(module: nn.Module) -> list[nn.Module]:
-    """The members of all stacks that are more than a few matrices."""
+    """Return the layers of all stacks, without plain linear and sequential ones."""
     stacks = [part for part in module.modules() if isinstance(part, nn.ModuleList)]
     return [layer for stack in stacks for layer in stack if not isinstance(layer, nn.Linear | nn.Sequential)]

@@ -46,7 +46,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
     config = resolved(config)
-    load_assets(config.assets)  # mistakes are found before there is a run folder
+    load_assets(config.assets)  # fails before there is a run folder
     dataset = Dataset(config.data)
     boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
     runtime = config.runtime
@@ -71,7 +71,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
 
 
 class _Stages:
-    """Makes the stages of a run from its settings."""
+    """Builds the stages of a run."""
 
     def __init__(
         self,
@@ -143,10 +143,7 @@ class _Stages:
 
     @cached_property
     def _caches(self) -> list[ObjectCache]:
-        """The object caches: of true boxes, of those of a detector, or first the one and then the other.
-
-        The first process makes them if need be.
-        """
+        """Object caches of true boxes, of detected ones, or both; the first process builds missing ones."""
         prob, folder = self.config.loader.detected_prob or 0.0, self.config.object_cache
         caches = []
         if not self.parallel.is_first:

@@ -1,4 +1,4 @@
-"""What a run was made with, for whoever reads its results later."""
+"""Versions, git commit and data of a run."""
 
 import hashlib
 import subprocess
@@ -14,7 +14,7 @@ _PACKAGES = ("torch", "numpy", "pyarrow", "safetensors", "transformers")
 
 
 def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
-    """Return versions, the git commit of the package if it lies in a checkout, and which data were used."""
+    """Return versions, the git commit of the package if it is in a checkout, and digests of the data."""
     content = (dataset.path / MANIFEST_NAME).read_bytes()
     return {
         "versions": {"openvima": openvima.__version__, **_versions()},
@@ -28,15 +28,15 @@ def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
 
 
 def index_hash(folder: Path) -> str:
-    """Return a hash of which demonstrations a folder holds."""
+    """Return a hash of the index of a folder of demonstrations."""
     return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()
 
 
 def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON
-    """Return the commit of the checkout that a folder lies in, and whether files differ from it.
+    """Return the commit of the checkout that contains a folder, and whether it has changes.
 
     Returns:
-        `commit` and `changed`; None where the folder is no part of a checkout, or git is missing.
+        `commit` and `changed`; None without checkout or git.
     """
 
     def ask(*words: str) -> str | None:

@@ -1,4 +1,4 @@
-"""Named settings: as the paper trains, for one workstation, and for a CPU; and settings from files."""
+"""Recipes (named settings), and settings from files."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,7 +62,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
-        # For a policy like the bundled openvima-small; docs/training.md has its history.
+        # For a policy like the bundled openvima-small; its history is in docs/training.md.
         "small": {
             "preset": "small",
             "pretraining.steps": 4000,
@@ -134,10 +134,10 @@ def read_settings(file: Path) -> dict[str, Any]:
 
 
 def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Put other settings over some.
+    """Override settings by others.
 
-    Steps among them replace the epochs of a recipe; and `init_from` brings a trained crop encoder, so that
-    pretraining is left to the preset, which then has none, unless they set it as well.
+    Steps replace epochs. `init_from` comes with a trained crop encoder, so it resets pretraining to the
+    default of the preset, which is then none, unless the others set it as well.
     """
     length = {"schedule.epochs": None} if "schedule.steps" in others else {}
     pretraining = {"pretraining.steps": None} if others.get("init_from") else {}

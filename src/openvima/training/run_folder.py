@@ -1,14 +1,14 @@
-"""The folder of a training run: its settings, metrics and checkpoints, whole at every moment.
+"""The folder of a training run: settings, metrics and checkpoints, consistent at any moment.
 
     RUN/config.yaml                                   settings, resolved
     RUN/metrics.jsonl                                 one line of metrics every few steps
-    RUN/timings_log.jsonl                             when they were reached; differs between machines
+    RUN/timings_log.jsonl                             when steps were reached
     RUN/sessions_log.jsonl                            versions, git commit and data of each start
     RUN/tensorboard_log/                              the metrics for TensorBoard, if it is installed
     RUN/checkpoints/2-cloning-000400/model.safetensors, config.yaml, optimizer.safetensors, state.json
     RUN/checkpoints/best.txt                          name of the best checkpoint
 
-Every file and checkpoint is written under a temporary name and renamed when it is whole.
+Files and checkpoints are written under a temporary name and renamed when complete.
 """
 
 import json
@@ -40,11 +40,11 @@ _PARTIAL = ".partial"
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a run has come.
+    """Progress of a run.
 
     Args:
-        stage: Number of the stage, from 0.
-        step: Steps of it that are done.
+        stage: Index of the stage.
+        step: Steps of the stage done.
         best_score: Best validation score so far; None before the first.
         best_checkpoint: Name of the checkpoint to use.
     """
@@ -57,11 +57,11 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class TrainedState:
-    """What a checkpoint holds.
+    """Content of a checkpoint.
 
     Args:
         weights: Name to tensor.
-        optimizer: Name of a parameter to the optimizer's state of it.
+        optimizer: Name of a parameter to its optimizer state.
     """
 
     weights: Mapping[str, torch.Tensor]
@@ -72,10 +72,10 @@ class RunFolder:
     """Reads and writes one run.
 
     Args:
-        path: The folder; it is made if it does not exist.
-        settings: Plain values that decide the run.
-        force: Throw away what is there if it belongs to other settings.
-        keep_every: Steps between checkpoints that are never deleted; None keeps the latest and the best only.
+        path: The folder; created if missing.
+        settings: Plain values that identify the run.
+        force: Delete a run with other settings.
+        keep_every: Steps between permanent checkpoints; None keeps the latest and the best only.
         is_first: Whether this process writes the folder; others only read.
 
     Raises:
@@ -99,7 +99,7 @@ class RunFolder:
         if differing and not force:
             raise ConfigError(
                 f"{path} holds a run with other settings: {'; '.join(differing)}. Give the same settings to "
-                "continue it, another --out, or --force to throw it away."
+                "continue it, another --out, or --force to delete it."
             )
         if differing:
             self._clear()
@@ -109,24 +109,18 @@ class RunFolder:
         atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def latest(self) -> Path | None:
-        """Return the last whole checkpoint, or None if there is none."""
+        """Return the last complete checkpoint, or None."""
         found = sorted(path for path in self.checkpoints.iterdir() if path.is_dir())
         return found[-1] if found else None
 
-    def save(
-        self,
-        name: str,
-        learner: Learner,
-        state: TrainedState,
-        progress: Progress,
-    ) -> None:
-        """Write a checkpoint and delete those that are neither the latest, nor the best, nor to be kept.
+    def save(self, name: str, learner: Learner, state: TrainedState, progress: Progress) -> None:
+        """Write a checkpoint, and delete others except the best and permanent ones.
 
         Args:
-            name: Name of the checkpoint's folder; later ones sort behind earlier ones.
+            name: Folder name; names sort in the order of steps.
             learner: Writes its weights.
-            state: Weights and the state of the optimizer.
-            progress: How far the run has come.
+            state: Weights and optimizer state.
+            progress: Progress of the run.
         """
         partial = self.checkpoints / f"{name}{_PARTIAL}"
         shutil.rmtree(partial, ignore_errors=True)
@@ -153,7 +147,7 @@ class RunFolder:
         """Load the weights of the last checkpoint, if there is one.
 
         Returns:
-            How far the run had come.
+            Progress of the run.
 
         Raises:
             CheckpointError: The checkpoint is damaged or does not fit.
@@ -165,14 +159,14 @@ class RunFolder:
         return progress
 
     def optimizer_state(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Read the optimizer's state of the last checkpoint: name of the parameter to its state.
+        """Read the optimizer state of the last checkpoint, by name of the parameter.
 
         Raises:
             CheckpointError: There is none, or it is damaged.
         """
         checkpoint = self.latest()
         if checkpoint is None:
-            raise CheckpointError(f"{self.checkpoints} holds no checkpoint to go on from.")
+            raise CheckpointError(f"{self.checkpoints} holds no checkpoint to resume from.")
         state: dict[str, dict[str, torch.Tensor]] = {}
         for key, tensor in read_tensors(checkpoint / OPTIMIZER_FILE).items():
             parameter, _, name = key.partition("|")
@@ -184,9 +178,9 @@ class RunFolder:
         with (self.path / file).open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(values) + "\n")
 
-    def go_back_to(self, progress: Progress) -> None:
-        """Make the folder what it was at a checkpoint: without metrics of later steps, which come again."""
-        self._note_best(progress)  # the run may have been killed before it could
+    def rewind_to(self, progress: Progress) -> None:
+        """Remove metrics of steps after a checkpoint, which will be repeated."""
+        self._note_best(progress)  # the run may have been killed before
         file = self.path / METRICS_FILE
         if not file.is_file():
             return

@@ -1,4 +1,4 @@
-"""The learning rate over a run, and random generators that follow from the step alone."""
+"""Learning rate schedule, and random generators derived from the step."""
 
 import hashlib
 import math
@@ -28,14 +28,11 @@ def learning_rate_at(step: int, schedule: ScheduleConfig, *, peak: float, num_st
 
 
 def step_seed(seed: int, purpose: str, step: int) -> int:
-    """Seed for what one step of a run draws for one purpose.
-
-    A resumed run needs no saved generators: every draw follows from the run's seed and the step's number.
-    """
+    """Return the seed of one purpose at one step, so that a resumed run needs no saved generators."""
     digest = hashlib.blake2b(f"{seed}/{purpose}/{step}".encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
 
 
 def step_generator(seed: int, purpose: str, step: int) -> torch.Generator:
-    """Generator seeded by `step_seed`."""
+    """Return a generator seeded by `step_seed`."""
     return torch.Generator().manual_seed(step_seed(seed, purpose, step))

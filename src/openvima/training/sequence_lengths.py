@@ -1,4 +1,4 @@
-"""Whether demonstrations fit into a network: checked before training rather than in the middle of it."""
+"""Checks before training that all demonstrations fit into the context of a network."""
 
 import numpy as np
 import torch
@@ -14,18 +14,18 @@ from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.training.augmentation.inverse_dynamics import motion_text, with_motion_prompt
 
-MAX_READ = 256  # only those that may be too long are read, and of them the longest
+MAX_READ = 256  # of those that may be too long the longest are checked
 
 
 def check_lengths(
     cache: ObjectCache, network: PolicyNetwork, processor: Processor, *, inverse_dynamics_prob: float = 0.0
 ) -> None:
-    """Read the longest demonstrations, if one of them may be too long.
+    """Run the network on the longest demonstrations, if they may be too long.
 
     Args:
-        cache: The tokens of all.
-        network: What is trained; it is left in evaluation mode.
-        processor: How it sees prompts and observations.
+        cache: All demonstrations.
+        network: The network; it is left in evaluation mode.
+        processor: Its processor.
         inverse_dynamics_prob: Probability of inverse dynamics.
 
     Raises:
@@ -38,51 +38,55 @@ def check_lengths(
         *([False] if inverse_dynamics_prob < 1 else []),
         *([True] if inverse_dynamics_prob else []),
     ]:
-        prompt, whole = _at_most(cache, processor, is_motion)
+        prompt, whole = _upper_bounds(cache, processor, is_motion)
         excess = np.maximum(prompt / MAX_PROMPT_POSITIONS, whole / MAX_POSITIONS)
         longest = np.argsort(-excess, kind="stable")[:MAX_READ]
         for row in longest[excess[longest] > 1]:
-            tokens = cache[int(row)]
-            _read(network, processor, with_motion_prompt(tokens) if is_motion else tokens, is_motion)
+            episode = cache[int(row)]
+            _forward(network, processor, with_motion_prompt(episode) if is_motion else episode, is_motion)
 
 
-def _at_most(cache: ObjectCache, processor: Processor, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds on the places of each prompt, and of prompt and history together, shape (N,)."""
-    steps, (shown, seen) = cache.lengths()[:, 0], cache.widths().T
+def _upper_bounds(cache: ObjectCache, processor: Processor, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return bounds on the positions of each prompt, and of prompt and history together, shape (N,)."""
+    steps, (in_prompt, in_view) = cache.lengths()[:, 0], cache.widths().T
     texts = [motion_text(1)] if is_motion else cache.texts()
     pieces = [split_prompt(text) for text in texts]
     words = max(
         sum(len(processor.tokenizer.encode(p)) for p in text if isinstance(p, str)) for text in pieces
     )
     if is_motion:
-        images = (steps + 1) * _tokens_of(seen, processor)
+        images = (steps + 1) * _tokens_of(in_view, processor)
     else:
-        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * _tokens_of(shown, processor)
-    prompt = words + images + 1  # the end
-    return prompt, prompt + 1 + steps * (_tokens_of(seen + len(VIEWS), processor) + 1 + ACTION_WIDTH)
+        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * _tokens_of(
+            in_prompt, processor
+        )
+    prompt = words + images + 1  # end of prompt
+    return prompt, prompt + 1 + steps * (_tokens_of(in_view + len(VIEWS), processor) + 1 + ACTION_WIDTH)
 
 
 def _tokens_of(num_objects: np.ndarray, processor: Processor) -> np.ndarray:
-    """Tokens of an image that shows so many objects."""
+    """Return the tokens of an image with so many objects."""
     if processor.layout == "frames":
         return np.full_like(num_objects, processor.tokens_per_frame_pair)
     return num_objects * (len(VIEWS) if processor.layout == "views" else 1)
 
 
 @torch.no_grad()
-def _read(network: PolicyNetwork, processor: Processor, tokens: PreprocessedEpisode, is_motion: bool) -> None:
-    """Let the network read one demonstration, with black images."""
+def _forward(
+    network: PolicyNetwork, processor: Processor, episode: PreprocessedEpisode, is_motion: bool
+) -> None:
+    """Run the network on one demonstration, with black images."""
     device = next(network.parameters()).device
-    batch = processor.collate([tokens]).to(device)
+    batch = processor.collate([episode]).to(device)
     height, width = processor.image_size
     black = network.encode_images(torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device))
-    features = black.expand(1 + len(tokens.images), *black.shape[1:])
+    features = black.expand(1 + len(episode.images), *black.shape[1:])
     try:
         prompt = network.encode_prompt(batch.prompts, features)
         network.loss(prompt, batch.history, features, batch.targets)
     except PolicyError as error:
-        reading = " with its inverse-dynamics prompt" if is_motion else ""
+        prompt_kind = " with its inverse-dynamics prompt" if is_motion else ""
         raise DatasetError(
-            f"episode {tokens.seed} of {tokens.task}{reading} is too long to train on: {error} Or "
+            f"episode {episode.seed} of {episode.task}{prompt_kind} is too long to train on: {error} Or "
             "leave its task out, with `openvima data sample --tasks`."
         ) from None

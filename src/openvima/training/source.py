@@ -1,4 +1,4 @@
-"""The demonstrations of a run, from the object cache: those to learn from, and those kept for validation."""
+"""The demonstrations of a run, from the object cache: training split, validation split, and batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +19,13 @@ from openvima.training.learner import Collate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExampleSource(Sequence[Example]):
-    """Some demonstrations of a cache, by number.
+    """A subset of the demonstrations of a cache.
 
     Args:
         cache: All demonstrations.
-        rows: Which of them, shape (N,), int64.
-        bases: Images of all demonstrations before each one, shape (all,), int64.
-        lengths: Steps of each one and objects in view in all of them, shape (N, 2), int64.
+        rows: Their indices, shape (N,), int64.
+        bases: Index of the first image of each demonstration of the cache, shape (all,), int64.
+        lengths: Steps of each, and objects in view in all of them, shape (N, 2), int64.
     """
 
     cache: ObjectCache
@@ -40,24 +40,24 @@ class ExampleSource(Sequence[Example]):
         return self.example(int(self.rows[index]))
 
     def example(self, row: int) -> Example:
-        """Return a demonstration by its number among all."""
+        """Return a demonstration by its index in the cache."""
         return Example(self.cache[row], int(self.bases[row]), row)
 
     def num_steps(self, indices: np.ndarray) -> int:
-        """Return the steps of some demonstrations together."""
+        """Return the total steps of some demonstrations."""
         return int(self.lengths[indices, 0].sum())
 
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """Makes a process's part of a batch, in parts of demonstrations of similar length.
+    """Collates the batch of a process in parts of similar length.
 
     Args:
         collate: Makes a batch of each part.
-        seed: Of the run; every example has a generator of its own for every batch.
-        largest: Most demonstrations of a part.
-        count: Make exactly so many parts, whatever the lengths; None makes as many as needed.
-        detected: The same demonstrations with the boxes of a detector; see `with_boxes_of`.
+        seed: Of the run; every example of every batch has its own generator.
+        largest: Maximum size of a part.
+        count: Number of parts, whatever the lengths; None is as many as needed.
+        detected: The same demonstrations with detected boxes; see `with_boxes_of`.
         detected_prob: Probability of using these instead.
         distractors: Demonstrations from which distractors are inserted; see `with_distractors`.
         distractor_prob: Probability of that, for demonstrations that allow it.
@@ -73,7 +73,7 @@ class Parts:
     distractor_prob: float = 0.0
 
     def __call__(self, examples: Sequence[Example], number: int) -> list[tuple[object, int]]:
-        """Return the batches of one step, each with its number of steps in demonstrations."""
+        """Return the parts of one batch, each with its number of demonstration steps."""
         parts = []
         for part in self._divided(examples):
             rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
@@ -82,7 +82,7 @@ class Parts:
         return parts
 
     def _drawn(self, example: Example, rng: np.random.Generator) -> Example:
-        """Draw the boxes of an example, and where distractors come from; the number of steps stays."""
+        """Draw the boxes of an example, and the source of its distractors."""
         if self.detected is not None and rng.random() < self.detected_prob:
             example = self.detected.example(example.row)
         source = self.distractors
@@ -110,14 +110,14 @@ class Parts:
 def split_examples(
     cache: ObjectCache, *, validation_fraction: float, validation_episodes: int
 ) -> tuple[ExampleSource, ExampleSource]:
-    """Split demonstrations into those to train on and held-out ones.
+    """Split demonstrations into training and validation.
 
-    Which ones are held out follows from task and seed, so that it stays when data are added.
+    The split follows from task and seed, so that it stays the same when data are added.
 
     Args:
         cache: All demonstrations.
         validation_fraction: Fraction to hold out.
-        validation_episodes: At most so many are used; which ones follows from task and seed, too.
+        validation_episodes: Maximum number of them.
 
     Raises:
         DatasetError: There is none to train on.
@@ -140,12 +140,11 @@ def split_examples(
 
 
 def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource:
-    """Return the demonstrations of a source with the boxes of a detector.
+    """Return the demonstrations of a source with detected boxes.
 
     Args:
-        detected: The detections in the demonstrations of the source's cache. Its images come after all of
-            that one's.
-        source: Which demonstrations.
+        detected: Cache of the detections; its images are numbered after those of the source's cache.
+        source: The demonstrations.
     """
     counts = detected.image_counts()
     bases = np.cumsum(counts) - counts + source.cache.image_counts().sum()
@@ -153,7 +152,7 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
 
 
 def check_words(cache: ObjectCache, processor: Processor) -> None:
-    """Check the words of every prompt before training.
+    """Check before training that the vocabulary has the words of every prompt.
 
     Raises:
         PromptError: A prompt has a word that the vocabulary lacks.
@@ -167,7 +166,7 @@ def check_words(cache: ObjectCache, processor: Processor) -> None:
 def order_of(
     source: ExampleSource, *, batch: int, seed: int, bucket: int, rank: int, num_ranks: int
 ) -> BatchOrder:
-    """Return which demonstrations each step takes; a batch is never larger than there are.
+    """Return the order of demonstrations; a batch is at most as large as the data.
 
     Raises:
         ConfigError: The processes cannot share the demonstrations, or a batch of them, equally.
@@ -190,7 +189,7 @@ def order_of(
 
 
 def by_length(examples: Sequence[Example]) -> list[list[Example]]:
-    """Group examples of one step, of two or three, and longer ones, to reduce padding."""
+    """Group examples of 1, of 2 or 3, and of more steps, to reduce padding."""
     groups: dict[int, list[Example]] = {}
     for example in examples:
         groups.setdefault(min(2, example.episode.num_steps // 2), []).append(example)

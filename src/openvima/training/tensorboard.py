@@ -1,4 +1,4 @@
-"""Metrics for TensorBoard, beside the lines of `metrics.jsonl`, which are always written."""
+"""TensorBoard events, in addition to `metrics.jsonl`."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -9,12 +9,12 @@ BOARD_FOLDER = "tensorboard_log"  # events hold times, so they differ between ma
 
 
 class Board:
-    """Writes events where `tensorboard` is installed, and else nothing.
+    """Writes events if `tensorboard` is installed.
 
     Args:
         run: The run folder.
-        first: Step, counted through all stages, from which a resumed run logs again.
-        wanted: False writes nothing either.
+        first: First step of this session, counted through all stages; later events are purged.
+        wanted: False writes nothing.
     """
 
     def __init__(self, run: Path, first: int, *, wanted: bool) -> None:
@@ -26,7 +26,7 @@ class Board:
         """Write named numbers at a step, counted through all stages."""
         if not self._wanted:
             return
-        if self._writer is None:  # a finished run that is started again gets no empty file
+        if self._writer is None:  # restarting a finished run writes no empty file
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(self._run / BOARD_FOLDER), purge_step=self._first)

@@ -1,4 +1,4 @@
-"""Checks of settings, which may come from a file and so be anything, and settings by dotted names."""
+"""Validation of settings, which may come from a file, and settings by dotted name."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -23,7 +23,7 @@ Steps = Annotated[int, Range(0)]
 Probability = Annotated[float, Range(0, 1)]
 
 Settings = TypeVar("Settings")
-# What values of a type may be, and how that is called.
+# Allowed type of values, and its name in messages.
 _TYPES = {
     int: (Integral, "a whole number"),
     float: (Real, "a number"),
@@ -33,11 +33,11 @@ _TYPES = {
 
 
 def problems_of(settings: object, prefix: str = "") -> Iterator[str]:
-    """Say of each setting that is not allowed why, nested ones included.
+    """Yield a message for each invalid setting, nested ones included.
 
     Args:
-        settings: A dataclass; the types of its fields decide what they may hold.
-        prefix: What comes before the names of its fields.
+        settings: A dataclass whose annotations define allowed values.
+        prefix: Prefix of field names.
     """
     for name, hint in get_type_hints(type(settings), include_extras=True).items():
         value = getattr(settings, name)
@@ -48,7 +48,7 @@ def problems_of(settings: object, prefix: str = "") -> Iterator[str]:
 
 
 def flattened(values: Any, prefix: str = "") -> dict[str, Any]:  # Any: plain YAML values
-    """Return nested settings as one mapping; names are joined by dots."""
+    """Flatten nested settings; names are joined by dots."""
     if not isinstance(values, Mapping):
         return {prefix: values}
     result: dict[str, Any] = {}
@@ -98,13 +98,13 @@ def _values(section: Any) -> dict[str, Any]:  # Any: a dataclass
 
 
 def converted(value: Any, hint: Any) -> Any:  # Any: what YAML holds, and types
-    """Make paths and numbers of texts; YAML takes 1e-4, without a point, for a text."""
+    """Convert text to paths and numbers; YAML reads 1e-4, without a point, as text."""
     kinds = {_plain(option)[0] for option in _options(hint)}
     if not isinstance(value, str) or not {Path, float} & kinds:
         return value
     try:
         return Path(value) if Path in kinds else float(value)
-    except ValueError:  # the settings will say what it must be
+    except ValueError:  # reported by `problems_of`
         return value
 
 

@@ -1,4 +1,4 @@
-"""Augmentation of batches: false detections among the objects, and shuffled objects.
+"""Augmentation of batches: false positives, and shuffled objects.
 
 Shape suffixes: B batch, T steps, V views, N objects in view (slots of a view).
 """
@@ -25,16 +25,15 @@ def augmented(
     probability: float,
     rngs: Sequence[np.random.Generator],
 ) -> Batch:
-    """Add false detections, and shuffle objects where their order means nothing.
+    """Add false positives, and shuffle objects where their order has no meaning.
 
     Args:
         batch: Demonstrations.
-        layout: What a token shows, as in `Processor`. Fused objects are shuffled, since that head points at
-            them. With a token for each view they keep their order, as in the published policies, and a false
-            detection comes anywhere among them. Whole frames stay as they are.
-        probability: Chance that a view of a step shows an object that is none.
-        rngs: One for each demonstration. What it draws does not depend on the others of the batch, nor on
-            how much they are padded.
+        layout: Token layout of the `Processor`. Fused objects are shuffled, as the head points at them. With
+            a token for each view they keep their order, as in the published policies, and false positives
+            anywhere among them. Whole frames stay as they are.
+        probability: Probability that a view of a step contains a false positive.
+        rngs: One for each demonstration; draws depend neither on the rest of the batch nor on padding.
 
     Returns:
         The batch with two more slots for objects; targets follow their objects.
@@ -64,7 +63,7 @@ def _drawn(history: HistoryBatch, rngs: Sequence[np.random.Generator]) -> torch.
 
 
 def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatch:
-    """Append a slot for each view; slot N + v shows the false detection of view v, or nothing."""
+    """Append a slot for each view; slot N + v is the false positive of view v, or nothing."""
     history, false_positives = batch.history, batch.false_positives
     visible_BTVN = torch.diag_embed(shows_BTV)  # view v, slot v
     crop_index_BTVN = torch.diag_embed(torch.from_numpy(false_positives.crop_index)) * visible_BTVN
@@ -83,7 +82,7 @@ def _with_spurious_objects(batch: Batch, shows_BTV: torch.Tensor) -> HistoryBatc
 
 
 def _with_spurious_in_views(batch: Batch, shows_BTV: torch.Tensor, drawn_BTV: torch.Tensor) -> Batch:
-    """Put false detections anywhere among the visible slots of their view.
+    """Put false positives anywhere among the visible slots of their view.
 
     The numbers of slots become what `Processor` would make of such detections: each is an object that one
     view shows, so that the other view gets an empty slot; and slots once there stay for the episode.

@@ -1,4 +1,4 @@
-"""Everything that decides the training of a detector, as nested frozen records."""
+"""Settings of a detector's training, as nested frozen dataclasses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _SCHEDULE = ScheduleConfig(steps=4200, warmup_steps=100, checkpoint_every=200)
 
 @dataclass(frozen=True, slots=True)
 class FrameLoaderConfig:
-    """Which frames a step reads.
+    """Batches and held-out frames.
 
     Args:
         batch_size: Frames a step, two views of each moment.

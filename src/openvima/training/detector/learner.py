@@ -1,4 +1,4 @@
-"""A detector as something that can be trained: its losses, and its checkpoints."""
+"""The learner of a detector: losses and checkpoints."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class FrameBatch:
 
     @staticmethod
     def of(frames: Sequence[Frame], generator: torch.Generator) -> "FrameBatch":
-        """Put frames into tensors."""
+        """Stack frames into tensors."""
         images = torch.from_numpy(np.stack([frame.rgb for frame in frames]))
         objects = [
             Instances(

@@ -1,4 +1,4 @@
-"""Which demonstrations a detector is trained on, and which are held out."""
+"""Training and validation split of a detector's demonstrations."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from openvima.training.hash_split import split_hashes
 
 
 def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-    """Split demonstrations into those to train on and held-out ones.
+    """Split demonstrations into training and validation.
 
-    Which ones are held out follows from task and seed, so that it stays when data are added.
+    The split follows from task and seed, so that it stays the same when data are added.
 
     Args:
         dataset: The demonstrations.

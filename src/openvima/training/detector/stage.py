@@ -1,4 +1,4 @@
-"""Training a detector: frames of demonstrations, and its stage of the training loop."""
+"""Detector training as a stage of the training loop."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,10 +74,10 @@ class DetectorStage:
     """Minimises the losses of Mask R-CNN over frames with known objects.
 
     Args:
-        learner: What is trained.
+        learner: The trained module.
         config: All settings.
         source: Frames to train on.
-        held_out: Frames that choose the best checkpoint, by their loss.
+        held_out: Validation frames.
         parallel: The process of the run.
     """
 
@@ -98,7 +98,7 @@ class DetectorStage:
         self._order = BatchOrder(len(source), batch=config.loader.batch_size // 2, seed=config.seed)
 
     def backward(self, step: int) -> Metrics:
-        """Draw the step's frames and add their gradients, in parts."""
+        """Add the gradients of one batch of frames, in parts."""
         frames, sums = self._frames(step), Metrics()
         generator = step_generator(self._config.seed, "boxes of the losses", step)
         size = -(-len(frames) // self._config.optimizer.grad_accum_steps)
@@ -137,7 +137,7 @@ class DetectorStage:
 
 
 def _network(config: DetectorTrainingConfig) -> MaskRCNN:
-    """The network to begin with; `init_from` is read in full, which also checks it."""
+    """Build the network, with the weights of `init_from` if given."""
     if config.init_from is not None:
         is_file = config.init_from.is_file()
         return load_detectron2(config.init_from) if is_file else load_network(config.init_from)
