@@ -1,6 +1,6 @@
 """Draw policy.png: the token sequences of the policies for one prompt and two steps.
 
-Words, crops, patches and bins are the networks' inputs, from their processors.
+Words, crops, patches and bins are the networks' inputs, as made by `Processor`.
 """
 
 from collections.abc import Mapping, Sequence
