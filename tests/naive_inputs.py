@@ -75,7 +75,7 @@ class StepInput:
 
 
 @dataclass(frozen=True, slots=True)
-class Reader:
+class NaiveProcessor:
     """Turns prompts and observations into what a network takes; the same for training and acting.
 
     Args:
@@ -97,15 +97,15 @@ class Reader:
         inputs: InputLayout,
         tokenizer: Tokenizer | None = None,
         extractor: ObjectExtractor | None = None,
-    ) -> "Reader":
-        """Make the reader for a network that takes such inputs."""
+    ) -> "NaiveProcessor":
+        """Make the processor for a network that takes such inputs."""
         tokenizer = tokenizer or CLOSED_TOKENIZER
         order = PUBLISHED_ORDER if inputs.tokens == "views" else GROUND_TRUTH
-        return Reader(
+        return NaiveProcessor(
             inputs.tokens, inputs.image_size, inputs.tokens_per_frame_pair, tokenizer, extractor or order
         )
 
-    def read_prompt(self, prompt: RenderedPrompt) -> PromptInput:
+    def encode_prompt(self, prompt: RenderedPrompt) -> PromptInput:
         """Turn a prompt into words and images.
 
         Raises:
@@ -139,9 +139,9 @@ class Reader:
         in_scene = np.array(kinds, np.bool_)[numbers]
         return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers, in_scene)
 
-    def begin_episode(self) -> "EpisodeReader":
-        """Return the reader of one episode's observations."""
-        return EpisodeReader(self)
+    def start_episode(self) -> "NaiveEpisode":
+        """Return the processor of one episode's observations."""
+        return NaiveEpisode(self)
 
     def see_frames(self, rgb: Mapping[str, np.ndarray]) -> ObjectViews:
         """Take both frames whole, at the size that the network takes.
@@ -177,18 +177,18 @@ class Reader:
         return [(k, v, bool(objects.masks[v, k])) for v, count in enumerate(slots) for k in range(count)]
 
 
-class EpisodeReader:
+class NaiveEpisode:
     """Reads the observations of one episode, in order.
 
     With a token for each view, an object that was seen once keeps its slots when it is hidden in both views.
     So the number of slots never falls within an episode, as in the published evaluation.
     """
 
-    def __init__(self, reader: Reader) -> None:
-        self._reader = reader
+    def __init__(self, processor: NaiveProcessor) -> None:
+        self._processor = processor
         self._num_slots = 0
 
-    def read_step(self, observation: Mapping) -> StepInput:
+    def encode_step(self, observation: Mapping) -> StepInput:
         """Turn an observation into objects.
 
         Args:
@@ -200,12 +200,12 @@ class EpisodeReader:
                 With a token for each view the last is allowed after the first step. Or there are too many.
             ShapeError: An image has another shape or dtype.
         """
-        layout, end_effector = self._reader.layout, end_effector_of(observation)
+        layout, end_effector = self._processor.layout, end_effector_of(observation)
         if layout == "frames":
-            frames = self._reader.see_frames(part_of(observation, "rgb"))
+            frames = self._processor.see_frames(part_of(observation, "rgb"))
             centre = frames.positions()
             return StepInput(frames, centre, centre, end_effector)
-        objects = self._reader.extractor.in_observation(observation)
+        objects = self._processor.extractor.in_observation(observation)
         if not len(objects) and not self._num_slots:
             raise PolicyError(
                 "the observation shows no object; there is nothing to act on. Look at its segmentation, "
@@ -219,7 +219,7 @@ class EpisodeReader:
 
     def _check_count(self, count: int) -> None:
         """Refuse what no history has room for; a long history may have less."""
-        limit = MAX_POSITIONS // (len(VIEWS) if self._reader.layout == "views" else 1) - 1
+        limit = MAX_POSITIONS // (len(VIEWS) if self._processor.layout == "views" else 1) - 1
         if count > limit:
             raise PolicyError(
                 f"the observation shows {count} objects; this policy takes {limit}. Raise its min_score."

@@ -23,8 +23,8 @@ from torch import nn
 from naive_inputs import (
     WORD,
     HistoryBatch,
+    NaiveProcessor,
     PromptInput,
-    Reader,
     StepInput,
     batch_histories,
     batch_prompts,
@@ -279,7 +279,7 @@ def _file(name: str) -> Path:
 
 
 def _stack(network: PolicyNetwork) -> ImageStack:
-    return ImageStack(Reader.of(network.config.inputs).image_size)
+    return ImageStack(NaiveProcessor.of(network.config.inputs).image_size)
 
 
 def _features(network: PolicyNetwork, stack: ImageStack) -> torch.Tensor:
@@ -315,9 +315,9 @@ def _places(
     network: PolicyNetwork, objects: ObjectViews, counts: Sequence[int]
 ) -> list[tuple[int, int, bool]]:
     """Slot, part and validity of the tokens of one image."""
-    reader = Reader.of(network.config.inputs)
-    if reader.layout == "frames":
-        return [(0, part, True) for part in range(reader.tokens_per_frame_pair)]
+    processor = NaiveProcessor.of(network.config.inputs)
+    if processor.layout == "frames":
+        return [(0, part, True) for part in range(processor.tokens_per_frame_pair)]
     return [
         (k, view, bool(objects.masks[view, k])) for view, count in enumerate(counts) for k in range(count)
     ]

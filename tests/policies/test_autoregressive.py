@@ -157,8 +157,8 @@ def test_the_loss_is_that_of_the_published_head_on_these_logits(network, demonst
     parts = torch.zeros((), dtype=torch.float64)
     for part in ACTION_PARTS.values():
         for c in range(part.start, part.stop):
-            chances = logits[c].softmax(-1).gather(-1, bins_BTC[..., c, None])
-            parts = parts - chances[exists].log().mean() / (part.stop - part.start)
+            probabilities = logits[c].softmax(-1).gather(-1, bins_BTC[..., c, None])
+            parts = parts - probabilities[exists].log().mean() / (part.stop - part.start)
     torch.testing.assert_close(loss, parts)
     assert isinstance(network.head, AutoregressiveHead) and metrics.keys() >= {
         "accuracy",
@@ -307,10 +307,10 @@ def chance_of_either(config: PolicyConfig, demonstration) -> float:
     with torch.no_grad():
         _, _, logits = forward(network, network.encode_prompt(prompts, features), history, features, targets)
     bins_BTC = encode_bins(to_unit_range(actions))
-    chances = [
+    probabilities = [
         score.softmax(-1).gather(-1, bins_BTC[..., c, None])[:, 0, 0] for c, score in enumerate(logits)
     ]
-    return torch.stack(chances).prod(0).sum().item()
+    return torch.stack(probabilities).prod(0).sum().item()
 
 
 @pytest.mark.slow

@@ -148,11 +148,11 @@ def test_a_position_counts_as_much_as_a_rotation_of_twice_its_length():
     exists, slots = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.int64)
     loss, metrics = loss_of(network, query, ActionTargets(actions, slots, slots, exists))
     bins = encode_bins(to_unit_range(actions))
-    surprises = []
+    nlls = []
     for component, scores in enumerate(network.logits(query)):
-        chances = scores.detach().log_softmax(-1)
-        surprises.append(-sum(chances[0, t, bins[0, t, component]].item() for t in range(2)) / 2)
-    expected = sum(sum(surprises[part]) / len(surprises[part]) for part in ACTION_PARTS.values())
+        log_probs = scores.detach().log_softmax(-1)
+        nlls.append(-sum(log_probs[0, t, bins[0, t, component]].item() for t in range(2)) / 2)
+    expected = sum(sum(nlls[part]) / len(nlls[part]) for part in ACTION_PARTS.values())
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     assert sum(metrics[f"loss/{name}"] for name in ACTION_PARTS).item() == pytest.approx(expected, rel=1e-5)
 

@@ -33,7 +33,7 @@ from small_networks import narrow_small  # noqa: E402
 
 
 @pytest.fixture
-def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def bundled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Folder of a small network in float16 that replaces the bundled checkpoint.
 
     The working directory is another, empty one.
@@ -47,8 +47,8 @@ def packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_it_is_loaded_by_its_name_and_never_computes_in_float16(packaged: Path, demonstrations) -> None:
-    expected = load_checkpoint(packaged).state_dict()
+def test_it_is_loaded_by_its_name_and_never_computes_in_float16(bundled: Path, demonstrations) -> None:
+    expected = load_checkpoint(bundled).state_dict()
     for load in (load_policy, NetworkPolicy.from_pretrained):
         policy = load(SMALL)
         floats = [
@@ -59,19 +59,19 @@ def test_it_is_loaded_by_its_name_and_never_computes_in_float16(packaged: Path, 
             torch.equal(tensor, expected[name]) for name, tensor in policy.network.state_dict().items()
         )
     assert load_policy(SMALL, dtype=torch.float32).network.query.dtype == torch.float32
-    seen = set()
+    dtypes = set()
     for module in policy.network.modules():
         module.register_forward_pre_hook(
-            lambda _, given: seen.update(
+            lambda _, given: dtypes.update(
                 t.dtype for t in given if isinstance(t, torch.Tensor) and t.is_floating_point()
             )
         )
     policy.reset([demonstrations[0].prompt])
     policy.act([demonstrations[0].observation(0)])
-    assert seen == {torch.float64}
+    assert dtypes == {torch.float64}
 
 
-def test_storing_in_float16_and_then_in_float32_changes_nothing(packaged: Path, demonstrations) -> None:
+def test_storing_in_float16_and_then_in_float32_changes_nothing(bundled: Path, demonstrations) -> None:
     assert main(["policies", "convert", SMALL, "wide"]) == 0
     actions = []
     for policy in (load_policy(SMALL), load_policy("wide")):
@@ -80,7 +80,7 @@ def test_storing_in_float16_and_then_in_float32_changes_nothing(packaged: Path, 
     assert all(np.array_equal(actions[0][key], actions[1][key]) for key in actions[0])
 
 
-def test_an_unknown_name_is_told_the_name_of_the_package(packaged: Path) -> None:
+def test_the_message_for_an_unknown_name_lists_the_bundled_checkpoint(bundled: Path) -> None:
     with pytest.raises(
         UnknownPolicyError, match=r"Did you mean 'openvima-small'\?.*openvima-small, a preset"
     ):
@@ -92,10 +92,10 @@ def test_an_unknown_name_is_told_the_name_of_the_package(packaged: Path) -> None
 
 
 @pytest.mark.slow
-def test_without_its_weights_the_message_says_where_they_belong(packaged: Path, capsys) -> None:
-    (packaged / "model.safetensors").unlink()
+def test_without_its_weights_the_message_says_where_they_belong(bundled: Path, capsys) -> None:
+    (bundled / "model.safetensors").unlink()
     for work in (load_policy, weights_hash, find_checkpoint):
-        with pytest.raises(CheckpointError, match=f"lacks the weights of 'openvima-small'.*{packaged}"):
+        with pytest.raises(CheckpointError, match=f"lacks the weights of 'openvima-small'.*{bundled}"):
             work(SMALL)
     assert main(["policies", "--json"]) == 0
     assert SMALL not in capsys.readouterr().out
@@ -104,17 +104,17 @@ def test_without_its_weights_the_message_says_where_they_belong(packaged: Path, 
     assert not list(Path().iterdir())
 
 
-def test_a_checkpoint_here_of_the_same_name_is_not_mistaken_for_it(packaged: Path) -> None:
+def test_a_checkpoint_here_of_the_same_name_is_not_mistaken_for_it(bundled: Path) -> None:
     save_checkpoint(build_network(narrow_small(), seed=6), f"run/{CHECKPOINTS_FOLDER}/000001")
     Path("run").rename(SMALL)
     with pytest.raises(PolicyError, match=r"write \./openvima-small for the folder"):
         load_policy(SMALL)
     here = load_policy(f"./{SMALL}").network.query
     assert torch.equal(here.float(), build_network(narrow_small(), seed=6).query)
-    assert weights_hash(f"./{SMALL}") == weights_hash(Path(SMALL)) != weights_hash(packaged)
+    assert weights_hash(f"./{SMALL}") == weights_hash(Path(SMALL)) != weights_hash(bundled)
 
 
-def test_other_folders_and_files_here_do_not_stand_in_for_it(packaged: Path) -> None:
+def test_other_folders_and_files_here_do_not_replace_it(bundled: Path) -> None:
     Path(SMALL).mkdir()
     Path(SMALL, "metrics.jsonl").write_text("{}")
     Path("metrics.jsonl").write_text("{}")
@@ -124,12 +124,12 @@ def test_other_folders_and_files_here_do_not_stand_in_for_it(packaged: Path) -> 
     assert find_metrics(policy_sources((SMALL,))) is None
 
 
-def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(packaged: Path, capsys) -> None:
-    policies = f"{SMALL},mine={SMALL},copy={packaged}"
+def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(bundled: Path, capsys) -> None:
+    policies = f"{SMALL},mine={SMALL},copy={bundled}"
     words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--videos", "0", "--out", SMALL]
     assert main(["evaluate", "--policy", policies, *words]) == 0
     results = Results.read(Path(SMALL, "results.json"))
-    sha = weights_hash(packaged)
+    sha = weights_hash(bundled)
     own = {"kind": "run", "bundled": SMALL, "sha256": sha}
     assert results.policies == {SMALL: own, "mine": own, "copy": {"kind": "run", "sha256": sha}}
     first, *others = (results.row(name, "rotate", "L1").outcomes for name in results.policies)
@@ -139,40 +139,40 @@ def test_it_can_be_scored_under_two_names_and_its_weights_are_recorded(packaged:
 
 
 @pytest.mark.slow
-def test_it_is_filmed_and_listed_and_shown(packaged: Path, capsys) -> None:
-    assert main(["demo", "rotate", "--policy", SMALL, "--out", "film.mp4"]) == 0
-    assert Path("film.mp4").stat().st_size > 0
-    size = (packaged / "model.safetensors").stat().st_size
+def test_it_is_recorded_and_listed_and_shown(bundled: Path, capsys) -> None:
+    assert main(["demo", "rotate", "--policy", SMALL, "--out", "video.mp4"]) == 0
+    assert Path("video.mp4").stat().st_size > 0
+    size = (bundled / "model.safetensors").stat().st_size
     capsys.readouterr()
     for words in (["list"], ["show", SMALL]):
         assert main(["policies", *words]) == 0
         shown = capsys.readouterr().out
-        for text in (f"{size / 1e6:.1f} MB", BUNDLED[SMALL].trained_on, str(packaged / MODEL_CARD)):
+        for text in (f"{size / 1e6:.1f} MB", BUNDLED[SMALL].trained_on, str(bundled / MODEL_CARD)):
             assert text in shown
     assert main(["policies", "list", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)[-1]
     assert (record["name"], record["bytes"]) == (SMALL, size)
-    assert record["model_card"] == str(packaged / MODEL_CARD)
+    assert record["model_card"] == str(bundled / MODEL_CARD)
 
 
-def test_training_begins_with_it(packaged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_begins_with_it(bundled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(presets.PRESETS, "narrow", narrow_small)
     learner = build_learner(
         TrainingConfig(data=Path("data"), out=Path("out"), preset="narrow", init_from=SMALL)
     )
-    expected = load_checkpoint(packaged).state_dict()
+    expected = load_checkpoint(bundled).state_dict()
     weights = learner.network.state_dict()
     assert {tensor.dtype for tensor in weights.values()} == {torch.float32}
     assert all(torch.equal(tensor, expected[name]) for name, tensor in weights.items())
 
 
 def test_quickstart_scores_it_beside_the_policy_that_it_trains(
-    packaged: Path, monkeypatch: pytest.MonkeyPatch, capsys
+    bundled: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     monkeypatch.setattr(quickstart, "TASKS", ("rotate",))
     monkeypatch.setattr(quickstart, "_first_look", lambda *_: None)
     monkeypatch.setattr(quickstart, "_generate", lambda *_: Path("demonstrations"))
-    monkeypatch.setattr(quickstart, "_train", lambda *_: packaged)
+    monkeypatch.setattr(quickstart, "_train", lambda *_: bundled)
     monkeypatch.setattr(assets, "recording_jobs", lambda *_: [])  # other tests record
     assert quickstart.main(out=Path("quick"), episodes=1, workers=1) == 0
     shown = capsys.readouterr().out.splitlines()

@@ -1,4 +1,4 @@
-"""Objects from detectors: a perfect one sees what the segmentation says, bad ones are told what is wrong."""
+"""Objects from detectors: a perfect one matches the segmentation, invalid detections are reported."""
 
 from dataclasses import replace
 
@@ -100,7 +100,7 @@ def test_prompt_images_are_seen_alike_but_for_the_order_of_their_records(task: s
         assert_same(found, observe_prompt_image(image).left_to_right())
 
 
-def test_a_segmentation_is_never_looked_at(starts) -> None:
+def test_the_segmentation_is_never_used(starts) -> None:
     _, seen = starts[0]
     extractor = DetectedObjects(perfect(seen["segm"], 5))
     expected = extractor.in_observation(seen)

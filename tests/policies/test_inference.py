@@ -167,7 +167,7 @@ def test_neither_company_nor_order_changes_an_action(policy, prompts, pool) -> N
 
 
 def test_history_and_prompt_change_the_action(policy, prompts, pool) -> None:
-    """Without this the tests above could pass for a network that looks at nothing."""
+    """Without this the tests above could pass for a network that ignores its input."""
     policy.reset([prompts[0], prompts[1], prompts[0]])
     with recorded_queries(policy.network) as queries:
         policy.act([pool[0], pool[0], pool[3]])
@@ -295,13 +295,13 @@ def test_a_low_temperature_gives_the_likeliest_actions(policy, prompts, pool) ->
 def test_samples_have_the_distribution_of_the_logits() -> None:
     """Chi-square over 4000 draws from five classes and a hidden one, at temperature 2."""
     scores = torch.tensor([0.0, 3.0, 1.0, torch.finfo(torch.float32).min, 2.0, 4.0])
-    chances = torch.softmax(scores.double() / 2, dim=-1).numpy()
+    probabilities = torch.softmax(scores.double() / 2, dim=-1).numpy()
     generators = [torch.Generator().manual_seed(seed) for seed in range(4000)]
     drawn = sampling(generators, 2.0)(scores.expand(4000, 1, 6)).flatten()
     counts = np.bincount(drawn.numpy(), minlength=6)
     assert counts[3] == 0
-    shown = chances > 0
-    expected = 4000 * chances[shown]
+    shown = probabilities > 0
+    expected = 4000 * probabilities[shown]
     assert ((counts[shown] - expected) ** 2 / expected).sum() < 23.5  # exceeded once in 10 000 times
 
 

@@ -43,7 +43,7 @@ def test_classes_that_score_alike_are_a_near_tie(name, last_layer, starts):
 
 
 @pytest.mark.parametrize("name", ["nano", "small", "nano-bins", "midas-nano"])
-def test_in_single_precision_only_near_ties_turn_with_the_batch(name, starts):
+def test_in_single_precision_only_near_ties_depend_on_the_batch(name, starts):
     envs, observations = zip(*starts, strict=True)
     policy = NetworkPolicy(decisive(name), dtype=torch.float32)
     policy.reset([env.prompt for env in envs])

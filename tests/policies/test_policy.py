@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import UnknownPolicyError  # noqa: E402
 from openvima.policies import RandomPolicy, load_policy  # noqa: E402
@@ -118,18 +118,18 @@ def test_the_environment_takes_the_actions(policy) -> None:
     assert env.action_space.contains(action)
 
 
-def read_episode(reader: Reader, demo) -> list:
-    episode = reader.begin_episode()
-    return [episode.read_step(demo.observation(t)) for t in range(demo.num_steps)]
+def encode_episode(processor: NaiveProcessor, demo) -> list:
+    episode = processor.start_episode()
+    return [episode.encode_step(demo.observation(t)) for t in range(demo.num_steps)]
 
 
 def test_padding_changes_nothing(small_sizes, demonstrations) -> None:
     """The same prompt and steps, alone and beside longer ones, give the head the same inputs."""
     model = build_network(small_sizes, seed=4).double().eval()
     chosen = [demonstrations[0], demonstrations[-1]]
-    reader = Reader.of(small_sizes.inputs)
-    prompts = [reader.read_prompt(demo.prompt) for demo in chosen]
-    steps = [read_episode(reader, demo) for demo in chosen]
+    processor = NaiveProcessor.of(small_sizes.inputs)
+    prompts = [processor.encode_prompt(demo.prompt) for demo in chosen]
+    steps = [encode_episode(processor, demo) for demo in chosen]
 
     def run(rows: list[int]):
         crops, numbers, histories, first = [], [], [], 0

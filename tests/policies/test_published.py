@@ -152,7 +152,7 @@ def test_names_go_to_published_ones_and_back(network) -> None:
         ("vima", "action_decoder._decoders.pose1_position.mlps.1.0.bias", "head.classifiers.7.0.bias"),
     ],
 )
-def test_weights_of_equal_shapes_are_told_apart(network, architecture, published, ours) -> None:
+def test_weights_of_equal_shapes_are_distinguished(network, architecture, published, ours) -> None:
     weight = to_published(network)[published]
     assert torch.equal(weight, network.state_dict()[ours])
 
@@ -264,7 +264,7 @@ def test_loading_draws_no_random_numbers(vima_contents, tmp_path) -> None:
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_all_that_is_missing_too_much_or_misshapen_is_told_at_once(vima_contents, tmp_path) -> None:
+def test_missing_unexpected_and_misshapen_weights_are_listed_in_one_message(vima_contents, tmp_path) -> None:
     weights = vima_contents["state_dict"]
     del weights["policy.end_effector_encoder.weight"], weights["policy.xattn_gpt.positions_embed.weight"]
     weights["policy.surplus.weight"] = torch.zeros(1)

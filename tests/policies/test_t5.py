@@ -11,7 +11,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")
 
-from naive_inputs import Reader  # noqa: E402
+from naive_inputs import NaiveProcessor  # noqa: E402
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
@@ -106,10 +106,10 @@ def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(token
         (),
     )
     prompt = RenderedPrompt("Put the {a} into the {a}.", {"a": image})
-    reader = Reader("frames", (64, 128), 1, tokenizer)
-    read = reader.read_prompt(prompt)
+    processor = NaiveProcessor("frames", (64, 128), 1, tokenizer)
+    encoded = processor.encode_prompt(prompt)
     image_place = 0  # padding
-    assert read.words.tolist() == [
+    assert encoded.words.tolist() == [
         *ids("▁Put", "▁the"),
         image_place,
         *ids("▁into", "▁the"),
@@ -118,7 +118,7 @@ def test_a_prompt_is_read_with_placeholders_between_words_and_the_end_mark(token
         STOP,
         1,
     ]
-    assert (read.entries >= 0).tolist() == [word == image_place for word in read.words]
+    assert (encoded.entries >= 0).tolist() == [word == image_place for word in encoded.words]
 
 
 def test_words_without_ids_are_all_named(tokenizer) -> None:
@@ -174,7 +174,7 @@ def test_a_missing_transformers_is_named_with_its_extra(tokenizer_folder, monkey
 
 
 @pytest.mark.parametrize("name", ["./nowhere", "no where", "/nowhere/t5", "a/b/c"])
-def test_what_can_be_no_id_is_not_looked_for_on_the_hub(name, monkeypatch) -> None:
+def test_an_invalid_id_causes_no_request_to_the_hub(name, monkeypatch) -> None:
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda *_, **__: pytest.fail("asked the Hub"))
     with pytest.raises(CheckpointError, match="no folder"):
         T5Tokenizer(name)

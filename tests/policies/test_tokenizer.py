@@ -84,7 +84,7 @@ def blank_images(text: str) -> RenderedPrompt:
 
 
 def encoded(prompt: RenderedPrompt) -> list[int | PromptImage]:
-    """Ids and images in reading order, as a reader interleaves them."""
+    """Ids and images in reading order, as the processor interleaves them."""
     sequence: list[int | PromptImage] = []
     for part in prompt.sequence():
         sequence += CLOSED_TOKENIZER.encode(part) if isinstance(part, str) else [part]

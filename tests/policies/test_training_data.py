@@ -26,7 +26,7 @@ def appearances(task: str, role: str) -> frozenset[tuple[str, str]]:
     return appearances_of(roles[role]) if role in roles else frozenset()
 
 
-def seen(task: str) -> frozenset[tuple[str, str]]:
+def training_pairs(task: str) -> frozenset[tuple[str, str]]:
     """On the table or in prompts."""
     return frozenset().union(*(appearances(task, role) for role in RECORD["tasks"][task]["roles"]))
 
@@ -59,7 +59,7 @@ def test_all_that_it_saw_is_from_the_training_partition() -> None:
     assert leaks(RECORD) == []
 
 
-def test_a_novel_look_among_its_data_would_be_noticed() -> None:
+def test_a_novel_appearance_among_its_data_would_be_noticed() -> None:
     for task, role, name, texture in (
         ("rotate", "dragged", "letter A", "brick"),
         ("rotate", "dragged", "letter R", "red"),
@@ -86,7 +86,7 @@ def test_what_l2_combines_was_neither_dragged_nor_a_base(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_it_saw_no_novel_shape_in_any_role(task: str) -> None:
-    assert not {name for name, _ in seen(task)} & NOVEL_SHAPES
+    assert not {name for name, _ in training_pairs(task)} & NOVEL_SHAPES
 
 
 def test_novel_textures_are_only_on_distractors_of_rearrangements_as_the_benchmark_has_them() -> None:

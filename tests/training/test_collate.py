@@ -7,7 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
@@ -25,20 +25,20 @@ SETTINGS = {
 OBJECTS = Processor("objects")
 
 
-def as_when_acting(demos, reader: Reader):
+def as_when_acting(demos, naive: NaiveProcessor):
     """Prompts and histories read one by one by the naive twin, and their images."""
-    stack = ImageStack(reader.image_size)
+    stack = ImageStack(naive.image_size)
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)
         numbers[objects.masks] = stack.add(objects.crops[objects.masks])
         return numbers
 
-    prompts = [reader.read_prompt(demo.prompt) for demo in demos]
+    prompts = [naive.encode_prompt(demo.prompt) for demo in demos]
     histories = []
     for demo in demos:
-        episode = reader.begin_episode()
-        histories.append([episode.read_step(demo.observation(t)) for t in range(demo.num_steps)])
+        episode = naive.start_episode()
+        histories.append([episode.encode_step(demo.observation(t)) for t in range(demo.num_steps)])
     prompt_batch = batch_prompts(prompts, [add(prompt.objects) for prompt in prompts])
     numbers = [[add(step.objects) for step in history] for history in histories]
     return prompt_batch, batch_histories(histories, numbers), torch.from_numpy(stack.images())
@@ -57,8 +57,10 @@ def test_training_and_acting_see_the_same(layout, demonstrations_of_several_step
     processor, demos = Processor(**SETTINGS[layout]), demonstrations_of_several_steps
     examples, images = stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
     batch = collate_examples(processor, examples)
-    reader = Reader(**SETTINGS[layout], extractor=PUBLISHED_ORDER if layout == "views" else GROUND_TRUTH)
-    for *expected, expected_images in (as_when_acting(demos, reader), acting(demos, processor)):
+    naive = NaiveProcessor(
+        **SETTINGS[layout], extractor=PUBLISHED_ORDER if layout == "views" else GROUND_TRUTH
+    )
+    for *expected, expected_images in (as_when_acting(demos, naive), acting(demos, processor)):
         for ours, theirs in zip((batch.prompts, batch.history), expected, strict=True):
             for field in fields(ours):
                 got, asked = getattr(ours, field.name), getattr(theirs, field.name)

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from safetensors.torch import load_file  # noqa: E402
 
-from naive_inputs import Reader, batch_histories, batch_prompts  # noqa: E402
+from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from noisy_extractor import HOOK, Clumsy  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
@@ -46,9 +46,9 @@ class Guesses:
 EXTRACTORS = {"clumsy": PluggedExtractor(Clumsy()), "guesses": PluggedExtractor(DetectedObjects(Guesses()))}
 
 
-def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
+def assert_as_when_acting(batch, demos, naive: NaiveProcessor, prompts) -> None:
     """Compare a batch with what a policy encodes, and with what the naive twin reads step by step."""
-    stack = ImageStack(reader.image_size)
+    stack = ImageStack(naive.image_size)
 
     def add(objects: ObjectViews) -> np.ndarray:
         numbers = np.zeros(objects.masks.shape, np.int64)
@@ -56,15 +56,15 @@ def assert_as_when_acting(batch, demos, reader: Reader, prompts) -> None:
             numbers[objects.masks] = stack.add(objects.crops[objects.masks])
         return numbers
 
-    read = [reader.read_prompt(prompt) for prompt in prompts]
+    read = [naive.encode_prompt(prompt) for prompt in prompts]
     histories = []
     for demo in demos:
-        episode = reader.begin_episode()
-        histories.append([episode.read_step(demo.observation(t)) for t in range(demo.num_steps)])
+        episode = naive.start_episode()
+        histories.append([episode.encode_step(demo.observation(t)) for t in range(demo.num_steps)])
     expected_prompts = batch_prompts(read, [add(prompt.objects) for prompt in read])
     numbers = [[add(step.objects) for step in history] for history in histories]
     expected_history = batch_histories(histories, numbers)
-    processor = Processor(reader.layout, extractor=reader.extractor)
+    processor = Processor(naive.layout, extractor=naive.extractor)
     acting_prompts, acting_stack = processor.encode_prompts(prompts)
     observations = [[demo.observation(t) for t in range(demo.num_steps)] for demo in demos]
     acting_history, _ = processor.encode_observations(observations, stack=acting_stack)
@@ -90,10 +90,10 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
         EXTRACTORS[name],
         [*demonstrations_of_several_steps, *(Dataset(data)[row] for row in range(6))],
     )
-    reader = Reader(layout, extractor=extractor)
+    naive = NaiveProcessor(layout, extractor=extractor)
     examples = [Example(preprocess(demo, "objects", extractor)) for demo in demos]
     batch = PolicyCollate(Processor(layout), 0.0, with_images=True)(examples)
-    assert_as_when_acting(batch, demos, reader, [demo.prompt for demo in demos])
+    assert_as_when_acting(batch, demos, naive, [demo.prompt for demo in demos])
     # Motions, too: their frames show what was found before and after.
     motions = PolicyCollate(
         Processor(layout), 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0)
@@ -102,7 +102,7 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
         motion_prompt([demo.observation(t) for t in range(demo.num_steps + 1)], demo.objects)
         for demo in demos
     ]
-    assert_as_when_acting(motions, demos, reader, shown)
+    assert_as_when_acting(motions, demos, naive, shown)
 
 
 def test_the_clumsy_extractor_finds_nothing_now_and_then(demonstrations_of_several_steps) -> None:
@@ -132,7 +132,7 @@ def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrati
         [Example(preprocess(demo, "objects", blind))]
     )
     assert batch.prompts.crop_index_VS.shape == (2, 0)
-    assert_as_when_acting(batch, [demo], Reader(layout, extractor=blind), [prompt])
+    assert_as_when_acting(batch, [demo], NaiveProcessor(layout, extractor=blind), [prompt])
 
 
 @pytest.fixture(scope="module")
