@@ -46,7 +46,7 @@ SCALING_LEVELS = ("L1", "L3", "L4")
 
 
 def save_all(findings: Findings, folder: Path) -> dict[str, Path]:
-    """Draw what there is to draw.
+    """Draw all figures with data.
 
     Returns:
         The files by name: levels, and scaling and ablations where there are trainings.
@@ -60,7 +60,7 @@ def save_all(findings: Findings, folder: Path) -> dict[str, Path]:
         folder.mkdir(parents=True, exist_ok=True)
         files = {name: folder / f"openvima_small_{name}.png" for name in figures}
         for name, figure in figures.items():
-            # without the version of matplotlib, so that the bytes change with the picture only
+            # without the matplotlib version, so that bytes depend on the picture only
             figure.savefig(files[name], dpi=140, facecolor=PAPER, metadata={"Software": None})
     return files
 
@@ -79,14 +79,14 @@ def levels(findings: Findings) -> Figure:
             if level in model.levels:
                 axes.barh(place, model.levels[level], color=PUBLISHED, height=0.66)
                 draw_label(axes, model.levels[level], place, f"{model.levels[level]:.1f}")
-        per_cent_axis(axes)
+        percent_axis(axes)
         axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(names) - 0.5, -0.6)
         axes.grid(visible=False, axis="y")
     figure.axes[0].get_yticklabels()[0].set(color=OURS, fontweight="bold")
     figure.supxlabel(
-        "Solved episodes (%), mean over the tasks of the level. Blue: measured, with its 95 % "
-        "interval. Grey: published.",
+        "Success rate (%), mean over the tasks of the level. Blue: measured, with 95 % interval. "
+        "Grey: published.",
         fontsize=8.5,
         color=FAINT,
         x=0.01,
@@ -103,7 +103,7 @@ def scaling(findings: Findings) -> Figure:
     for axes, level in zip(panels, SCALING_LEVELS, strict=True):
         axes.set_title(TITLES[level])
         draw_published(axes, level)
-        draw_curve(axes, findings.curve(vima=True), level, VIMA, "VIMA’s architecture of like size")
+        draw_curve(axes, findings.curve(vima=True), level, VIMA, "VIMA architecture of similar size")
         draw_curve(axes, findings.curve(vima=False), level, OURS, "preset small")
         if level in own:
             draw_point(axes, findings.demonstrations, own[level], OURS)
@@ -137,7 +137,7 @@ def scaling(findings: Findings) -> Figure:
 
 
 def ablations(findings: Findings) -> Figure:
-    """Bars of the baseline and its variants at each level that they played, with paired differences."""
+    """Success of the baseline and its variants at each level, with paired differences."""
     assert findings.baseline  # there is none without differences
     shown = [findings.baseline, *findings.variants]
     names = list(findings.baseline.means())
@@ -151,14 +151,14 @@ def ablations(findings: Findings) -> Figure:
             colour = VIMA if training.is_vima else OURS
             draw_bar(axes, place, mean, colour, faint=place > 0, label=False)
             draw_label(axes, 100 * mean.interval[1], place, difference_text(findings, training, level))
-        per_cent_axis(axes, room=72)
+        percent_axis(axes, room=72)
         axes.set_yticks(range(len(shown)), [folded(training.what) for training in shown], fontsize=8.5)
         axes.set_ylim(len(shown) - 0.5, -0.6)
         axes.grid(visible=False, axis="y")
     full = findings.baseline
     figure.supxlabel(
         f"All with {full.demonstrations:,} demonstrations and {full.steps:,} steps. Lines: 95 % intervals. "
-        "Numbers: difference to the first in points, on the same episodes; grey ones may be chance.",
+        "Numbers: difference to the first in points, on the same episodes; grey: not significant.",
         fontsize=8.5,
         color=FAINT,
         x=0.01,
@@ -167,7 +167,7 @@ def ablations(findings: Findings) -> Figure:
     return figure
 
 
-# Parts of them.
+# Elements of the figures.
 
 
 def draw_bar(
@@ -207,32 +207,32 @@ def draw_point(axes: Any, count: int, mean: LevelMean, colour: str) -> None:
 
 
 def draw_published(axes: Any, level: str) -> None:
-    """Draw the published curves over shares of the data, and VIMA-200M with all of it."""
+    """Draw the published curves over fractions of the data, and VIMA-200M with all of it."""
     for model, mark in (("VIMA", "o"), ("MIDAS", "s")):
-        shares = sorted(_shares(model, "92M"), key=lambda entry: entry.data_share)
-        counts = [PUBLISHED_DEMONSTRATIONS * entry.data_share for entry in shares]
-        rates = [entry.levels[level] for entry in shares]
+        fractions = sorted(_fractions(model, "92M"), key=lambda entry: entry.data_share)
+        counts = [PUBLISHED_DEMONSTRATIONS * entry.data_share for entry in fractions]
+        rates = [entry.levels[level] for entry in fractions]
         style = {"color": FAINT, "linewidth": 1.2, "markersize": 4, "markerfacecolor": PAPER}
         axes.plot(counts, rates, "--" + mark, label=f"{model} 92M, published", **style)
-    for entry in _shares("VIMA", "200M"):
+    for entry in _fractions("VIMA", "200M"):
         label = "VIMA 200M, published"
         axes.plot(
             [PUBLISHED_DEMONSTRATIONS], [entry.levels[level]], "D", color=INK, markersize=5, label=label
         )
 
 
-def _shares(model: str, size: str) -> list[PublishedModel]:
+def _fractions(model: str, size: str) -> list[PublishedModel]:
     return [entry for entry in published_models() if (entry.model, entry.size) == (model, size)]
 
 
-def per_cent_axis(axes: Any, room: float = 14) -> None:
+def percent_axis(axes: Any, room: float = 14) -> None:
     """Scale from 0 to 100 %, with room for numbers beyond."""
     axes.set_xlim(0, 100 + room)
     axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)], fontsize=8)
 
 
 def difference_text(findings: Findings, training: Training, level: str) -> tuple[str, str]:
-    """What stands beside a bar, and its colour."""
+    """Label of a bar, and its colour."""
     if training is findings.baseline:
         return f"{100 * training.means()[level].mean:.1f}", INK
     found = {part.level: part for part in findings.differences[training.name].levels}.get(level)
@@ -244,5 +244,5 @@ def difference_text(findings: Findings, training: Training, level: str) -> tuple
 
 
 def folded(text: str, width: int = 38) -> str:
-    """Break a line that is long."""
+    """Wrap a long label."""
     return "\n".join(textwrap.wrap(text, width))

@@ -76,7 +76,7 @@ class Findings:
         return [training for training in self.trainings if training.name in self.differences]
 
     def curve(self, *, vima: bool) -> list[Training]:
-        """Trainings of one architecture, by demonstrations ascending: the whole preset, or VIMA's."""
+        """Trainings of one architecture, by demonstrations ascending: the full model, or VIMA's."""
         chosen = [
             training
             for training in self.trainings

@@ -57,7 +57,7 @@ _FIGURES = {
     "animation": "openvima-small at work on six tasks, each with its prompt",
     "levels": "Success of openvima-small at the four levels beside published models",
     "scaling": "Success against the number of demonstrations",
-    "ablations": "Success of the whole preset and of variants without one part",
+    "ablations": "Success of the full model and of variants without one component",
 }
 _PAGE = """# openvima-small: scores, ablations, scaling
 
@@ -182,7 +182,7 @@ def _beside() -> list[PublishedModel]:
 
 
 def _level_table(findings: Findings, models: Sequence[PublishedModel]) -> Table:
-    means, size = findings.means(), policy_size(preset("small")).whole.total
+    means, size = findings.means(), policy_size(preset("small")).parameters.total
     own = (f"{size / 1e6:.1f}M", f"{findings.demonstrations:,}", *(_estimate(means.get(x)) for x in LEVELS))
     lines = [Line(findings.policy, own)]
     for model in models:

@@ -41,7 +41,7 @@ def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
     size, recipe = policy_size(preset("small")), RECIPES["small"]
     assert f"{size.parameters.total / 1e6:.1f} million parameters" in TEXT
     assert f"text encoder of {size.parts['prompt'].total / 1e6:.1f} M parameters" in TEXT
-    assert f"{len(GridCandidates(1).points_mm)} free points" in TEXT
+    assert f"{len(GridCandidates(1).points_mm)} grid candidates" in TEXT
     assert f"{100 * recipe['augmentation.inverse_dynamics_prob']:g} % of them read as" in TEXT
     page, looks = " ".join(TEXT.split()), recipe["pretraining.appearance_randomization_prob"]
     assert (
