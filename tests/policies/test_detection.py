@@ -176,7 +176,7 @@ def test_detections_of_low_score_are_left_out() -> None:
     assert columns == [[15, 94], [15, 55, 94], []]
 
 
-def test_an_image_of_one_object_shows_the_likeliest_one_however_unsure() -> None:
+def test_an_image_of_one_object_keeps_the_highest_score_even_below_the_threshold() -> None:
     rows = boxes((10, 10, 20, 20), (150, 10, 160, 20))
     front, top = (Detections(rows, scores=np.array(scores)) for scores in ([0.1, 0.2], [0.9, 0.8]))
     extractor = DetectedObjects(Fixed(front, top))

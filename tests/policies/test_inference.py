@@ -287,7 +287,7 @@ def test_draws_follow_from_the_generator_alone_and_leave_it_alone(policy, prompt
     assert any(not np.array_equal(others[key][0], together[key][0]) for key in together)
 
 
-def test_a_low_temperature_gives_the_likeliest_actions(policy, prompts, pool) -> None:
+def test_a_low_temperature_gives_the_greedy_actions(policy, prompts, pool) -> None:
     cold = NetworkPolicy(policy.network, temperature=1e-9, generator=torch.Generator().manual_seed(1))
     assert_same_actions(played(cold, prompts, pool), played(policy, prompts, pool))
 
