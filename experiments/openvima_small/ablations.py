@@ -1,11 +1,11 @@
-r"""What the parts of the preset `small` are worth, and what more demonstrations are.
+r"""Ablations of the preset `small`, and its scaling with demonstrations.
 
     python experiments/openvima_small/ablations.py --data train400 --crops crops --out ablations \
         --only full,no-correspondence
 
-Every variant is trained with the same number of steps, then plays the same evaluation episodes. Most begin
-with the crop encoder of the run `--crops`, which stays as it is; so differences are those of cloning. Two
-match looks for a short time of their own, with and without random ones. Repeating a command continues it.
+All variants are trained for the same number of steps and evaluated on the same episodes. Most start from
+the frozen crop encoder of the run `--crops`, so that only behaviour cloning differs. Two have a short
+pretraining of their own, with and without appearance randomization. Repeating a command resumes it.
 """
 
 import argparse
@@ -137,14 +137,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
     parser.add_argument("--crops", type=Path, required=True, help="run of `small` after pretraining")
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--only", default=",".join(VARIANTS), help="variants, with commas in between")
+    parser.add_argument("--out", type=Path, required=True, help="folder of runs and results")
+    parser.add_argument("--only", default=",".join(VARIANTS), help="variants, separated by commas")
     parser.add_argument("--name", default="", help="name in the table, instead of the variant's")
     parser.add_argument("--what", default="", help="short description, instead of the variant's")
-    parser.add_argument("--seed", type=int, default=0, help="of first weights, order and augmentation")
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--episodes", type=int, default=40, help="for each task and level")
-    parser.add_argument("--levels", default="L1,L3,L4")
+    parser.add_argument("--seed", type=int, default=0, help="seed of weights, order and augmentation")
+    parser.add_argument("--steps", type=int, default=400, help="steps of behaviour cloning")
+    parser.add_argument("--episodes", type=int, default=40, help="episodes per task and level")
+    parser.add_argument("--levels", default="L1,L3,L4", help="levels of the evaluation")
     given = parser.parse_args()
     for name in given.only.split(","):
         if name not in VARIANTS:
@@ -192,11 +192,11 @@ def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: pl
 
 
 def _begin(sizes: PolicyConfig, crops: Path, folder: Path, seed: int) -> Path:
-    """Write fresh weights with the crop encoder of another run, to begin with."""
+    """Write initial weights: fresh ones, with the crop encoder of another run."""
     network = build_network(sizes, seed=seed)
     own, other = network.state_dict(), load_file(find_checkpoint(str(crops)) / WEIGHTS_FILE)
-    matched = {name: other[name] for name in own if name.startswith(_CROPS)}
-    network.load_state_dict({**own, **matched})
+    pretrained = {name: other[name] for name in own if name.startswith(_CROPS)}
+    network.load_state_dict({**own, **pretrained})
     save_checkpoint(network, folder)
     return folder
 

@@ -1,4 +1,4 @@
-"""Make docs/images/openvima_small.webp: a policy at work on several tasks, side by side, prompts above.
+"""Make docs/images/openvima_small.webp: rollouts of several tasks, side by side, with their prompts.
 
     python experiments/openvima_small/animation.py [--policy NAME] [--show TASK:LEVEL,...] [--out FILE]
 
@@ -41,8 +41,8 @@ SHOWN = (  # every level; object and scene images, words, rotations, sequences; 
     "scene_understanding:L3",
 )
 STRIDE = 2  # of 30 frames a second; every second one is smooth enough
-START_S, END_S = 1.2, 1.0  # s; time to read the prompt, and to see how it ended
-ENLARGE = 3  # of the picture before it is scaled down to its panel, which smooths its edges
+START_S, END_S = 1.2, 1.0  # s; pauses before and after an episode
+ENLARGE = 3  # supersampling of panels, for smooth edges
 GAP, TITLE_PX, ROUND_PX = 10, 30, 8
 PAPER, INK, MUTED, EDGE, GOOD, BAD = "#ffffff", "#1f2933", "#5b6472", "#d0d5dc", "#18794e", "#b42318"
 MAX_TRIES = 50
@@ -262,16 +262,16 @@ def encoded(frames: Sequence[Image.Image], kind: str, quality: int) -> bytes:
 
 
 def main() -> None:
-    """Play, draw and write."""
+    """Run the episodes, and write the animation."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--policy", default="openvima-small", help="as `openvima demo` takes it")
+    parser.add_argument("--policy", default="openvima-small", help="policy, as in `openvima demo`")
     parser.add_argument("--show", default=",".join(SHOWN), help="episodes, TASK:LEVEL or TASK:LEVEL:SEED")
-    parser.add_argument("--seed", type=int, default=0, help="first one to try where none is named")
-    parser.add_argument("--columns", type=int, default=2, help="panels in a row")
+    parser.add_argument("--seed", type=int, default=0, help="first seed to try")
+    parser.add_argument("--columns", type=int, default=2, help="panels per row")
     parser.add_argument("--rows", type=int, default=2, help="rows of panels")
-    parser.add_argument("--width", type=int, default=810, help="of the animation in pixels")
-    parser.add_argument("--quality", type=int, default=50, help="of a .webp, 0 to 100")
+    parser.add_argument("--width", type=int, default=810, help="width of the animation in pixels")
+    parser.add_argument("--quality", type=int, default=50, help="quality of a .webp, 0 to 100")
     parser.add_argument("--out", type=Path, default=OUT, help=".webp, .png (APNG) or .gif")
     options = parser.parse_args()
     kind = {".webp": "WEBP", ".png": "PNG", ".gif": "GIF"}.get(options.out.suffix.lower())

@@ -2,14 +2,14 @@
 
     PYTHONPATH=benchmarks python experiments/openvima_small/results.py EVALUATION --trainings FILES
 
-EVALUATION is made by `openvima evaluate --policy openvima-small --ablations all --out EVALUATION`. Each file
-of `--trainings` holds what `ablations.py` writes, or a list of such records: name, what,
-demonstrations, steps, minutes, and evaluation, the path of a results.json. Those of as many demonstrations
-and steps as the one named `--baseline` are compared with it, and those of other numbers of demonstrations
-make the scaling curve with it. Names that begin with "vima" are VIMA's architecture.
+EVALUATION is written by `openvima evaluate --policy openvima-small --ablations all --out EVALUATION`. Each
+file of `--trainings` contains a record of `ablations.py`, or a list of them: name, what, demonstrations,
+steps, minutes, and evaluation, the path of a results.json. Trainings with the demonstrations and steps of
+`--baseline` are compared with it; those with other numbers of demonstrations form the scaling curve. Names
+that begin with "vima" are VIMA's architecture.
 
-Written are OUT.json, the figures, and the tables: between `<!-- small:NAME -->` and `<!-- /small:NAME -->`
-in each file of `--fill`, where everything else stays. OUT.md is made if there is none.
+The script writes OUT.json, the figures, and the tables between `<!-- small:NAME -->` and
+`<!-- /small:NAME -->` in each file of `--fill`. OUT.md is created if missing.
 """
 
 import argparse
@@ -49,7 +49,7 @@ BESIDE = (
     ("MIDAS", "92M"),
     ("VIMA", "200M"),
     ("VIMA", "9M"),
-)  # in the short table: best, best known, like size
+)  # in the short table: best, best known, of similar size
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"
 _ANIMATION = "openvima_small.webp"  # that `experiments/openvima_small/animation.py` makes
@@ -300,11 +300,13 @@ def main() -> None:
     parser.add_argument("evaluation", type=Path, help="folder or results.json of the bundled checkpoint")
     parser.add_argument("--trainings", type=Path, nargs="*", default=[], help="records of smaller trainings")
     parser.add_argument("--policy", default=POLICY, help="its name in the evaluation")
-    parser.add_argument("--baseline", default="full", help="the training that others are compared with")
-    parser.add_argument("--demonstrations", type=int, default=DEMONSTRATIONS, help="it learnt from")
-    parser.add_argument("--out", type=Path, default=OUT, help="record, without suffix")
+    parser.add_argument("--baseline", default="full", help="training that others are compared with")
+    parser.add_argument(
+        "--demonstrations", type=int, default=DEMONSTRATIONS, help="number of training demonstrations"
+    )
+    parser.add_argument("--out", type=Path, default=OUT, help="path of the record, without suffix")
     parser.add_argument("--images", type=Path, default=IMAGES, help="folder of the figures")
-    parser.add_argument("--fill", type=Path, nargs="*", default=list(FILL), help="pages with marks")
+    parser.add_argument("--fill", type=Path, nargs="*", default=list(FILL), help="pages with marked tables")
     given = parser.parse_args()
     try:
         trainings = read_trainings(given.trainings)
