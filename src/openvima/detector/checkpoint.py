@@ -124,9 +124,9 @@ def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, sour
         if name in tensors and tensors[name].shape != own.shape
     ]
     problems = [
-        *listed("missing", [name for name in expected if name not in tensors], most=_MAX_LISTED),
-        *listed("unexpected", [name for name in tensors if name not in expected], most=_MAX_LISTED),
-        *listed("wrong", wrong, most=_MAX_LISTED),
+        *listed("missing", [name for name in expected if name not in tensors], limit=_MAX_LISTED),
+        *listed("unexpected", [name for name in tensors if name not in expected], limit=_MAX_LISTED),
+        *listed("wrong", wrong, limit=_MAX_LISTED),
     ]
     if problems:
         raise CheckpointError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
