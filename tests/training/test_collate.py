@@ -1,4 +1,4 @@
-"""Batches for training are what a policy would see that acts in the same episodes."""
+"""Batches of training equal the inputs of a policy in the same episodes."""
 
 from dataclasses import fields, replace
 
@@ -53,7 +53,7 @@ def acting(demos, processor: Processor):
 
 
 @pytest.mark.parametrize("layout", SETTINGS)
-def test_training_and_acting_see_the_same(layout, demonstrations_of_several_steps):
+def test_training_and_inference_have_equal_inputs(layout, demonstrations_of_several_steps):
     processor, demos = Processor(**SETTINGS[layout]), demonstrations_of_several_steps
     examples, images = stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
     batch = collate_examples(processor, examples)
@@ -82,7 +82,7 @@ def test_slots_of_views_never_fall_from_step_to_step(demonstrations_of_several_s
             assert num_slots == [whole.num_slots_BT[0, t]]
 
 
-def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
+def test_targets_are_the_actions_of_the_oracle(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
     batch = collate_examples(OBJECTS, examples_of(demos, OBJECTS)[0])
     for b, demo in enumerate(demos):
@@ -94,7 +94,7 @@ def test_targets_are_what_the_oracle_did(demonstrations_of_several_steps):
         assert (batch.targets.pick_BT[b, demo.num_steps :] == -1).all()
 
 
-def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_steps):
+def test_false_positives_are_crops_of_the_frame(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
     examples, images = stack_images([preprocess(demo, "objects") for demo in demos], OBJECTS)
     spurious = collate_examples(OBJECTS, examples).false_positives
@@ -108,7 +108,7 @@ def test_false_detections_show_pixels_of_the_frame(demonstrations_of_several_ste
                 assert np.array_equal(box, spurious.boxes[b, t, v])
 
 
-def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps):
+def test_examples_of_a_batch_are_independent(demonstrations_of_several_steps):
     examples, _ = examples_of(demonstrations_of_several_steps, OBJECTS)
     together, alone = (collate_examples(OBJECTS, part) for part in (examples, examples[2:3]))
     steps, slots = alone.history.crop_index_BTVN.shape[1], alone.history.crop_index_BTVN.shape[3]
@@ -118,7 +118,7 @@ def test_a_batch_does_not_depend_on_its_company(demonstrations_of_several_steps)
     assert torch.equal(together.prompts.word_ids_BL[2, :length], alone.prompts.word_ids_BL[0])
 
 
-def test_an_episode_in_which_nothing_is_seen_is_named(demonstrations_of_several_steps):
+def test_an_episode_without_visible_objects_is_named(demonstrations_of_several_steps):
     tokens = preprocess(demonstrations_of_several_steps[-1], "objects")
     none = np.zeros_like(tokens.objects_per_step)
     blind = replace(tokens, objects=tokens.objects.select(slice(0)), objects_per_step=none)

@@ -1,4 +1,4 @@
-"""Settings: those out of range are named, all at once, with what would be allowed."""
+"""Settings: invalid ones are named all at once, with the allowed values."""
 
 import math
 from pathlib import Path
@@ -92,7 +92,7 @@ def test_all_problems_are_in_one_message() -> None:
     assert "\n" not in message
 
 
-def test_defaults_and_extreme_but_possible_values_are_taken() -> None:
+def test_defaults_and_extreme_values_are_valid() -> None:
     assert TrainingConfig.of(FOLDERS).runtime.threads == 1
     least = {"schedule.steps": 1, "loader.batch_size": 1, "pretraining.steps": 0, "runtime.threads": 1}
     TrainingConfig.of({**FOLDERS, **least, "loader.validation_fraction": 0.0})
@@ -105,7 +105,7 @@ def test_settings_cannot_be_changed_afterwards() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("runtime.precision", "float16"), ("runtime.sharding", "fdsp")])
-def test_a_word_that_is_no_choice_is_named(name: str, value: str) -> None:
+def test_an_invalid_choice_is_named(name: str, value: str) -> None:
     with pytest.raises(ConfigError, match=rf"there is no {name} '{value}'"):
         TrainingConfig.of({**FOLDERS, name: value})
 
@@ -117,7 +117,7 @@ def test_an_unknown_setting_is_named_with_the_nearest_one() -> None:
         TrainingConfig.of({**FOLDERS, "schedule.stepps": 3})
 
 
-def test_what_does_not_decide_the_weights_is_no_part_of_the_identity() -> None:
+def test_execution_settings_are_not_part_of_the_identity() -> None:
     first = TrainingConfig.of(
         {**FOLDERS, "runtime.threads": 2, "schedule.keep_every": 3, "loader.num_workers": 1}
     )

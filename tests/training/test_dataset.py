@@ -1,4 +1,4 @@
-"""Examples, their order, and what augmentation does to them."""
+"""Examples, their order, and their augmentation."""
 
 from dataclasses import replace
 from functools import partial
@@ -84,7 +84,7 @@ def test_an_example_of_a_source_knows_its_images_among_all(data):
     assert training.num_steps(np.arange(len(training))) == sum(e.episode.num_steps for e in training)
 
 
-def test_a_word_that_nobody_knows_is_found_before_training(data):
+def test_an_unknown_word_is_found_before_training(data):
     class Cache:
         def texts(self):
             return {"rotate the xylophone"}
@@ -94,13 +94,13 @@ def test_a_word_that_nobody_knows_is_found_before_training(data):
         check_words(Cache(), OBJECTS)
 
 
-def test_groups_hold_all_examples_of_like_length(examples):
+def test_groups_contain_examples_of_similar_length(examples):
     groups = by_length(examples)
     assert sum(len(group) for group in groups) == 24
     assert {e.episode.num_steps for e in groups[0]} == {1}
 
 
-def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
+def test_the_parts_of_a_batch_contain_all_of_it(examples):
     drawn = {}
 
     def collate(part, rngs):
@@ -119,7 +119,7 @@ def test_a_batch_is_worked_off_in_parts_that_hold_all_of_it(examples):
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
-def test_augmentation_of_an_example_does_not_depend_on_its_company(layout, demonstrations_of_several_steps):
+def test_augmentation_of_an_example_does_not_depend_on_its_batch(layout, demonstrations_of_several_steps):
     processor = Processor(layout)
     examples, _ = examples_of(demonstrations_of_several_steps, processor)
     collate, rngs = partial(collate_examples, processor), rngs_of(examples)
@@ -150,7 +150,7 @@ def test_targets_follow_their_objects_through_shuffling(examples):
     assert 0.3 * possible < added < 0.7 * possible
 
 
-def test_a_false_detection_shows_in_one_view_only(examples):
+def test_a_false_positive_is_in_one_view_only(examples):
     batch = collate_examples(OBJECTS, examples[:4])
     nothing = replace(batch.history, masks_BTVN=torch.zeros_like(batch.history.masks_BTVN))
     changed = augmented(
@@ -177,7 +177,7 @@ def shown(history, b: int, t: int, v: int) -> list[tuple[int, ...]]:
     return [(int(number), *box.tolist()) for number, box in zip(numbers, boxes, strict=True)]
 
 
-def test_false_detections_come_anywhere_among_the_objects_of_a_view_which_keep_their_order(views):
+def test_false_positives_come_anywhere_among_the_ordered_objects_of_a_view(views):
     batch = collate_examples(VIEWS, views[0])
     changed = augmented(batch, "views", probability=0.5, rngs=rngs_of(views[0], 1))
     before, after = batch.history, changed.history
@@ -216,7 +216,7 @@ def test_slots_of_views_are_those_of_an_episode_with_such_detections(views):
     assert not views[1][0].any()
 
 
-def test_without_false_detections_views_stay_as_they_are(views):
+def test_without_false_positives_views_are_unchanged(views):
     batch = collate_examples(VIEWS, views[0])
     after = augmented(batch, "views", probability=0.0, rngs=rngs_of(views[0])).history
     count = batch.history.masks_BTVN.shape[3]
@@ -226,7 +226,7 @@ def test_without_false_detections_views_stay_as_they_are(views):
     assert not after.masks_BTVN[..., count:].any()
 
 
-def test_whole_frames_know_no_false_detections_and_stay_bytes(demonstrations_of_several_steps):
+def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_several_steps):
     processor = Processor("frames", (64, 128), tokens_per_frame_pair=1)
     examples, images = examples_of(demonstrations_of_several_steps, processor)
     assert images.dtype == torch.uint8

@@ -1,4 +1,4 @@
-"""Training on boxes of a detector: what acting shows, in the share asked for, and exactly resumed."""
+"""Training on detected boxes: inputs as in inference, the requested fraction, exact resuming."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from training_examples import train_until  # noqa: E402
 
 
 class Guesses:
-    """A detector that knows nothing: boxes anywhere, by the pixels of the image alone."""
+    """A noisy detector: random boxes that follow from the pixels of the image."""
 
     def detect(self, rgb: np.ndarray, view: str) -> Detections:
         """Draw a few boxes."""
@@ -83,7 +83,7 @@ def assert_as_when_acting(batch, demos, naive: NaiveProcessor, prompts) -> None:
 
 @pytest.mark.parametrize("name", EXTRACTORS)
 @pytest.mark.parametrize("layout", ["objects", "views"])
-def test_training_shows_what_a_policy_with_that_detector_sees(
+def test_training_and_inference_have_equal_inputs(
     layout, name, demonstrations_of_several_steps, data
 ) -> None:
     extractor, demos = (
@@ -105,8 +105,8 @@ def test_training_shows_what_a_policy_with_that_detector_sees(
     assert_as_when_acting(motions, demos, naive, shown)
 
 
-def test_the_clumsy_extractor_finds_nothing_now_and_then(demonstrations_of_several_steps) -> None:
-    """So that the comparison above holds that case."""
+def test_the_noisy_extractor_sometimes_finds_nothing(demonstrations_of_several_steps) -> None:
+    """So that the comparison above covers this case."""
     seen = [
         len(Clumsy().in_observation(demo.observation(t)))
         for demo in demonstrations_of_several_steps
@@ -117,7 +117,7 @@ def test_the_clumsy_extractor_finds_nothing_now_and_then(demonstrations_of_sever
 
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
-def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrations_of_several_steps) -> None:
+def test_a_prompt_without_detections_keeps_its_words(layout, demonstrations_of_several_steps) -> None:
     blind = PluggedExtractor(Clumsy())
     demo = demonstrations_of_several_steps[0]
     prompt = replace(
@@ -137,14 +137,14 @@ def test_a_prompt_in_which_nothing_is_found_leaves_its_words(layout, demonstrati
 
 @pytest.fixture(scope="module")
 def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
-    """Demonstrations with true boxes, and with those of the clumsy extractor."""
+    """Demonstrations with true boxes, and with those of the noisy extractor."""
     dataset = Dataset(data)
     true, _ = split_examples(open_object_cache(dataset), validation_fraction=0.2, validation_episodes=9)
     return true, with_boxes_of(detected_object_cache(dataset, plugged_boxes(HOOK)), true)
 
 
 def detected_rows(sources, share: float, number: int, rows: slice = slice(None)) -> tuple[list, list]:
-    """Which demonstrations of a batch are shown with detected boxes, and the next draw of each generator."""
+    """Which demonstrations of a batch have detected boxes, and the next draw of each generator."""
     true, detected = sources
     first_detected = int(true.cache.image_counts().sum())
     found, draws = [], []
@@ -160,7 +160,7 @@ def detected_rows(sources, share: float, number: int, rows: slice = slice(None))
     return sorted(found), sorted(draws)
 
 
-def test_each_demonstration_is_drawn_for_itself(sources) -> None:
+def test_boxes_are_drawn_per_demonstration(sources) -> None:
     true, _ = sources
     rows = true.rows.tolist()
     assert detected_rows(sources, 0.0, 1)[0] == []
@@ -211,7 +211,7 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
     ],
 )
 @pytest.mark.slow
-def test_a_mixed_run_that_was_killed_ends_as_if_nothing_had_happened(settings, tmp_path, change) -> None:
+def test_a_killed_mixed_run_resumes_exactly(settings, tmp_path, change) -> None:
     settings |= {"loader.boxes": HOOK, **change}
     whole = train(TrainingConfig.of({**settings, "out": tmp_path / "whole"}))
     torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
@@ -244,7 +244,7 @@ def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(sett
 
 @pytest.mark.slow
 def test_the_best_checkpoint_is_chosen_by_true_boxes(settings, tmp_path) -> None:
-    """The same weights get the same score whether or not some learnt from detected boxes."""
+    """The same weights get the same score whether or not training used detected boxes."""
     still = {
         **settings,
         "pretraining.steps": 0,
@@ -288,7 +288,7 @@ def test_another_detector_is_another_run(settings, tmp_path) -> None:
         ({"loader.boxes": "builtins:nobody"}, "has no function 'nobody'"),
     ],
 )
-def test_boxes_that_cannot_be_leave_no_run_folder(settings, change, message) -> None:
+def test_invalid_boxes_leave_no_run_folder(settings, change, message) -> None:
     fits = {"pretraining.steps": 0} if "preset" in change else {}
     with pytest.raises(ConfigError, match=message):
         train(TrainingConfig.of({**settings, **fits, **change}))

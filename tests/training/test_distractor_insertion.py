@@ -1,4 +1,4 @@
-"""Demonstrations with objects of others in view."""
+"""Distractor insertion."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def _overlap(one, other) -> bool:
     return False
 
 
-def test_distractors_lie_beside_what_was_there_at_all_steps_and_nothing_else_changes(stacked):
+def test_distractors_overlap_nothing_at_any_step_and_nothing_else_changes(stacked):
     examples, stack = stacked
     added = 0
     for example in examples[:4]:
@@ -97,7 +97,7 @@ def test_few_tasks_receive_distractors(episodes):
     assert [allows_distractors(episode.task) for episode in episodes] == [True] * 4 + [False] * 2
 
 
-def test_distractors_are_drawn_in_training_alone_with_the_share_asked_for(episodes):
+def test_distractors_are_inserted_in_training_only_with_their_probability(episodes):
     examples = [Example(episode, row=row) for row, episode in enumerate(episodes)]
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True)
 
@@ -117,7 +117,7 @@ def test_distractors_are_drawn_in_training_alone_with_the_share_asked_for(episod
 
 
 @pytest.mark.parametrize("with_images", [True, False])
-def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, stacked):
+def test_a_batch_contains_the_same_images_with_either_indexing(with_images, stacked):
     examples, stack = stacked
     borrowing = [replace(e, other=o) for e, o in zip(examples[:4], examples[2:], strict=True)]
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=with_images)
@@ -138,6 +138,6 @@ def test_a_batch_shows_the_same_pictures_however_they_are_numbered(with_images, 
         ({"augmentation.distractor_prob": 1.5}, "augmentation.distractor_prob"),
     ],
 )
-def test_wrong_shares_say_so(settings, message, tmp_path):
+def test_invalid_probabilities_are_named(settings, message, tmp_path):
     with pytest.raises(ConfigError, match=message):
         train(TrainingConfig.of({"data": tmp_path, "out": tmp_path / "run", **settings}))

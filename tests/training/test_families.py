@@ -42,7 +42,7 @@ def run_train(data: Path, out: Path, preset: str, *options: object) -> int:
     "architecture",
     ["vima", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gato", "flamingo", "gpt", "midas"))],
 )
-def test_an_interrupted_run_gives_a_policy_that_acts(architecture, data, tmp_path, monkeypatch) -> None:
+def test_an_interrupted_run_resumes_to_a_working_policy(architecture, data, tmp_path, monkeypatch) -> None:
     preset, whole, torn = f"{architecture}-nano", tmp_path / "whole", tmp_path / "torn"
     assert run_train(data, whole, preset) == 0
     backward = BehaviourCloning.backward
@@ -70,7 +70,7 @@ def test_an_interrupted_run_gives_a_policy_that_acts(architecture, data, tmp_pat
 
 
 @pytest.mark.slow
-def test_without_an_appearance_embedding_there_is_no_matching_and_the_images_are_learnt(
+def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_encoder_is_trained(
     data, tmp_path
 ) -> None:
     assert run_train(data, tmp_path, "gpt-nano") == 0

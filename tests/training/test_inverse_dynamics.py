@@ -1,4 +1,4 @@
-"""Demonstrations read as motions: nothing is lost, nothing leaks, and runs go on from one another."""
+"""Inverse dynamics: complete prompts, no leaks, and fine-tuning from other runs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +35,7 @@ def whole_motion(demo: Demonstration) -> list[dict]:
 
 
 @pytest.mark.parametrize("kind", ["objects", "frames"])
-def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
+def test_the_prompt_has_every_frame_and_the_targets_every_action(
     kind, demonstrations_of_several_steps
 ) -> None:
     for demo in demonstrations_of_several_steps:
@@ -56,7 +56,7 @@ def test_a_motion_shows_every_frame_and_is_answered_by_every_action(
         np.testing.assert_array_equal(motion.actions, np.float32(actions))
 
 
-def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
+def test_only_rows_are_copied(demonstrations_of_several_steps) -> None:
     tokens = preprocess(demonstrations_of_several_steps[0], "objects")
     motion = with_motion_prompt(tokens)
     for name in ("images", "objects", "objects_per_step", "actions"):
@@ -64,9 +64,7 @@ def test_nothing_is_copied_but_rows(demonstrations_of_several_steps) -> None:
 
 
 @pytest.mark.parametrize("name", PROCESSORS)
-def test_training_shows_what_a_policy_that_is_prompted_with_a_motion_sees(
-    name, demonstrations_of_several_steps
-) -> None:
+def test_training_and_inference_have_equal_inputs(name, demonstrations_of_several_steps) -> None:
     processor, demos = PROCESSORS[name], demonstrations_of_several_steps
     episodes = [preprocess(demo, processor.input_kind) for demo in demos]
     collate = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(1.0))
@@ -91,7 +89,7 @@ def prompts_of(collate: PolicyCollate, episodes, rngs=None) -> list[tuple]:
 
 
 def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_steps) -> None:
-    """Whatever the demonstrator did and brought about, the prompts of tasks in a mixed batch do not show."""
+    """Prompts of tasks in a mixed batch do not depend on the actions."""
     processor = PROCESSORS["midas-nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps] * 4
     mixed = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(0.5))
@@ -117,7 +115,7 @@ def test_no_target_leaks_into_the_prompt_of_a_task(demonstrations_of_several_ste
     assert prompts_of(PolicyCollate(processor, 0.0, with_images=True), elsewhere) == tasks
 
 
-def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
+def test_the_draw_follows_from_the_example_alone(demonstrations_of_several_steps) -> None:
     processor = PROCESSORS["nano"]
     episodes = [preprocess(demo, "objects") for demo in demonstrations_of_several_steps]
     mixed = PolicyCollate(processor, 0.0, with_images=True, augmentation=DemonstrationAugmentation(0.5))
@@ -126,7 +124,7 @@ def test_whether_it_is_a_motion_follows_from_the_example_alone(demonstrations_of
     assert together == [length for length, *_ in prompts_of(mixed, episodes, rngs_of(episodes))]
 
 
-def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_are_motions(
+def test_the_best_checkpoint_is_chosen_by_tasks_unless_all_is_inverse_dynamics(
     demonstrations_of_several_steps,
 ) -> None:
     processor = PROCESSORS["nano"]
@@ -146,7 +144,7 @@ def last_weights(run: Path) -> dict[str, "torch.Tensor"]:
 
 
 @pytest.mark.slow
-def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
+def test_init_from_loads_the_weights_of_another_run(data, tmp_path) -> None:
     words = [
         "--data",
         str(data),
@@ -172,8 +170,8 @@ def test_a_run_begins_with_the_weights_of_another(data, tmp_path) -> None:
 
 @pytest.mark.parametrize("finetune", [False, True])
 @pytest.mark.slow
-def test_what_has_matched_looks_need_not_do_so_again(finetune, settings, tmp_path) -> None:
-    """The crop encoder is taken over, and stays as it is unless it is to be tuned."""
+def test_a_pretrained_encoder_is_not_pretrained_again(finetune, settings, tmp_path) -> None:
+    """The crop encoder is loaded, and frozen unless it is fine-tuned."""
     first = train(TrainingConfig.of({**settings, "schedule.steps": 1}))
     again = {
         **settings,
@@ -213,7 +211,7 @@ def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
         ("visual_residual", True),
     ],
 )
-def test_a_learner_of_ones_own_has_no_such_switch(switch, value, data, tmp_path) -> None:
+def test_a_custom_learner_has_no_such_setting(switch, value, data, tmp_path) -> None:
     config = TrainingConfig.of(
         {"data": data, "out": tmp_path / "run", "preset": "some:learner", switch: value}
     )

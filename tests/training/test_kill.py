@@ -1,4 +1,4 @@
-"""Runs that end at any moment: by Ctrl-C, or by a signal that leaves no time to tidy up."""
+"""Runs that are interrupted: by Ctrl-C, or killed."""
 
 import json
 import signal
@@ -70,13 +70,13 @@ def interrupted(config: TrainingConfig, at: str) -> None:
 
 
 @pytest.mark.parametrize("stages", [("1-pretraining",), ("2-cloning",), ("1-pretraining", "2-cloning")])
-def test_a_run_stopped_by_the_keyboard_goes_on_as_if_it_had_not_been(config, whole, stages) -> None:
+def test_a_run_stopped_by_the_keyboard_resumes_exactly(config, whole, stages) -> None:
     for stage in stages:
         interrupted(config, stage)
     assert_same(train(config), whole)
 
 
-def test_a_killed_process_leaves_whole_files_and_the_same_settings_go_on(config, settings, whole) -> None:
+def test_a_killed_process_leaves_whole_files_and_resumes(config, settings, whole) -> None:
     plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
     plain["schedule.checkpoint_every"] = 1
     argument = json.dumps([config_to_dict(presets.PRESETS["tiny"]()), plain])

@@ -1,4 +1,4 @@
-"""Networks of one's own in the training loop, and what surrounds it: trials, TensorBoard, compiling."""
+"""Custom learners in the training loop; rollouts, TensorBoard, compilation."""
 
 import json
 import runpy
@@ -23,7 +23,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "custom_learner.py"
 
 @pytest.fixture
 def example(monkeypatch) -> str:
-    """The preset that the example is."""
+    """The preset of the example."""
     monkeypatch.syspath_prepend(str(EXAMPLE.parent))
     yield "custom_learner:make"
     sys.modules.pop("custom_learner", None)
@@ -76,7 +76,7 @@ def test_a_learner_that_cannot_be_made_is_named(name: str, message: str) -> None
         make_learner(name)
 
 
-def test_mistakes_in_a_learner_of_ones_own_are_shown_as_they_are(monkeypatch, example) -> None:
+def test_errors_of_a_custom_learner_propagate(monkeypatch, example) -> None:
     import custom_learner
 
     monkeypatch.setattr(custom_learner, "Matcher", None)
@@ -84,7 +84,7 @@ def test_mistakes_in_a_learner_of_ones_own_are_shown_as_they_are(monkeypatch, ex
         make_learner(example)
 
 
-def test_a_learner_that_does_not_tell_its_score_is_named_at_once(example, settings, monkeypatch) -> None:
+def test_a_learner_without_its_score_is_named_at_the_first_step(example, settings, monkeypatch) -> None:
     import custom_learner
 
     monkeypatch.setattr(custom_learner.Matcher, "score", "accuracy")
@@ -93,7 +93,7 @@ def test_a_learner_that_does_not_tell_its_score_is_named_at_once(example, settin
     assert not (settings["out"] / "metrics.jsonl").exists()
 
 
-def test_a_learner_of_ones_own_knows_no_matching(example, settings) -> None:
+def test_a_custom_learner_has_no_pretraining(example, settings) -> None:
     with pytest.raises(ConfigError, match=r"does not know pretraining\.steps"):
         train(TrainingConfig.of({**settings, "preset": example}))
 
@@ -108,7 +108,7 @@ def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
         learner.read(tmp_path)
 
 
-def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
+def test_rollouts_are_logged_with_their_step(settings) -> None:
     seen = []
 
     def rollout(checkpoint: Path) -> dict[str, float]:
@@ -123,8 +123,8 @@ def test_trials_in_the_simulator_are_noted_with_their_step(settings) -> None:
     assert (trial["step"], trial["rollout_rotate"]) == (4, trial["rollout_success"])
 
 
-def test_checkpoints_that_are_to_be_kept_are_kept(settings) -> None:
-    """Also between those from which a run could go on."""
+def test_permanent_checkpoints_are_kept(settings) -> None:
+    """Also between the regular ones."""
     run = train(TrainingConfig.of({**settings, "schedule.keep_every": 2, "schedule.checkpoint_every": 5}))
     kept = {folder.name for folder in (run / "checkpoints").glob("2-*")}
     assert kept >= {"2-cloning-000002", "2-cloning-000004", "2-cloning-000006"}
@@ -143,7 +143,7 @@ def test_a_run_of_epochs_takes_as_many_steps_as_they_have(settings) -> None:
 
 
 def _interrupts_at(step: int):
-    """Stop when metrics of a step were told, and before its checkpoint."""
+    """Stop after the metrics of a step are logged, and before its checkpoint."""
 
     def report(done: int, total: int, note: str) -> None:
         if done == step:
@@ -155,7 +155,7 @@ def _interrupts_at(step: int):
 @pytest.mark.skipif(find_spec("tensorboard") is None, reason="tensorboard is not installed")
 @pytest.mark.filterwarnings("ignore")  # of the reader, whose package is not ours
 @pytest.mark.slow
-def test_tensorboard_shows_the_metrics(settings) -> None:
+def test_tensorboard_has_the_metrics(settings) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     with pytest.raises(KeyboardInterrupt):  # what it told of step 4 comes again
@@ -176,7 +176,7 @@ def test_tensorboard_shows_the_metrics(settings) -> None:
     ).exists()
 
 
-def test_a_loss_that_is_no_number_stops_the_run_and_keeps_the_last_checkpoint(settings, monkeypatch) -> None:
+def test_a_nan_loss_stops_the_run_and_keeps_the_last_checkpoint(settings, monkeypatch) -> None:
     from openvima.training.behaviour_cloning import BehaviourCloning
 
     backward = BehaviourCloning.backward

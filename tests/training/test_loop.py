@@ -1,4 +1,4 @@
-"""Whole runs: resuming, settings that differ, what a run folder holds."""
+"""Whole runs: resuming, differing settings, content of the run folder."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ def final_weights(run: Path, name: str = "2-cloning-000006") -> dict:
 
 @pytest.mark.parametrize("killed_at", [1, 3, 4, 7])
 @pytest.mark.slow
-def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_path, killed_at):
+def test_a_killed_run_resumes_exactly(settings, tmp_path, killed_at):
     whole = TrainingConfig.of({**settings, "out": tmp_path / "whole"})
     torn = TrainingConfig.of({**settings, "out": tmp_path / "torn"})
     train(whole)
@@ -38,7 +38,7 @@ def test_a_killed_and_resumed_run_ends_as_if_nothing_had_happened(settings, tmp_
 
 
 @pytest.mark.slow
-def test_metrics_after_the_last_checkpoint_are_not_told_twice(settings):
+def test_metrics_after_the_last_checkpoint_are_not_logged_twice(settings):
     config = TrainingConfig.of(settings)
     train_until(config, 7)
     with (config.out / "metrics.jsonl").open("a") as lines:
@@ -79,7 +79,7 @@ def test_global_random_state_and_threads_are_left_alone(settings):
 
 
 @pytest.mark.slow
-def test_other_settings_on_a_run_are_named_and_force_begins_anew(settings):
+def test_differing_settings_are_named_and_force_starts_anew(settings):
     train(TrainingConfig.of(settings))
     changed = {**settings, "schedule.steps": 2, "optimizer.learning_rate": 5e-4}
     differing = r"training\.optimizer\.learning_rate is .*; training\.schedule\.steps is 6 there and 2 here"
@@ -115,7 +115,7 @@ def test_a_run_keeps_its_last_checkpoint_and_the_best(settings):
 
 
 @pytest.mark.slow
-def test_metrics_name_stage_and_step_and_hold_no_times(settings):
+def test_metrics_have_stage_and_step_and_no_times(settings):
     run = train(TrainingConfig.of(settings))
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [(line["name"], line["step"]) for line in lines if "loss" in line] == [
@@ -147,7 +147,7 @@ def test_a_damaged_checkpoint_is_named(settings):
 
 
 @pytest.mark.slow
-def test_what_an_interrupted_save_left_behind_is_removed(settings):
+def test_partial_checkpoints_are_removed(settings):
     config = TrainingConfig.of(settings)
     leftover = config.out / "checkpoints" / "2-cloning-000002.partial"
     train_until(config, 3)
@@ -174,12 +174,12 @@ def test_the_progress_report_ends_at_the_total(settings):
     ],
 )
 @pytest.mark.slow
-def test_bins_and_tuned_crops_train_too(settings, change):
+def test_bins_and_a_finetuned_crop_encoder_train_too(settings, change):
     run = train(TrainingConfig.of({**settings, **change}))
     load_policy(str(run))
 
 
-def test_an_empty_run_folder_has_nothing_to_go_on_from(tmp_path):
+def test_an_empty_run_folder_has_no_checkpoint(tmp_path):
     folder = RunFolder(tmp_path / "run", {"a": 1})
     assert folder.latest() is None
     with pytest.raises(CheckpointError, match="no checkpoint"):
@@ -206,7 +206,7 @@ def test_settings_out_of_range_are_named(settings, change, message):
         ({"preset": "gato-nano", "pretraining.steps": 5}, "'gato-nano' has no appearance embedding"),
     ],
 )
-def test_a_preset_that_cannot_be_trained_so_leaves_no_run_folder(settings, change, message):
+def test_settings_that_contradict_the_preset_leave_no_run_folder(settings, change, message):
     with pytest.raises(ConfigError, match=message):
         train(TrainingConfig.of({**settings, **change}))
     assert not settings["out"].exists()

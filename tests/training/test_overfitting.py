@@ -1,4 +1,4 @@
-"""A network that cannot learn 32 demonstrations by heart cannot learn."""
+"""Every architecture overfits 32 demonstrations."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,9 +56,7 @@ def demonstrations() -> dict[str, list[Demonstration]]:
 
 
 @pytest.mark.parametrize("architecture", ["vima", "gato", "flamingo", "gpt", "midas"])
-def test_each_family_learns_32_demonstrations_by_heart_and_acts_like_them(
-    architecture, demonstrations
-) -> None:
+def test_each_architecture_overfits_32_demonstrations_and_repeats_them(architecture, demonstrations) -> None:
     model = build_network(preset(f"{architecture}-nano"), seed=0).eval()  # that is, without dropout
     tasks = [read(model, group) for group in demonstrations.values()]
     learn_by_heart(model, tasks)
@@ -101,7 +99,7 @@ def learn_by_heart(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Ten
 def loss_and_accuracy(
     model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]], *, backward: bool
 ) -> tuple[float, float]:
-    """Mean loss, and share of actions of which all twelve bins are right."""
+    """Mean loss, and fraction of actions with all twelve bins right."""
     total = sum(int(batch.targets.steps_BT.sum()) for batch, _ in tasks)
     sums = [0.0, 0.0]
     for batch, images in tasks:
@@ -117,7 +115,7 @@ def loss_and_accuracy(
 
 
 def share_of_recorded_actions(policy: NetworkPolicy, runs: Sequence[Demonstration]) -> float:
-    """Show a policy what was recorded, in one batch; how often it does what was done."""
+    """Return how often a policy repeats the recorded actions, in one batch."""
     policy.reset([run.prompt for run in runs])
     same = []
     for t in range(max(run.num_steps for run in runs)):
@@ -136,7 +134,7 @@ def bins(action: dict) -> "torch.Tensor":
     return encode_bins(to_unit_range(vector))
 
 
-def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, tmp_path) -> None:
+def test_the_object_head_overfits_32_demonstrations(demonstrations, tmp_path) -> None:
     sizes = preset("nano")
     sizes = replace(
         sizes,
@@ -171,8 +169,8 @@ def test_the_pointing_network_learns_32_demonstrations_by_heart(demonstrations, 
 
 
 @pytest.mark.parametrize("task", ["rearrange_then_restore", "follow_order", "twist"])
-def test_the_copying_network_learns_places_by_heart_that_prompt_and_past_show(task, tmp_path) -> None:
-    """Places at which nothing lies: the pointing network could only learn offsets from what is in view."""
+def test_the_candidate_head_overfits_positions_of_prompt_and_history(task, tmp_path) -> None:
+    """Empty positions, which the object head could express only as offsets from visible objects."""
     env = TabletopEnv(task, level="train", domain="user")
     runs = [rollout_oracle(env, seed) for seed in range(6)]
     sizes = narrow_small(width=64)

@@ -1,4 +1,4 @@
-"""Several processes train as one would, and read ahead without changing anything."""
+"""Distributed training and loader workers give the results of one process."""
 
 import json
 import os
@@ -109,7 +109,7 @@ def assert_alike(ours: Path, theirs: Path) -> None:
 
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
-def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
+def test_two_processes_train_as_one(bins, tmp_path, sharding) -> None:
     bins |= {"loader.boxes": HOOK}
     one = train(TrainingConfig.of({**bins, "out": tmp_path / "one"}))
     parts = {"optimizer.grad_accum_steps": 8}  # more than demonstrations of a process
@@ -119,7 +119,7 @@ def test_two_processes_learn_what_one_does(bins, tmp_path, sharding) -> None:
 
 
 @pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
-def test_a_run_of_two_processes_goes_on_with_one(bins, tmp_path, sharding) -> None:
+def test_a_run_of_two_processes_resumes_with_one(bins, tmp_path, sharding) -> None:
     whole = train(TrainingConfig.of({**bins, "out": tmp_path / "whole"}))
     torn = {**bins, "out": tmp_path / "torn", "runtime.sharding": sharding}
     run_in_processes(2, {**torn, "kill_at": 4})
@@ -127,7 +127,7 @@ def test_a_run_of_two_processes_goes_on_with_one(bins, tmp_path, sharding) -> No
     assert_alike(whole, train(TrainingConfig.of(torn)))
 
 
-def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, tmp_path) -> None:
+def test_loader_workers_and_gradient_accumulation_change_only_the_last_bits(bins, tmp_path) -> None:
     plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
     ahead = train(TrainingConfig.of({**bins, "out": tmp_path / "ahead", "loader.num_workers": 2}))
     assert (plain / "metrics.jsonl").read_bytes() == (ahead / "metrics.jsonl").read_bytes()
@@ -136,7 +136,7 @@ def test_reading_ahead_and_smaller_parts_change_nothing_but_the_last_bits(bins, 
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # of the tracer itself
-def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
+def test_compiled_layers_train_equally(bins, tmp_path, monkeypatch) -> None:
     """Traced as for the compiler, but run as they are: generating code takes a minute."""
     bins |= {"schedule.steps": 2, "schedule.checkpoint_every": 2}
     plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
@@ -156,7 +156,7 @@ def test_compiled_layers_learn_the_same(bins, tmp_path, monkeypatch) -> None:
     assert not {"Linear", "Sequential"} & set(traced)
 
 
-def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:
+def test_half_precision_trains_nearly_equally(bins, tmp_path) -> None:
     plain = train(TrainingConfig.of({**bins, "out": tmp_path / "plain"}))
     half = train(TrainingConfig.of({**bins, "out": tmp_path / "half", "runtime.precision": "bfloat16"}))
     for a, b in zip(losses(plain), losses(half), strict=True):
@@ -165,7 +165,7 @@ def test_half_precision_learns_nearly_the_same(bins, tmp_path) -> None:
             assert a["loss"] == pytest.approx(b["loss"], rel=0.02)
 
 
-def test_a_device_that_is_not_there_is_named() -> None:
+def test_a_missing_device_is_named() -> None:
     with pytest.raises(ConfigError, match="device is 'gpu0'; it must be auto, cpu"), joined("gpu0", "ddp"):
         pass
     if not torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""Demonstrations told in other words, and motions without what is beside the point."""
+"""Prompt augmentation: renamed objects, shuffled sentences, dropped unused objects."""
 
 import re
 
@@ -49,7 +49,7 @@ def _images(episode) -> dict[str, list]:
 
 
 @pytest.mark.parametrize("task", NAMED)
-def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task, episodes):
+def test_renamed_objects_keep_image_and_placeholder(task, episodes):
     episode, with_others = episodes[task], 0
     for seed in range(12):
         named = renamed(episode, np.random.default_rng(seed))
@@ -79,11 +79,11 @@ def test_names_stand_for_objects_and_each_image_stays_with_its_placeholder(task,
 
 
 @pytest.mark.parametrize("task", KEPT)
-def test_prompts_with_invented_words_or_without_single_objects_stay(task, episodes):
+def test_prompts_with_novel_words_or_without_single_objects_are_unchanged(task, episodes):
     assert renamed(episodes[task], np.random.default_rng(0)) is episodes[task]
 
 
-def test_names_are_read_in_training_and_not_in_validation(episodes):
+def test_objects_are_renamed_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
     naming = DemonstrationAugmentation(of_tasks=(RenameObjects(1.0),))
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, augmentation=naming)
@@ -94,7 +94,7 @@ def test_names_are_read_in_training_and_not_in_validation(episodes):
 
 
 @pytest.mark.parametrize("task", ["novel_noun", "novel_adj", "visual_manipulation"])
-def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholder(task, episodes):
+def test_shuffled_sentences_keep_images_and_placeholders(task, episodes):
     seen, examples = set(), set()
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def test_explanations_come_in_any_order_and_each_image_stays_with_its_placeholde
 
 
 @pytest.mark.parametrize("task", ["twist", "rearrange", "same_shape"])
-def test_prompts_that_explain_nothing_stay_in_order(task, episodes):
+def test_prompts_without_definitions_stay_in_order(task, episodes):
     episode = episodes[task]
     assert shuffled(episode, np.random.default_rng(0)) is episode
 
@@ -130,7 +130,7 @@ def test_an_instruction_of_two_sentences_stays_in_one_piece(episodes):
 
 
 @pytest.mark.parametrize("task", ["visual_manipulation", "pick_in_order_then_restore"])
-def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
+def test_only_unused_objects_are_dropped_from_observations_or_prompt_frames(task, episodes):
     motion = with_motion_prompt(episodes[task])
     used = {*motion.pick_ids.tolist(), *motion.place_ids.tolist()}
     bystanders = set(motion.objects.ids.tolist()) - used
@@ -172,7 +172,7 @@ def test_only_bystanders_are_left_out_of_view_or_of_pictures(task, episodes):
         ),
     ],
 )
-def test_what_needs_objects_and_their_ids_says_so(settings, message, tmp_path):
+def test_settings_that_need_objects_and_their_ids_say_so(settings, message, tmp_path):
     config = TrainingConfig.of({"data": tmp_path, "out": tmp_path / "run", **settings})
     with pytest.raises(ConfigError, match=message):
         train(config)

@@ -1,4 +1,4 @@
-"""What a run says of where it came from."""
+"""Provenance of a run."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ from openvima.training.provenance import git_state, provenance
 
 
 @pytest.mark.slow
-def test_every_start_of_a_run_is_noted(settings, data):
+def test_every_session_of_a_run_is_logged(settings, data):
     config = TrainingConfig.of({**settings, "schedule.checkpoint_every": 3})
     train(config)
     train(config)

@@ -1,4 +1,4 @@
-"""Named settings, files of settings, and what the command line makes of them."""
+"""Recipes, files of settings, and their precedence on the command line."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ def trained(monkeypatch) -> list[TrainingConfig]:
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_every_recipe_is_a_run_that_could_be(name: str) -> None:
+def test_every_recipe_is_valid(name: str) -> None:
     config = TrainingConfig.of({"data": Path("demos"), "out": Path("run"), **recipe_settings(name)})
     assert config.loader.batch_size % config.optimizer.grad_accum_steps == 0
 
@@ -48,7 +48,7 @@ def test_the_paper_recipe_is_that_of_the_paper() -> None:
     assert config.augmentation.false_positive_prob == 0.05
 
 
-def test_nano_presets_and_own_learners_have_the_recipe_of_minutes() -> None:
+def test_nano_presets_and_custom_learners_have_the_nano_recipe() -> None:
     assert default_recipe("vima-nano") == default_recipe("mine:learner") == "nano"
     assert default_recipe("small:learner") == default_recipe("nano-bins") == "nano"
     assert default_recipe("vima-20m") == default_recipe(None) == "paper"
@@ -56,7 +56,7 @@ def test_nano_presets_and_own_learners_have_the_recipe_of_minutes() -> None:
         recipe_settings("papper")
 
 
-def test_what_is_given_counts_more_than_the_file_and_that_more_than_the_recipe(trained, tmp_path) -> None:
+def test_options_take_precedence_over_the_file_and_the_file_over_the_recipe(trained, tmp_path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("{optimizer: {learning_rate: 0.5}, loader: {batch_size: 7}, data: demos}")
     words = [
@@ -105,7 +105,7 @@ def test_the_small_policy_is_trained_by_one_command(trained) -> None:
     assert (augmentation.shuffle_sentences_prob, augmentation.distractor_prob) == (0.3, 0.6)
 
 
-def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for(trained, tmp_path) -> None:
+def test_init_from_disables_pretraining_unless_it_is_set(trained, tmp_path) -> None:
     of_a_run, of_its_own = tmp_path / "config.yaml", tmp_path / "mine.yaml"
     of_a_run.write_text("{training: {preset: small, pretraining: {steps: 3000}}}")
     of_its_own.write_text("{preset: small, init_from: other, pretraining: {steps: 7}}")
@@ -126,7 +126,7 @@ def test_weights_to_begin_with_are_not_pretrained_again_unless_that_is_asked_for
         assert resolved(trained[-1]).pretraining.steps == expected, words
 
 
-def test_the_settings_of_another_run_can_be_taken(trained, tmp_path) -> None:
+def test_the_settings_of_another_run_can_be_read(trained, tmp_path) -> None:
     file = tmp_path / "config.yaml"
     file.write_text(yaml.safe_dump({"training": {"schedule": {"steps": 5, "epochs": None}}, "network": {}}))
     assert main(["train", "--config", str(file), "--data", "demos", "--out", "run"]) == 0

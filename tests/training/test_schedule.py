@@ -1,4 +1,4 @@
-"""Learning rates and seeds: functions of the step alone."""
+"""Learning rates and seeds are functions of the step."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Demonstrations that are too long for a network are named before it learns from any."""
+"""Demonstrations that are too long for a network are named before training."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_widths_are_those_of_the_episodes(case) -> None:
 
 
 @pytest.mark.parametrize("is_motion", [False, True])
-def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
+def test_the_bounds_hold(case, is_motion) -> None:
     cache, _, processor = case
     prompt, whole = sequence_lengths._upper_bounds(cache, processor, is_motion)
     episodes = [with_motion_prompt(tokens) if is_motion else tokens for tokens in cache]
@@ -52,7 +52,7 @@ def test_what_is_not_read_is_not_too_long(case, is_motion) -> None:
     assert prompt.max() <= 2 * found.max()  # or else too many would be read
 
 
-def test_a_motion_that_is_too_long_is_named(case, monkeypatch) -> None:
+def test_an_inverse_dynamics_prompt_that_is_too_long_is_named(case, monkeypatch) -> None:
     cache, network, processor = case
     tasks, motions = ([num_places(f(t), processor) for t in cache] for f in (lambda t: t, with_motion_prompt))
     limit = max(motions) - 1
@@ -80,7 +80,7 @@ def test_a_history_that_is_too_long_is_named_before_the_first_step(settings, mon
 
 
 @pytest.mark.slow
-def test_looking_draws_no_random_numbers(case, monkeypatch) -> None:
+def test_the_check_draws_no_random_numbers(case, monkeypatch) -> None:
     cache, network, processor = case
     monkeypatch.setattr(sequence_lengths, "MAX_PROMPT_POSITIONS", 1)  # so that all are read
     before = torch.get_rng_state()

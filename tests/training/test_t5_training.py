@@ -1,4 +1,4 @@
-"""Runs of policies that read prompts with T5: its weights at the start, its tokenizer in every checkpoint."""
+"""Training with T5: initial weights, and the tokenizer in every checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +58,7 @@ def checkpoints(run: Path) -> list[Path]:
     return sorted(path for path in (run / "checkpoints").iterdir() if path.is_dir())
 
 
-def test_training_begins_with_the_weights_of_t5_and_leaves_the_frozen_ones(t5_settings, t5) -> None:
+def test_training_starts_from_t5_and_keeps_its_frozen_weights(t5_settings, t5) -> None:
     from transformers import T5EncoderModel
 
     prompt = load_checkpoint(checkpoints(train(TrainingConfig.of(t5_settings)))[-1]).prompt
@@ -71,7 +71,7 @@ def test_training_begins_with_the_weights_of_t5_and_leaves_the_frozen_ones(t5_se
     assert change.abs().max() < 0.1  # trained, not drawn anew
 
 
-def test_every_checkpoint_holds_the_tokenizer_so_that_t5_may_go(t5_settings, t5) -> None:
+def test_every_checkpoint_contains_the_tokenizer(t5_settings, t5) -> None:
     run = train(TrainingConfig.of(t5_settings))
     text = "Put the block into the bowl."
     expected = T5Tokenizer(t5).encode(text)
@@ -96,7 +96,7 @@ def kill_at_4(done: int, total: int, note: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settings, t5, tmp_path) -> None:
+def test_a_killed_run_resumes_without_the_original_t5(t5_settings, t5, tmp_path) -> None:
     whole = train(TrainingConfig.of({**t5_settings, "out": tmp_path / "whole"}))
     torn = TrainingConfig.of({**t5_settings, "out": tmp_path / "torn"})
     with pytest.raises(Killed):
@@ -107,7 +107,7 @@ def test_a_killed_run_goes_on_with_what_it_learnt_wherever_t5_lies_now(t5_settin
     assert all(torch.equal(tensor, actual[name]) for name, tensor in expected.items())
 
 
-def test_a_preset_with_t5_needs_to_know_where_it_is(t5_settings) -> None:
+def test_a_preset_with_t5_needs_its_source(t5_settings) -> None:
     with pytest.raises(ConfigError, match="'tiny-t5' encodes prompts with T5; set t5"):
         train(TrainingConfig.of({**t5_settings, "t5": None}))
     assert not t5_settings["out"].exists()
@@ -129,7 +129,7 @@ def test_a_t5_of_another_size_leaves_no_run_folder(t5_settings, monkeypatch) -> 
 
 
 @pytest.mark.slow
-def test_weights_to_begin_with_bring_their_tokenizer(t5_settings, t5, tmp_path) -> None:
+def test_init_from_brings_its_tokenizer(t5_settings, t5, tmp_path) -> None:
     first = train(TrainingConfig.of(t5_settings))
     t5.rename(t5.with_name("elsewhere"))
     again = {**t5_settings, "t5": None, "init_from": str(first), "out": tmp_path / "again"}
@@ -139,7 +139,7 @@ def test_weights_to_begin_with_bring_their_tokenizer(t5_settings, t5, tmp_path) 
     assert checkpoints(train(TrainingConfig.of(again)))
 
 
-def test_weights_without_a_tokenizer_need_to_know_where_it_is(t5_settings, t5, tmp_path) -> None:
+def test_weights_without_a_tokenizer_need_its_source(t5_settings, t5, tmp_path) -> None:
     network = build_network(small_t5_vima(), seed=3)
     save_checkpoint(network, tmp_path / "bare")
     begun = {**t5_settings, "init_from": str(tmp_path / "bare")}
