@@ -13,7 +13,7 @@ HOOK = f"{Path(__file__)}:make"
 
 
 @dataclass(frozen=True)
-class Clumsy:
+class NoisyExtractor:
     """Moves boxes, loses every third object and ids, is blind now and then, and orders from right to left.
 
     Args:
@@ -39,6 +39,6 @@ class Clumsy:
         return found
 
 
-def make() -> Clumsy:
+def make() -> NoisyExtractor:
     """Make one, for a hook."""
-    return Clumsy()
+    return NoisyExtractor()

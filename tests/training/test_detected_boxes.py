@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file  # noqa: E402
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
-from noisy_extractor import HOOK, Clumsy  # noqa: E402
+from noisy_extractor import HOOK, NoisyExtractor  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
@@ -43,7 +43,10 @@ class Guesses:
         return Detections(np.concatenate([first, last], axis=1), scores=rng.random(len(first)))
 
 
-EXTRACTORS = {"clumsy": PluggedExtractor(Clumsy()), "guesses": PluggedExtractor(DetectedObjects(Guesses()))}
+EXTRACTORS = {
+    "noisy": PluggedExtractor(NoisyExtractor()),
+    "guesses": PluggedExtractor(DetectedObjects(Guesses())),
+}
 
 
 def assert_as_when_acting(batch, demos, naive: NaiveProcessor, prompts) -> None:
@@ -108,7 +111,7 @@ def test_training_and_inference_have_equal_inputs(
 def test_the_noisy_extractor_sometimes_finds_nothing(demonstrations_of_several_steps) -> None:
     """So that the comparison above covers this case."""
     seen = [
-        len(Clumsy().in_observation(demo.observation(t)))
+        len(NoisyExtractor().in_observation(demo.observation(t)))
         for demo in demonstrations_of_several_steps
         for t in range(demo.num_steps)
     ]
@@ -118,7 +121,7 @@ def test_the_noisy_extractor_sometimes_finds_nothing(demonstrations_of_several_s
 
 @pytest.mark.parametrize("layout", ["objects", "views"])
 def test_a_prompt_without_detections_keeps_its_words(layout, demonstrations_of_several_steps) -> None:
-    blind = PluggedExtractor(Clumsy())
+    blind = PluggedExtractor(NoisyExtractor())
     demo = demonstrations_of_several_steps[0]
     prompt = replace(
         demo.prompt,

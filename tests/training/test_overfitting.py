@@ -59,7 +59,7 @@ def demonstrations() -> dict[str, list[Demonstration]]:
 def test_each_architecture_overfits_32_demonstrations_and_repeats_them(architecture, demonstrations) -> None:
     model = build_network(preset(f"{architecture}-nano"), seed=0).eval()  # that is, without dropout
     tasks = [read(model, group) for group in demonstrations.values()]
-    learn_by_heart(model, tasks)
+    overfit(model, tasks)
     with torch.no_grad():
         _, accuracy = loss_and_accuracy(model, tasks, backward=False)
     assert accuracy > 0.99
@@ -74,7 +74,7 @@ def read(model: PolicyNetwork, runs: Sequence[Demonstration]) -> tuple[Batch, "t
     return collate_examples(processor, examples), images
 
 
-def learn_by_heart(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]]) -> None:
+def overfit(model: PolicyNetwork, tasks: Sequence[tuple[Batch, "torch.Tensor"]]) -> None:
     """Take steps on all demonstrations at once, until each action is right."""
     head = list(model.head.parameters())
     patches = [p for name, p in model.named_parameters() if name.endswith("patches.weight")]

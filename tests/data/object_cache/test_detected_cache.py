@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from noisy_extractor import HOOK, Clumsy
+from noisy_extractor import HOOK, NoisyExtractor
 from object_rows import rows_of
 from openvima.cli.main import main
 from openvima.data import Dataset
@@ -20,16 +20,16 @@ from openvima.errors import DatasetError, WorkerError
 from openvima.perception.iou import object_iou
 from openvima.perception.objects import GROUND_TRUTH, observe
 
-CLUMSY = Boxes("clumsy-1", Clumsy)
+CLUMSY = Boxes("clumsy-1", NoisyExtractor)
 
 
 def test_ids_are_places_and_the_objects_to_move_are_named_by_them(demos: Path) -> None:
     num_lost = 0
     for demo in Dataset(demos):
-        episode = preprocess(demo, "objects", Clumsy())
+        episode = preprocess(demo, "objects", NoisyExtractor())
         assert episode.prompt.text == demo.prompt.text
         for t, table in enumerate(episode.objects.split(episode.objects_per_step)):
-            found, true = Clumsy().in_observation(demo.observation(t)), observe(demo.observation(t))
+            found, true = NoisyExtractor().in_observation(demo.observation(t)), observe(demo.observation(t))
             assert table.ids.tolist() == list(range(len(found)))
             shares = object_iou(found, true)
             for slots, asked in (
@@ -69,9 +69,9 @@ def test_a_extractor_that_is_always_right_names_the_same_objects(demos: Path) ->
 def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -> None:
     dataset, made = Dataset(copy), []
 
-    def make(pixels: int) -> Clumsy:
+    def make(pixels: int) -> NoisyExtractor:
         made.append(pixels)
-        return Clumsy(pixels)
+        return NoisyExtractor(pixels)
 
     one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
     caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
@@ -105,7 +105,7 @@ def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None
 def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
     dataset, seen = Dataset(copy), []
 
-    class Tiring(Clumsy):
+    class Tiring(NoisyExtractor):
         def in_observation(self, observation):
             if len(seen) == 12:
                 raise WorkerError("enough")
@@ -120,7 +120,7 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
     cache = open_object_cache(dataset, boxes=CLUMSY)
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
     for demo, episode in zip(dataset, cache, strict=True):
-        expected = preprocess(demo, "objects", Clumsy())
+        expected = preprocess(demo, "objects", NoisyExtractor())
         assert rows_of(episode.objects).tolist() == rows_of(expected.objects).tolist()
 
 
