@@ -14,6 +14,7 @@ from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
+    build_action_tokens,
     build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -38,8 +39,9 @@ class Gato(PolicyNetwork):
         self.prompt = PromptEncoder(config.prompt, image_token_width=width, width=width)
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(width + NUM_END_EFFECTORS, width)
+        actions = build_action_tokens(config.head, width)
         self.decoder = PrefixDecoder(config.decoder)
-        self.head = build_bins_head(config.head, width)
+        self.head = build_bins_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode frames (..., 3, 64, 128), uint8, to features of patches (..., P, F)."""

@@ -15,6 +15,7 @@ from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
+    build_action_tokens,
     build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -39,8 +40,9 @@ class Gpt(PolicyNetwork):
         self.prompt = PromptEncoder(config.prompt, image_token_width=NUM_VIEWS * width, width=width)
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(NUM_VIEWS * width + NUM_END_EFFECTORS, width)
+        actions = build_action_tokens(config.head, width)
         self.decoder = PrefixDecoder(config.decoder)
-        self.head = build_bins_head(config.head, width)
+        self.head = build_bins_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode frames (..., 3, 64, 128), uint8, to class vectors (..., F)."""

@@ -52,9 +52,11 @@ class AutoregressiveHead(nn.Module):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
-    def __init__(self, config: AutoregressiveConfig, width: int) -> None:
+    def __init__(
+        self, config: AutoregressiveConfig, width: int, actions: "ComponentTokens | None" = None
+    ) -> None:
         super().__init__()
-        self.actions = ComponentTokens(width, config.token_std)
+        self.actions = actions or ComponentTokens(width, config.token_std)
         self.classifiers = bin_classifiers(config.hidden_width, width)
 
     def loss(

@@ -47,9 +47,9 @@ class BinsConfig:
 class BinsHead(nn.Module):
     """Twelve classifiers on the action query; a past action is one token of the history."""
 
-    def __init__(self, config: BinsConfig, width: int) -> None:
+    def __init__(self, config: BinsConfig, width: int, actions: ActionEncoder | None = None) -> None:
         super().__init__()
-        self.actions = ActionEncoder(config.action_width, width)
+        self.actions = actions or ActionEncoder(config.action_width, width)
         self.classifiers = bin_classifiers(config.hidden_width, width)
 
     def loss(

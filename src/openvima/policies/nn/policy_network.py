@@ -12,8 +12,9 @@ import torch
 from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
+from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
-from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead
+from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead, ComponentTokens
 from openvima.policies.nn.bins import SCORE, BinsConfig, BinsHead
 from openvima.policies.nn.decoder import CausalDecoder
 from openvima.policies.nn.history import ObservationTokens
@@ -158,8 +159,21 @@ class PolicyNetwork(nn.Module):
         return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, history.steps_BT)
 
 
-def build_bins_head(config: BinsConfig | AutoregressiveConfig, width: int) -> BinsHead | AutoregressiveHead:
-    """Build the head that a config describes."""
+def build_action_tokens(
+    config: BinsConfig | AutoregressiveConfig, width: int
+) -> ActionEncoder | ComponentTokens:
+    """Build the tokens of past actions; before the decoder, so that a seed gives the same weights."""
     if isinstance(config, AutoregressiveConfig):
-        return AutoregressiveHead(config, width)
-    return BinsHead(config, width)
+        return ComponentTokens(width, config.token_std)
+    return ActionEncoder(config.action_width, width)
+
+
+def build_bins_head(
+    config: BinsConfig | AutoregressiveConfig, width: int, actions: ActionEncoder | ComponentTokens
+) -> BinsHead | AutoregressiveHead:
+    """Build the head that a config describes, with the tokens of past actions."""
+    if isinstance(config, AutoregressiveConfig):
+        assert isinstance(actions, ComponentTokens)
+        return AutoregressiveHead(config, width, actions)
+    assert isinstance(actions, ActionEncoder)
+    return BinsHead(config, width, actions)

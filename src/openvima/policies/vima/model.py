@@ -14,6 +14,7 @@ from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
+    build_action_tokens,
     build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -44,9 +45,10 @@ class Vima(PolicyNetwork):
         self.prompt = PromptEncoder(config.prompt, image_token_width=config.images.width, width=width)
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(config.images.width + NUM_END_EFFECTORS, width)
+        actions = build_action_tokens(config.head, width)
         self.decoder = Decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
-        self.head = build_bins_head(config.head, width)
+        self.head = build_bins_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
