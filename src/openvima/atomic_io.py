@@ -91,16 +91,21 @@ def restore_folder(path: Path) -> None:
 
 
 def remove_stale(folder: Path) -> None:
-    """Delete the temporary files that killed writers left in a folder; on POSIX systems only."""
+    """Delete the temporary files and folders that killed writers left in a folder; on POSIX systems only."""
     if os.name != "posix":
         return
-    for file in folder.glob(".*.tmp"):
-        process = file.name.split(".")[-2]
-        if process.isdecimal() and not _runs(int(process)):
-            file.unlink(missing_ok=True)
+    for path in folder.glob(".*.tmp"):
+        process = path.name.split(".")[-2]
+        if not process.isdecimal() or process_runs(int(process)):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
-def _runs(process_id: int) -> bool:
+def process_runs(process_id: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(process_id, 0)  # sends nothing
     except (ProcessLookupError, OverflowError):

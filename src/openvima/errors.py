@@ -79,6 +79,10 @@ class StorageError(OpenVimaError, OSError):
     """A folder cannot be written to, for example because the disk is full; complete files were kept."""
 
 
+class FolderLockedError(OpenVimaError, RuntimeError):
+    """Another process is writing to the folder."""
+
+
 class ShardError(OpenVimaError, ValueError):
     """A file of demonstrations is damaged, truncated or of another format."""
 
