@@ -18,6 +18,7 @@ from openvima.data.page.charts import bar_chart
 from openvima.data.page.episodes import episode_card
 from openvima.data.summary import Histogram, Summary, Unfinished, summarise_folder
 from openvima.errors import ConfigError, DatasetError
+from openvima.html import render_page
 from openvima.scene import Action
 
 MadeUp = Callable[..., Demonstration]
@@ -180,42 +181,50 @@ def test_equal_data_give_equal_pages(demos: Path, tmp_path: Path) -> None:
     assert str(demos).encode() not in pages[0]
 
 
+def drawn_episode(demo: Demonstration) -> str:
+    return render_page("episode", card=episode_card(demo))
+
+
+def drawn_chart(histogram: Histogram) -> str:
+    return render_page("histogram", chart=bar_chart(histogram))
+
+
 def test_names_from_files_cannot_change_the_page(made_up: MadeUp) -> None:
     demo = made_up(num_images=0)
     evil = replace(demo.prompt, text="<script>alert(1)</script>")
-    card = episode_card(replace(demo, prompt=evil, level='"><b>', domain="<i>"))
+    card = drawn_episode(replace(demo, prompt=evil, level='"><b>', domain="<i>"))
     assert "<script" not in card
     assert "<b>" not in card
     assert "<i>" not in card
-    assert "<b>" not in bar_chart(Histogram("a", {"<b>": 1}))
+    assert "<b>" not in drawn_chart(Histogram("a", {"<b>": 1}))
 
 
 def test_captions_say_what_was_done(made_up: MadeUp) -> None:
     demo = replace(made_up(num_steps=1, num_images=0), end_effector="suction")
     there = Action.planar((0.3, 0.1), (0.6, -0.2))
     turned = Action.planar((0.3, 0.1), (0.3, 0.1), -0.5236)
-    assert "1: move red swirl flower<" in episode_card(replace(demo, actions=(there,)))
-    placed = episode_card(replace(demo, actions=(there,), place_ids=(6,)))
+    assert "1: move red swirl flower<" in drawn_episode(replace(demo, actions=(there,)))
+    placed = drawn_episode(replace(demo, actions=(there,), place_ids=(6,)))
     assert "1: move red swirl flower to red swirl flower<" in placed
-    in_place = episode_card(replace(demo, actions=(turned,), place_ids=(5,)))
+    in_place = drawn_episode(replace(demo, actions=(turned,), place_ids=(5,)))
     assert "1: turn red swirl flower 30° to the right<" in in_place
     assert "<path" not in in_place
-    swept = episode_card(replace(demo, actions=(there,), end_effector="spatula"))
+    swept = drawn_episode(replace(demo, actions=(there,), end_effector="spatula"))
     assert "1: sweep red swirl flower<" in swept
-    unknown = episode_card(replace(demo, actions=(there,), pick_ids=(-2,), place_ids=(-2,)))
+    unknown = drawn_episode(replace(demo, actions=(there,), pick_ids=(-2,), place_ids=(-2,)))
     assert "1: move an object<" in unknown
 
 
 def test_arrows_begin_and_end_where_the_action_does(made_up: MadeUp) -> None:
     demo = made_up(num_steps=1, num_images=0)
-    card = episode_card(replace(demo, actions=(Action.planar((0.5, 0.0), (0.5, 0.25)),)))
+    card = drawn_episode(replace(demo, actions=(Action.planar((0.5, 0.0), (0.5, 0.25)),)))
     # The top camera looks at (0.5, 0) with column 128 and row 63, 256 columns a metre; its image lies below.
     assert '<circle cx="128.5" cy="193.5"' in card
     assert 'd="M133.0 193.5L191.2 193.5' in card
 
 
 def test_long_histograms_show_both_ends() -> None:
-    chart = bar_chart(Histogram("values", {str(n): 100 - n for n in range(50)}))
+    chart = drawn_chart(Histogram("values", {str(n): 100 - n for n in range(50)}))
     assert "… 34 more …" in chart
     assert chart.count("<rect") == 16
 

@@ -64,7 +64,7 @@ class Page(HTMLParser):
 
     def handle_data(self, data):
         if "table" in self.open and self.tables[-1] and self.tables[-1][-1]:
-            self.tables[-1][-1][-1] += data + " "
+            self.tables[-1][-1][-1] += data.replace("\xa0", " ") + " "
 
 
 @pytest.fixture

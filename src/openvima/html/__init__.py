@@ -16,8 +16,8 @@ _FOLDER = Path(__file__).parent
 def render_page(template: str, **values: object) -> str:
     """Render a template of this package.
 
-    Values are escaped, except where a template marks a fragment of HTML as safe. A page contains its
-    stylesheet and loads nothing.
+    Values are escaped, except for the SVG of charts. No line breaks before a percent sign. A page contains
+    its stylesheet and loads nothing.
 
     Args:
         template: Name of a file in `templates`, without ".html.j2".
@@ -63,10 +63,11 @@ def _environment() -> "Environment":
         loader=FileSystemLoader([_FOLDER / "templates", _FOLDER]),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=lambda v: v if isinstance(v, Markup) else escape(v).replace(" %", Markup("&nbsp;%")),
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
     environment.filters["breakable"] = breakable
-    environment.filters["nbsp_percent"] = lambda text: escape(text).replace(" %", Markup("&nbsp;%"))
+    environment.globals["data_uri"] = data_uri
     return environment

@@ -10,15 +10,18 @@ from openvima.evaluation.comparison import Comparison, compare_pairs, default_pa
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
-from openvima.report import sections
-from openvima.report.ablations import ablation_section
+from openvima.report import figures, published, tables, text
+from openvima.report.ablations import ablated_policies
 from openvima.report.curves import read_run_charts
-from openvima.report.differences import comparison_section
-from openvima.report.published_comparison import published_section
-from openvima.report.tables import failure_table, rate_table
-from openvima.report.text import findings, headline
 from openvima.video.clips import Clip
 
+_FUNCTIONS = (  # that the templates in `html/templates/report/` call
+    *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
+    *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_description),
+    *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
+    *(published.published_tasks, published.published_rate, published.published_coverage),
+    *(published.leading_models, published.published_models),
+)
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
     "difficulty": "easy",
@@ -63,27 +66,27 @@ def write_report(
     if comparisons is None:
         comparisons = compare_pairs(results, default_pairs(results))
     records = [*([metrics] if metrics else []), *runs]
-    body = (
-        sections.policy_cards(results),
-        rate_table(results),
-        sections.clip_cards(clips),
-        failure_table(results),
-        sections.level_charts(results),
-        comparison_section(comparisons),
-        ablation_section(results),
-        published_section(results),
-        sections.training_charts(read_run_charts(records) if records else []),
-        sections.level_meanings(results),
-        sections.reproduction(results, command or default_command(results)),
-    )
     page = render_page(
         "report",
-        headline=headline(results),
-        summary=findings(results),
-        measured=sections.measured(results),
+        **{function.__name__: function for function in _FUNCTIONS},
+        level_names=text.LEVEL_NAMES,
+        level_meanings=text.LEVEL_MEANINGS,
+        published_column=any(published.published_tasks(row.level).get(row.task) for row in results.rows),
+        published_model=" ".join(published.BESIDE),
+        reliability=published.RELIABILITY,
+        results=results,
+        means=results.means(),
+        colours=text.series_colours(results),
+        headline=text.headline(results),
+        summary=text.findings(results),
+        measured=text.measured(results),
         notes=notes,
-        sections=[part for part in body if part],
-        version=results.versions.get("openvima", ""),
+        clips=clips,
+        comparisons=comparisons,
+        ablations=ablated_policies(results),
+        published_levels=[level for level in results.levels() if published.published_tasks(level)],
+        training_charts=read_run_charts(records) if records else [],
+        command=command or default_command(results),
     )
     return atomic_write_file(out, page)
 

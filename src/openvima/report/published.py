@@ -1,10 +1,12 @@
 """Success rates of the papers' models, as published elsewhere: for orientation beside one's own."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
+
+from openvima.evaluation.results import Results
 
 # The only model whose success by task was published for all levels.
 BESIDE = ("VIMA", "200M")
@@ -70,6 +72,25 @@ def published_tasks(level: str) -> Mapping[str, float]:
         if (record["model"], record["size"], record["level"]) == (*BESIDE, level):
             return record["tasks"]
     return {}
+
+
+def published_rate(level: str, tasks: Sequence[str]) -> float | None:
+    """Mean rate (%) of VIMA 200M over tasks of a level; None unless it was published for all of them."""
+    rates = published_tasks(level)
+    return sum(rates[task] for task in tasks) / len(tasks) if rates.keys() >= set(tasks) else None
+
+
+def published_coverage(results: Results) -> str:
+    """Say on how many of a level's tasks our means rest, where it is not all."""
+    partial = [
+        f"{len(set(results.tasks(level)) & published_tasks(level).keys())} of {len(published_tasks(level))} "
+        f"tasks at {level}"
+        for level in results.levels()
+        if published_tasks(level).keys() - set(results.tasks(level))
+    ]
+    if not partial:
+        return "Published means rest on the same tasks."
+    return f"Published means rest on all tasks, those of this evaluation on {', '.join(partial)}."
 
 
 @cache

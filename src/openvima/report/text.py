@@ -1,7 +1,6 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
-import html
-
+from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results
 
 LEVEL_NAMES = {
@@ -155,6 +154,27 @@ def findings(results: Results) -> str:
     return "; ".join(sentences) + "."
 
 
-def prose(text: str) -> str:
-    """Escape text for HTML, with no line break before percent signs."""
-    return html.escape(text, quote=True).replace(" %", "&nbsp;%")
+def measured(results: Results) -> str:
+    """Counts of policies, tasks, levels and episodes as a sentence."""
+    episodes = sorted({row.episodes for row in results.rows})
+    each = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
+    return (
+        f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
+        f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, {each} each; "
+        f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
+        "never uses."
+    )
+
+
+def finding(comparison: Comparison, difference: Difference | None = None) -> str:
+    """One difference, by default the overall one, in a sentence."""
+    difference = difference or comparison.overall
+    where = difference.level or "all levels together"
+    a, b, value, (low, high) = comparison.a, comparison.b, difference.difference, difference.interval
+    if value < 0:  # a reader expects the better one first
+        a, b, value, low, high = b, a, -value, -high, -low
+    size = f"{points(value)} points ({points_span((low, high))})"
+    if difference.verdict == "noise":
+        return f"On {where}, {a} − {b} is {size}: inside the noise, it may well be chance."
+    doubt = ", though the exact test leaves room for chance" if difference.verdict == "unsure" else ""
+    return f"On {where}, {a} is better than {b}: {size}{doubt}."

@@ -7,7 +7,6 @@ from PIL import Image
 
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
-from openvima.html import data_uri, render_page
 from openvima.render import channels_last
 from openvima.render.camera import CAMERAS, View, project
 from openvima.scene import BACKGROUND_ID, Action, PromptImage
@@ -18,11 +17,10 @@ _MARGIN = 3  # pixels around an object in the prompt
 _RING = 4.5  # radius in pixels
 _HEAD = 7.0  # length of the arrow's head in pixels
 _LEAST_TURN_DEG = 1
-_CLOSING = ".,;:"  # no space before these
 
 
-def episode_card(demo: Demonstration) -> str:
-    """Render an episode as HTML.
+def episode_card(demo: Demonstration) -> dict[str, object]:
+    """Values of the template `episode`: prompt, frames, and facts.
 
     Args:
         demo: The episode, with its images.
@@ -34,25 +32,24 @@ def episode_card(demo: Demonstration) -> str:
         *([f"{demo.num_redraws} resamples"] if demo.num_redraws else []),
         "solved" if demo.outcome.success else demo.outcome.reason or "not solved",
     )
-    return render_page(
-        "episode",
-        prompt=[_prompt_part(part, index) for index, part in enumerate(demo.prompt.sequence())],
-        frames=[_frame(demo, step) for step in range(demo.num_steps + 1)],
-        width=IMAGE_SHAPE[1],
-        height=2 * IMAGE_SHAPE[0] + _GAP,
-        facts=facts,
-        content_hash=demo.content_hash(),
-    )
+    return {
+        "prompt": [part if isinstance(part, str) else _prompt_image(part) for part in demo.prompt.sequence()],
+        "frames": [_frame(demo, step) for step in range(demo.num_steps + 1)],
+        "size": (IMAGE_SHAPE[1], 2 * IMAGE_SHAPE[0] + _GAP),
+        "facts": facts,
+        "content_hash": demo.content_hash(),
+    }
 
 
-def _prompt_part(part: str | PromptImage, index: int) -> dict[str, str]:
-    if isinstance(part, str):
-        return {"space": " " if index and part[0] not in _CLOSING else "", "uri": "", "text": part}
-    pixels = channels_last(part.rgb["front"])
-    if part.kind == "object":
-        pixels = _cut_to_object(pixels, part.segm["front"])
-    uri = data_uri(png(Image.fromarray(np.ascontiguousarray(pixels))))
-    return {"space": " " if index else "", "uri": uri, "kind": part.kind, "name": part.name}
+def _prompt_image(image: PromptImage) -> dict[str, object]:
+    pixels = channels_last(image.rgb["front"])
+    if image.kind == "object":
+        pixels = _cut_to_object(pixels, image.segm["front"])
+    return {"png": _png(pixels), "kind": image.kind, "name": image.name}
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    return png(Image.fromarray(np.ascontiguousarray(pixels)))
 
 
 def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
@@ -64,18 +61,18 @@ def _cut_to_object(pixels: np.ndarray, segm: np.ndarray) -> np.ndarray:
     return pixels[top : rows[-1] + 1 + _MARGIN, left : columns[-1] + 1 + _MARGIN]
 
 
-def _frame(demo: Demonstration, step: int) -> dict[str, str]:
+def _frame(demo: Demonstration, step: int) -> dict[str, object]:
     """Observation of both cameras before a step, or at the end, with the action that follows."""
     height, width = IMAGE_SHAPE
     image = np.full((2 * height + _GAP, width, 3), 255, np.uint8)
     for index, view in enumerate(VIEWS):
         top = index * (height + _GAP)
         image[top : top + height] = channels_last(demo.rgb[view][step])
-    arrows = "" if step == demo.num_steps else "".join(_arrow(demo.actions[step], view) for view in VIEWS)
-    return {"caption": _caption(demo, step), "uri": data_uri(png(Image.fromarray(image))), "arrows": arrows}
+    arrows = [_arrow(action, view) for action in demo.actions[step : step + 1] for view in VIEWS]
+    return {"caption": _caption(demo, step), "png": _png(image), "arrows": arrows}
 
 
-def _arrow(action: Action, view: View) -> str:
+def _arrow(action: Action, view: View) -> dict[str, object]:
     """A ring where the tool goes down, and an arrow to where it goes up again."""
     points = np.array([(*action.pose0_position, 0.0), (*action.pose1_position, 0.0)])
     start, end = project(points, CAMERAS[view]) + 0.5  # the middle of a pixel, as SVG counts
@@ -83,15 +80,14 @@ def _arrow(action: Action, view: View) -> str:
     start, end = start + below, end + below
     way = end - start
     length = float(np.hypot(*way))
-    ring = f'<circle cx="{start[0]:.1f}" cy="{start[1]:.1f}" r="{_RING}"/>'
+    ring: dict[str, object] = {"x": start[0], "y": start[1], "radius": _RING, "path": ""}
     if length <= _RING:  # it stays where it is, and turns
-        return f'<g class="arrow back">{ring}</g><g class="arrow">{ring}</g>'
+        return ring
     forward = way / length
     side = np.array([-forward[1], forward[0]])
     wings = [end - _HEAD * forward + sign * _HEAD / 2 * side for sign in (1, -1)]
     path = _path([start + _RING * forward, end]) + _path([wings[0], end, wings[1]])
-    drawn = f'{ring}<path d="{path}"/>'
-    return f'<g class="arrow back">{drawn}</g><g class="arrow">{drawn}</g>'
+    return {**ring, "path": path}
 
 
 def _path(points: list[np.ndarray]) -> str:
