@@ -13,7 +13,7 @@ from object_rows import rows_of
 from openvima.cli.main import main
 from openvima.data import Dataset
 from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
-from openvima.data.object_cache.cache_file import write_cache_file
+from openvima.data.object_cache.cache_file import CacheFile, write_cache_file
 from openvima.data.object_cache.episode import preprocess
 from openvima.data.verification import verify
 from openvima.errors import DatasetError, WorkerError
@@ -76,9 +76,9 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
     caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
     assert [cache.folder.name for cache in caches] == [
-        "objects-v3",
-        "objects-v3-clumsy-1",
-        "objects-v3-clumsy-2",
+        "objects-v4",
+        "objects-v4-clumsy-1",
+        "objects-v4-clumsy-2",
     ]
     assert made == [1, 2]  # once, for all shards
     reopened = open_object_cache(dataset, boxes=two)
@@ -114,8 +114,8 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 
     with pytest.raises(WorkerError, match="enough"):
         open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
-    folder = copy / "object_cache" / "objects-v3-clumsy-1"
-    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.arrow")}
+    folder = copy / "object_cache" / "objects-v4-clumsy-1"
+    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.cache")}
     assert 1 <= len(before) <= 5
     cache = open_object_cache(dataset, boxes=CLUMSY)
     assert all((folder / name).stat().st_mtime_ns == time for name, time in before.items())
@@ -127,9 +127,9 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     cache = open_object_cache(dataset, boxes=CLUMSY)
-    path = cache.folder / "rotate-train-00000.arrow"
+    path = cache.folder / "rotate-train-00000.cache"
     whole = path.read_bytes()
-    write_cache_file(path, cache[:2], "objects", cache._files[path.name].source, "clumsy-2")
+    write_cache_file(path, cache[:2], "objects", CacheFile(path).source, "clumsy-2")
     with pytest.raises(DatasetError, match="lacks 1 shards"):
         ObjectCache(dataset, boxes="clumsy-1")
     open_object_cache(dataset, boxes=CLUMSY)
@@ -144,13 +144,13 @@ def test_whole_frames_have_no_boxes(demos: Path) -> None:
 def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> None:
     cache = open_object_cache(Dataset(copy), boxes=CLUMSY)
     assert not verify(copy).problems
-    path = cache.folder / "rotate-train-00000.arrow"
+    path = cache.folder / "rotate-train-00000.cache"
     rows = [row for row, episode in enumerate(cache) if episode.task == "rotate"][:2]
     changed = [replace(cache[row], actions=cache[row].actions + 0.1) for row in rows]
-    write_cache_file(path, changed, "objects", cache._files[path.name].source, "clumsy-1")
+    write_cache_file(path, changed, "objects", CacheFile(path).source, "clumsy-1")
     (problem,) = verify(copy).problems
     assert "it differs from the demonstration" in problem.cause
-    assert problem.file.endswith("objects-v3-clumsy-1/rotate-train-00000.arrow")
+    assert problem.file.endswith("objects-v4-clumsy-1/rotate-train-00000.cache")
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,6 +158,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     assert main(words) == 0
     (folder,) = (copy / "object_cache").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
-    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v3-"))) == 10
+    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v4-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2
     assert "whole frames have none" in capsys.readouterr().err

@@ -1,20 +1,24 @@
 """The object cache: equal to preprocessing anew, written once, never trusted when damaged or old."""
 
+import json
 import os
 import pickle
+from collections import Counter
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
+from xxhash import xxh3_64_intdigest
 
+from damage_cache import damage_files
 from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.object_cache import cache_file
 from openvima.data.object_cache.cache import ObjectCache, open_object_cache
-from openvima.data.object_cache.cache_file import CacheFile
+from openvima.data.object_cache.cache_file import INDEX, OBJECT, PREAMBLE, CacheFile
 from openvima.data.object_cache.episode import preprocess
 from openvima.errors import DatasetError, ShardError
-from openvima.perception.preprocessing import image_names, split_prompt
+from openvima.perception.preprocessing import KINDS, image_names, split_prompt
 
 TASKS = ("rotate", "rearrange_then_restore")
 
@@ -46,7 +50,7 @@ def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None
     one = open_object_cache(Dataset(copy), folder=tmp_path / "one").folder
     two = open_object_cache(Dataset(copy), folder=tmp_path / "two", workers=2).folder
     files = sorted(path.name for path in one.iterdir())
-    assert files == sorted(path.name for path in copy.glob("*.arrow"))
+    assert files == sorted(path.with_suffix(".cache").name for path in copy.glob("*.arrow"))
     assert all((one / name).read_bytes() == (two / name).read_bytes() for name in files)
 
 
@@ -122,15 +126,52 @@ def test_a_cache_can_be_sent_to_another_process(demos: Path) -> None:
     assert [episode.seed for episode in again[1:3]] == [cache[1].seed, cache[2].seed]
 
 
-def test_a_file_is_read_with_pyarrow_alone(demos: Path) -> None:
+def test_damage_is_found_or_harmless(copy: Path) -> None:
+    dataset = Dataset(copy, tasks=["rotate"])
+    paths = [path for kind in KINDS for path in sorted(open_object_cache(dataset, kind).folder.iterdir())]
+    outcomes = damage_files(paths, rounds=300, seed=0)
+    assert sum(outcomes.values(), Counter()).keys() <= {"found", "harmless"}, outcomes
+
+
+def test_a_damaged_record_is_named_where_others_are_read(copy: Path) -> None:
+    cache = open_object_cache(Dataset(copy, tasks=["rotate"]))
+    path = cache.folder / "rotate-train-00000.cache"
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.unlink()  # the cache has the old file mapped
+    path.write_bytes(content)
+    damaged = ObjectCache(Dataset(copy, tasks=["rotate"]))
+    assert_equal(damaged[0], cache[0])
+    with pytest.raises(ShardError, match=r"00000\.cache .* record 1 of 2 is wrong.*`openvima data"):
+        damaged[1]
+
+
+def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatch) -> None:
+    monkeypatch.setattr(cache_file, "CACHE_VERSION", 3)
+    path = next(open_object_cache(Dataset(copy)).folder.iterdir())
+    monkeypatch.undo()
+    with pytest.raises(ShardError, match=r"of version 3, not 4\)\. .*`openvima data preprocess` makes it"):
+        CacheFile(path)
+    with pytest.raises(DatasetError, match=r"lacks 6 shards, .*`openvima data preprocess .*` writes them"):
+        ObjectCache(Dataset(copy))
+
+
+def test_a_file_is_read_as_documented(demos: Path) -> None:
     cache = open_object_cache(Dataset(demos, tasks=["rotate"]))
-    table = pa.ipc.open_file(pa.memory_map(str(cache.folder / "rotate-train-00000.arrow"))).read_all()
-    row = table.slice(1, 1).to_pylist()[0]
-    pixels = pa.decompress(row["images"], row["num_images"] * 3 * 32 * 32, codec="lz4_raw", asbytes=True)
-    images = np.frombuffer(pixels, np.uint8).reshape(-1, 3, 32, 32)
+    content = (cache.folder / "rotate-train-00000.cache").read_bytes()
+    preamble = np.frombuffer(content, PREAMBLE, count=1)[0]
+    index_start = PREAMBLE.itemsize + int(preamble["json_bytes"])
+    about = json.loads(content[PREAMBLE.itemsize : index_start])
+    assert about["tasks"] == ["rotate"]
+    entry = np.frombuffer(content, INDEX, count=about["rows"], offset=index_start)[1]
+    objects_start = entry["start"] + entry["num_prompt_objects"] * OBJECT.itemsize
+    objects = np.frombuffer(content, OBJECT, count=entry["num_objects"], offset=objects_start)
+    for name in OBJECT.names:
+        assert np.array_equal(objects[name], getattr(cache[1].objects, name))
+    end = entry["images_start"] + entry["num_images"] * 3 * 32 * 32
+    images = np.frombuffer(content[entry["images_start"] : end], np.uint8).reshape(-1, 3, 32, 32)
     assert np.array_equal(images, cache[1].images)
-    for name, field in (("id", "ids"), ("crop_index",) * 2, ("boxes",) * 2, ("grasps",) * 2):
-        assert np.array_equal([each[name] for each in row["objects"]], getattr(cache[1].objects, field))
+    assert xxh3_64_intdigest(content[entry["start"] : end]) == entry["checksum"]
 
 
 def test_a_prompt_is_split_into_texts_and_images() -> None:

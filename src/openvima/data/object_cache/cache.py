@@ -13,7 +13,7 @@ import pyarrow as pa
 from openvima.atomic_io import remove_stale
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
-from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, write_cache_file
+from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, file_name, write_cache_file
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
@@ -95,25 +95,28 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
-        return self._gathered(CacheFile.lengths, 2)
+        return self._gathered("num_steps", "num_objects")
 
     def widths(self) -> np.ndarray:
-        """Return the most objects in a prompt image and in an observation, shape (N, 2)."""
-        return self._gathered(CacheFile.widths, 2)
+        """Return the most objects in a prompt image and in an observation, shape (N, 2), int64."""
+        return self._gathered("most_in_prompt", "most_in_view")
 
     def image_counts(self) -> np.ndarray:
         """Return the number of images of each episode, shape (N,), int64."""
-        return self._gathered(CacheFile.image_counts, 1)[:, 0]
+        return self._gathered("num_images")[:, 0]
 
     def texts(self) -> set[str]:
         """Return the different prompts, with their placeholders."""
         return {text for file in self._files.values() for text in file.texts()}
 
-    def _gathered(self, column: Callable[[CacheFile], np.ndarray], width: int) -> np.ndarray:
-        """Read a column of numbers of all files, and put it into the order of the episodes."""
-        of_file = {name: column(file) for name, file in self._files.items()}
+    def _gathered(self, *names: str) -> np.ndarray:
+        """Read columns of the indices of all files, and put them into the order of the episodes."""
+        of_file = {
+            name: np.stack([file.index[column] for column in names], axis=1)
+            for name, file in self._files.items()
+        }
         places = [self.dataset.locate(index) for index in range(len(self))]
-        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, width)
+        return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, len(names))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +124,7 @@ class Source:
     """One shard of demonstrations.
 
     Args:
-        name: Of the shard, and of its file in the cache.
+        name: Of the shard.
         content_hash: Of its episodes together.
         index: Its part of the index.
     """
@@ -171,7 +174,7 @@ def open_object_cache(
             dataset.path / source.name,
             Envelope.from_entry(dataset.manifest["shards"][source.name]),
             source,
-            target / source.name,
+            target / file_name(source.name),
             kind,
             boxes,
         )
@@ -228,7 +231,7 @@ def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, boxes:
 def _made(folder: Path, source: Source, kind: InputKind, boxes: str) -> CacheFile | None:
     """Open the file of a shard; None if it is missing, damaged, or of another version or content."""
     try:
-        file = CacheFile(folder / source.name)
+        file = CacheFile(folder / file_name(source.name))
     except ShardError:
         return None
     asked = (source.content_hash, kind, boxes)

@@ -1,19 +1,23 @@
-"""One file of the object cache: an uncompressed Arrow file whose tables are memory-mapped.
+"""One file of the object cache: a head, and one record per episode, memory-mapped.
 
-Tables are lists of structs with fields of fixed width, so each field of all episodes is one array. Only the
-images are compressed, those of an episode together, so that any episode can be read by itself.
+    preamble   PREAMBLE
+    head       JSON; the index, an `Entry` per episode; the different prompt texts
+    records    tables of `OBJECT`, `STEP` and `PROMPT_IMAGE`, then the images; each at a multiple of 64 bytes
+
+The head has a checksum, compared when the file is opened; the index holds one of each record, compared at
+every read. Nothing is compressed, so that a batch is made of copies of contiguous bytes.
 """
 
 import json
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
+from xxhash import xxh3_64, xxh3_64_intdigest
 
 from openvima.atomic_io import atomic_write
+from openvima.data.checksums import mapped
 from openvima.data.object_cache.episode import ACTION_PARTS, FalsePositives, PreprocessedEpisode
 from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
@@ -24,58 +28,94 @@ from openvima.perception.preprocessing import (
     ObjectTable,
     PreprocessedPrompt,
 )
+from openvima.scene import ACTION_SHAPES
 
-CACHE_VERSION = 3  # grows whenever the same demonstration gives another record
-IMAGE_CODEC = "lz4_raw"  # blocks, without the frame around them
-_KEY = b"openvima.object_cache"
+CACHE_VERSION = 4  # grows whenever the same demonstration gives another record
+SUFFIX = ".cache"
+_ALIGNMENT = 64
+_MAGIC = b"ovcache\n"
+_HASHED_FROM = 16  # first byte that the checksum of the head covers
 
-
-def _field(name: str, dtype: pa.DataType, *shape: int, meaning: str) -> pa.Field:
-    """Describe a field of fixed shape."""
-    for size in reversed(shape):
-        dtype = pa.list_(pa.field("item", dtype, nullable=False), size)
-    return pa.field(name, dtype, nullable=False, metadata={"meaning": meaning})
-
-
-def _table(name: str, *fields: pa.Field) -> pa.Field:
-    return pa.field(name, pa.list_(pa.field("item", pa.struct(fields), nullable=False)), nullable=False)
-
-
-_BOXES = "front and top view: centre x, centre y, height, width in pixels"
-_OBJECT = (
-    _field("id", pa.int16(), meaning="segmentation value, or rank in the image where it was detected"),
-    _field("crop_index", pa.int32(), 2, meaning="front and top view: index of the image, 0 where hidden"),
-    _field("boxes", pa.int16(), 2, 4, meaning=_BOXES),
-    _field("grasps", pa.int16(), 2, 2, meaning="front and top view: column and row"),
+PREAMBLE = np.dtype([("magic", "S8"), ("checksum", "<u8"), ("head_bytes", "<i8"), ("json_bytes", "<i8")])
+# View axis: front, then top. Padding bytes are zero.
+OBJECT = np.dtype(
+    [("crop_index", "<i4", 2), ("boxes", "<i2", (2, 4)), ("grasps", "<i2", (2, 2)), ("ids", "<i2")],
+    align=True,
 )
-COLUMNS = pa.schema(
+STEP = np.dtype(
     [
-        pa.field("task", pa.string(), nullable=False),
-        pa.field("seed", pa.int64(), nullable=False),
-        pa.field("end_effector", pa.int8(), nullable=False),
-        pa.field("text", pa.string(), nullable=False),
-        _table("prompt_objects", *_OBJECT),
-        _table(
-            "prompt_images",
-            _field("num_objects", pa.int16(), meaning="rows of prompt_objects"),
-            _field("is_scene", pa.uint8(), meaning="1 for a scene, 0 for one object on white"),
-        ),
-        _table("objects", *_OBJECT),
-        _table(
-            "steps",
-            _field("num_objects", pa.int16(), meaning="rows of objects"),
-            _field("pick_id", pa.int16(), meaning="object to pick"),
-            _field("place_id", pa.int16(), meaning="object to place at"),
-            _field("false_positive_crop_index", pa.int32(), 2, meaning="front and top view"),
-            _field("false_positive_boxes", pa.int16(), 2, 4, meaning=_BOXES),
-            _field("action", pa.float32(), 12, meaning=", ".join(ACTION_PARTS)),
-        ),
-        _table("final_objects", *_OBJECT),
-        pa.field("num_images", pa.int32(), nullable=False),
-        pa.field("images", pa.large_binary(), nullable=False, metadata={"codec": IMAGE_CODEC}),
-    ]
+        ("actions", "<f4", sum(ACTION_SHAPES[part] for part in ACTION_PARTS)),
+        ("false_positive_crop_index", "<i4", 2),
+        ("false_positive_boxes", "<i2", (2, 4)),
+        ("objects_per_step", "<i2"),
+        ("pick_ids", "<i2"),
+        ("place_ids", "<i2"),
+    ],
+    align=True,
 )
-_TABLES = ("prompt_objects", "prompt_images", "objects", "steps", "final_objects")
+PROMPT_IMAGE = np.dtype([("num_objects", "<i2"), ("is_scene", "?")], align=True)
+_OBJECT_BYTES, _STEP_BYTES, _PROMPT_IMAGE_BYTES = OBJECT.itemsize, STEP.itemsize, PROMPT_IMAGE.itemsize
+
+
+class Entry(NamedTuple):
+    """Where the record of an episode lies, and what its tables count.
+
+    Args:
+        start: First byte of the record in the file.
+        images_start: First byte of its images.
+        checksum: xxh3 of its bytes, 64 bits.
+        seed: Number of the episode.
+        text_start: First byte of the prompt's text in the file, UTF-8.
+        text_bytes: Length of that.
+        task: Number of the task in the list of the head.
+        end_effector: 0 suction cup, 1 spatula.
+        num_prompt_objects: Rows of the first table, in `OBJECT`.
+        num_objects: Rows of the second, the same for all observations.
+        num_final_objects: Rows of the third, the same after the last step.
+        num_steps: Rows of the fourth, in `STEP`.
+        num_prompt_images: Rows of the fifth, in `PROMPT_IMAGE`.
+        num_images: Images.
+        most_in_prompt: Most objects in a prompt image.
+        most_in_view: Most objects in an observation, that after the last step included.
+    """
+
+    start: int
+    images_start: int
+    checksum: int
+    seed: int
+    text_start: int
+    text_bytes: int
+    task: int
+    end_effector: int
+    num_prompt_objects: int
+    num_objects: int
+    num_final_objects: int
+    num_steps: int
+    num_prompt_images: int
+    num_images: int
+    most_in_prompt: int
+    most_in_view: int
+
+
+_WIDE = ("start", "images_start", "seed", "text_start")
+INDEX = np.dtype(
+    [(name, "<u8" if name == "checksum" else "<i8" if name in _WIDE else "<i4") for name in Entry._fields]
+)
+
+
+class Record(NamedTuple):
+    """One episode as it is stored: bytes of tables, and its images, (K, 3, height, width), uint8."""
+
+    task: str
+    seed: int
+    end_effector: int
+    text: str
+    prompt_objects: memoryview
+    objects: memoryview
+    final_objects: memoryview
+    steps: memoryview
+    prompt_images: memoryview
+    images: np.ndarray
 
 
 def write_cache_file(
@@ -90,26 +130,52 @@ def write_cache_file(
         source: Content hash of the demonstrations that they were made of.
         boxes: Name of the extractor of the objects; empty for the segmentation.
     """
-    codec = pa.Codec(IMAGE_CODEC)
-    columns = {
-        "task": [episode.task for episode in episodes],
-        "seed": [episode.seed for episode in episodes],
-        "end_effector": [episode.end_effector for episode in episodes],
-        "text": [episode.prompt.text for episode in episodes],
-        "num_images": [len(episode.images) for episode in episodes],
-        "images": [codec.compress(np.ascontiguousarray(e.images), asbytes=True) for e in episodes],
-    }
-    tables = [_tables_of(episode) for episode in episodes]
-    arrays = [
-        _write_table([episode[field.name] for episode in tables], field.type)
-        if field.name in _TABLES
-        else pa.array(columns[field.name], field.type)
-        for field in COLUMNS
-    ]
-    about = {"version": CACHE_VERSION, "kind": kind, "source": source, **({"boxes": boxes} if boxes else {})}
-    schema = COLUMNS.with_metadata({_KEY: json.dumps(about, sort_keys=True).encode()})
-    with atomic_write(path) as file, pa.ipc.new_file(file, schema) as writer:
-        writer.write_batch(pa.record_batch(arrays, schema=schema))
+    tasks = sorted({episode.task for episode in episodes})
+    about = {"kind": kind, "source": source, "boxes": boxes, "tasks": tasks, "rows": len(episodes)}
+    heading = json.dumps({"version": CACHE_VERSION, **about}).encode()
+    texts, places = b"", {}
+    for text in dict.fromkeys(episode.prompt.text for episode in episodes):
+        places[text] = len(texts), len(text.encode())
+        texts += text.encode()
+    texts_start = PREAMBLE.itemsize + len(heading) + len(episodes) * INDEX.itemsize
+    head_bytes = start = _aligned(texts_start + len(texts))
+    tables, entries = [_tables_of(episode) for episode in episodes], []
+    for episode, content in zip(episodes, tables, strict=True):
+        prompt, images = episode.prompt, np.ascontiguousarray(episode.images)
+        text_start, text_bytes = places[prompt.text]
+        checksum = xxh3_64(content)
+        checksum.update(images.data)
+        entries.append(
+            Entry(
+                start=start,
+                images_start=start + len(content),
+                checksum=checksum.intdigest(),
+                seed=episode.seed,
+                text_start=texts_start + text_start,
+                text_bytes=text_bytes,
+                task=tasks.index(episode.task),
+                end_effector=episode.end_effector,
+                num_prompt_objects=len(prompt.objects),
+                num_objects=len(episode.objects),
+                num_final_objects=len(episode.final),
+                num_steps=episode.num_steps,
+                num_prompt_images=len(prompt.is_scene),
+                num_images=len(images),
+                most_in_prompt=int(prompt.objects_per_image.max(initial=0)),
+                most_in_view=int(episode.objects_per_step.max(initial=len(episode.final))),
+            )
+        )
+        start = _aligned(start + len(content) + images.nbytes)
+    preamble = np.array((_MAGIC, 0, head_bytes, len(heading)), PREAMBLE)
+    head = b"".join([preamble.tobytes(), heading, np.array(entries, INDEX).tobytes(), texts])
+    head = head.ljust(head_bytes, b"\0")
+    preamble["checksum"] = xxh3_64_intdigest(head[_HASHED_FROM:])
+    with atomic_write(path) as file:
+        file.write(preamble.tobytes() + head[PREAMBLE.itemsize :])
+        for episode, content in zip(episodes, tables, strict=True):
+            file.write(content)
+            file.write(np.ascontiguousarray(episode.images).data)
+            file.write(bytes(_aligned(file.tell()) - file.tell()))
 
 
 class CacheFile:
@@ -125,174 +191,140 @@ class CacheFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            reader = pa.ipc.open_file(pa.memory_map(str(path)))
-            about = json.loads((reader.schema.metadata or {})[_KEY])
-            self.kind: InputKind = about["kind"]
-            self.source: str = about["source"]
-            self.boxes: str = about.get("boxes", "")
-            fits = about["version"] == CACHE_VERSION and self.kind in KINDS and reader.schema.equals(COLUMNS)
-            batch = reader.get_batch(0) if fits else None
-            if batch is not None:
-                batch.validate(full=True)  # offsets that lead out of a buffer would end the process
+            self._content = mapped(path)
+            about = self._read_head()
         except ODD_ERRORS as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
-        if batch is None:
-            raise ShardError(_unfit(path, "of another version"))
-        self._batch = batch
-        self._tables = {name: _Table(batch.column(name)) for name in _TABLES}
-        self._seeds = batch.column("seed").to_numpy()
-        self._end_effectors = batch.column("end_effector").to_numpy()
-        self._num_images = batch.column("num_images").to_numpy()
-        _, offsets, self._packed = batch.column("images").buffers()
-        self._image_offsets: list[int] = np.frombuffer(offsets, np.int64).tolist()
-        self._codec = pa.Codec(IMAGE_CODEC)
+        self.kind: InputKind = about["kind"]
+        self.source: str = about["source"]
+        self.boxes: str = about["boxes"]
+        self._tasks: list[str] = about["tasks"]
         height, width = IMAGE_SIZES[self.kind]
-        self._shape, self._image_bytes = (-1, 3, height, width), 3 * height * width
+        self._image_shape, self._image_bytes = (-1, 3, height, width), 3 * height * width
+        num_bytes = _aligned(self._end_of(Entry(*self.index[-1].item()))) if len(self) else len(self._content)
+        if len(self._content) != num_bytes:
+            raise ShardError(_unfit(path, f"it has {len(self._content):,} of {num_bytes:,} bytes"))
 
     def __len__(self) -> int:
-        return self._batch.num_rows
+        return len(self.index)
 
     def __getitem__(self, row: int) -> PreprocessedEpisode:
-        tables = self._tables
-        num_objects, is_scene = tables["prompt_images"][row]
-        objects_per_step, pick_ids, place_ids, crop_index, boxes, actions = tables["steps"][row]
+        record = self.read(row)
+        steps = np.frombuffer(record.steps, STEP)
+        prompt_images = np.frombuffer(record.prompt_images, PROMPT_IMAGE)
         return PreprocessedEpisode(
-            task=self._tasks[row],
-            seed=int(self._seeds[row]),
-            end_effector=int(self._end_effectors[row]),
+            task=record.task,
+            seed=record.seed,
+            end_effector=record.end_effector,
             prompt=PreprocessedPrompt(
-                self._texts[row],
-                ObjectTable(*tables["prompt_objects"][row]),
-                num_objects,
-                is_scene.view(np.bool_),
+                record.text,
+                object_table(record.prompt_objects),
+                prompt_images["num_objects"],
+                prompt_images["is_scene"],
             ),
-            objects=ObjectTable(*tables["objects"][row]),
-            objects_per_step=objects_per_step,
-            pick_ids=pick_ids,
-            place_ids=place_ids,
-            false_positives=FalsePositives(crop_index, boxes),
-            final=ObjectTable(*tables["final_objects"][row]),
-            actions=actions,
-            images=self.images(row),
+            objects=object_table(record.objects),
+            objects_per_step=steps["objects_per_step"],
+            pick_ids=steps["pick_ids"],
+            place_ids=steps["place_ids"],
+            false_positives=FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
+            final=object_table(record.final_objects),
+            actions=steps["actions"],
+            images=record.images,
         )
 
-    @cached_property
-    def _tasks(self) -> list[str]:
-        return self._batch.column("task").to_pylist()
+    def read(self, row: int) -> Record:
+        """Read one episode as it is stored, after comparing its checksum.
 
-    @cached_property
-    def _texts(self) -> list[str]:
-        return self._batch.column("text").to_pylist()
-
-    def images(self, row: int) -> np.ndarray:
-        """Return the images of one episode, shape (K, 3, height, width), uint8."""
-        size = int(self._num_images[row]) * self._image_bytes
-        start, end = self._image_offsets[row : row + 2]
-        packed = self._packed.slice(start, end - start)
-        try:
-            pixels = self._codec.decompress(packed, decompressed_size=size) if size else b""
-            return np.frombuffer(pixels, np.uint8).reshape(self._shape)
-        except ODD_ERRORS as error:
-            raise ShardError(_unfit(self.path, f"images of row {row}: {error}")) from None
-
-    def image_counts(self) -> np.ndarray:
-        """Return the number of images of each episode, shape (rows,), int32."""
-        return self._num_images
+        Raises:
+            ShardError: It is damaged.
+        """
+        entry = Entry(*self.index[row].item())
+        content, images_start = self._content, entry.images_start
+        end = self._end_of(entry)
+        if xxh3_64_intdigest(content[entry.start : end]) != entry.checksum:
+            reason = f"the checksum of record {row} of {len(self)} is wrong"
+            raise ShardError(_unfit(self.path, reason))
+        prompt_objects = entry.start
+        objects = prompt_objects + entry.num_prompt_objects * _OBJECT_BYTES
+        final_objects = objects + entry.num_objects * _OBJECT_BYTES
+        steps = final_objects + entry.num_final_objects * _OBJECT_BYTES
+        prompt_images = steps + entry.num_steps * _STEP_BYTES
+        return Record(
+            self._tasks[entry.task],
+            entry.seed,
+            entry.end_effector,
+            self._text(entry.text_start, entry.text_bytes),
+            content[prompt_objects:objects],
+            content[objects:final_objects],
+            content[final_objects:steps],
+            content[steps:prompt_images],
+            content[prompt_images : prompt_images + entry.num_prompt_images * _PROMPT_IMAGE_BYTES],
+            np.frombuffer(content[images_start:end], np.uint8).reshape(self._image_shape),
+        )
 
     def texts(self) -> set[str]:
         """Return the different prompts."""
-        return set(self._texts)
+        places = np.unique(self.index[["text_start", "text_bytes"]])
+        return {self._text(start, length) for start, length in places.tolist()}
 
-    def lengths(self) -> np.ndarray:
-        """Return the steps of each episode and the visible objects of all of them, shape (rows, 2), int64."""
-        return np.stack([self._tables["steps"].lengths(), self._tables["objects"].lengths()], axis=1)
+    def _end_of(self, entry: Entry) -> int:
+        return entry.images_start + entry.num_images * self._image_bytes
 
-    def widths(self) -> np.ndarray:
-        """Return the most objects in a prompt image and in an observation, shape (rows, 2)."""
-        in_view = np.maximum(
-            self._tables["steps"].largest("num_objects"), self._tables["final_objects"].lengths()
-        )
-        return np.stack([self._tables["prompt_images"].largest("num_objects"), in_view], axis=1)
+    def _text(self, start: int, num_bytes: int) -> str:
+        return str(self._content[start : start + num_bytes], "utf-8")
 
-
-class _Table:
-    """A column of tables: each field of all episodes as one array, and where each episode begins."""
-
-    def __init__(self, column: pa.ListArray) -> None:
-        self._starts: list[int] = column.offsets.to_pylist()
-        structs = column.values
-        self._fields = {
-            field.name: _to_numpy(structs.field(number)) for number, field in enumerate(structs.type)
-        }
-        self._arrays = tuple(self._fields.values())
-
-    def __getitem__(self, row: int) -> tuple[np.ndarray, ...]:
-        """Return the fields of one episode."""
-        start, end = self._starts[row], self._starts[row + 1]
-        return tuple([array[start:end] for array in self._arrays])
-
-    def lengths(self) -> np.ndarray:
-        return np.diff(self._starts).astype(np.int64)
-
-    def largest(self, name: str) -> np.ndarray:
-        """Return the largest value of a field in each table, 0 in an empty one."""
-        result = np.zeros(len(self._starts) - 1, np.int64)
-        values = self._fields[name][self._starts[0] : self._starts[-1]]
-        np.maximum.at(result, np.repeat(np.arange(len(result)), self.lengths()), values)
-        return result
+    def _read_head(self) -> dict:
+        """Map the index, and return what the JSON says."""
+        content, size = self._content, PREAMBLE.itemsize
+        preamble = np.frombuffer(content[:size], PREAMBLE)
+        magic, checksum, head_bytes, json_bytes = preamble[0].item()
+        if magic != _MAGIC:
+            raise ValueError("it begins with other bytes")
+        if xxh3_64_intdigest(content[_HASHED_FROM:head_bytes]) != checksum:
+            raise ValueError("the checksum of its index is wrong")
+        about = json.loads(bytes(content[size : size + json_bytes]))
+        if about["version"] != CACHE_VERSION or about["kind"] not in KINDS:
+            raise ValueError(f"it is of version {about['version']}, not {CACHE_VERSION}")
+        index = content[size + json_bytes :][: about["rows"] * INDEX.itemsize]
+        self.index = np.frombuffer(index, INDEX)
+        return about
 
 
-def _tables_of(episode: PreprocessedEpisode) -> dict[str, tuple[np.ndarray, ...]]:
-    """The fields of an episode's tables, in the order of the schema."""
+def file_name(shard: str) -> str:
+    """Return the name of the cache file of a shard."""
+    return str(Path(shard).with_suffix(SUFFIX))
+
+
+def object_table(content: memoryview | bytes) -> ObjectTable:
+    """Return the objects of a stored table, without a copy."""
+    rows = np.frombuffer(content, OBJECT)
+    return ObjectTable(rows["ids"], rows["crop_index"], rows["boxes"], rows["grasps"])
+
+
+def _tables_of(episode: PreprocessedEpisode) -> bytes:
+    """All tables of a record, with zeros behind them up to where images may begin."""
     prompt, false_positives = episode.prompt, episode.false_positives
-    return {
-        "prompt_objects": _object_fields(prompt.objects),
-        "prompt_images": (prompt.objects_per_image, prompt.is_scene),
-        "objects": _object_fields(episode.objects),
-        "steps": (
-            episode.objects_per_step,
-            episode.pick_ids,
-            episode.place_ids,
-            false_positives.crop_index,
-            false_positives.boxes,
-            episode.actions,
-        ),
-        "final_objects": _object_fields(episode.final),
-    }
+    steps = np.zeros(episode.num_steps, STEP)
+    for name in ("actions", "objects_per_step", "pick_ids", "place_ids"):
+        steps[name] = getattr(episode, name)
+    steps["false_positive_crop_index"] = false_positives.crop_index
+    steps["false_positive_boxes"] = false_positives.boxes
+    prompt_images = np.zeros(len(prompt.is_scene), PROMPT_IMAGE)
+    prompt_images["num_objects"], prompt_images["is_scene"] = prompt.objects_per_image, prompt.is_scene
+    tables = [_object_rows(table) for table in (prompt.objects, episode.objects, episode.final)]
+    content = b"".join(table.tobytes() for table in (*tables, steps, prompt_images))
+    return content.ljust(_aligned(len(content)), b"\0")
 
 
-def _object_fields(table: ObjectTable) -> tuple[np.ndarray, ...]:
-    return table.ids, table.crop_index, table.boxes, table.grasps
+def _object_rows(table: ObjectTable) -> np.ndarray:
+    rows = np.zeros(len(table), OBJECT)
+    for name in OBJECT.names or ():
+        rows[name] = getattr(table, name)
+    return rows
 
 
-def _write_table(
-    tables: Sequence[tuple[np.ndarray, ...]], dtype: Any
-) -> pa.ListArray:  # Any: pyarrow's types are dynamic
-    struct = dtype.value_type
-    columns = [
-        _to_arrow(np.concatenate([table[number] for table in tables]), field.type)
-        for number, field in enumerate(struct)
-    ]
-    starts = np.cumsum([0, *(len(table[0]) for table in tables)])
-    rows = pa.StructArray.from_arrays(columns, fields=list(struct))
-    return pa.ListArray.from_arrays(pa.array(starts, pa.int32()), rows, type=dtype)
-
-
-def _to_arrow(values: np.ndarray, dtype: Any) -> Any:  # Any: as above
-    """Make an array of fixed-size lists, as deep as the type has it."""
-    if pa.types.is_fixed_size_list(dtype):
-        inner = _to_arrow(values.reshape(-1, *values.shape[2:]), dtype.value_type)
-        return pa.FixedSizeListArray.from_arrays(inner, type=dtype)
-    return pa.array(values.astype(dtype.to_pandas_dtype()), dtype)
-
-
-def _to_numpy(array: Any) -> np.ndarray:  # Any: as above
-    """Return an array of fixed-size lists in place, without a copy."""
-    shape = [len(array)]
-    while pa.types.is_fixed_size_list(array.type):
-        shape.append(array.type.list_size)
-        array = array.flatten()
-    return array.to_numpy(zero_copy_only=True).reshape(shape)
+def _aligned(offset: int) -> int:
+    return -(-offset // _ALIGNMENT) * _ALIGNMENT
 
 
 def _unfit(path: Path, reason: str) -> str:

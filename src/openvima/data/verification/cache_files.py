@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.data.manifest import CACHE_FOLDER
-from openvima.data.object_cache.cache_file import CacheFile
+from openvima.data.object_cache.cache_file import CacheFile, file_name
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.shard import Shard
 from openvima.data.verification.findings import Problem, Report, by_cause
@@ -51,9 +51,9 @@ def check_cache(
         Number of files that were compared, without outdated ones, and the problems.
     """
     tasks = [
-        CacheTask(path, folder / path.name, content_hashes[path.name])
-        for path in sorted((folder / CACHE_FOLDER).glob("*/*.arrow"))
-        if path.name in content_hashes
+        CacheTask(path, folder / shard, content_hash)
+        for shard, content_hash in sorted(content_hashes.items())
+        for path in sorted((folder / CACHE_FOLDER).glob(f"*/{file_name(shard)}"))
     ]
     total = sum(len(Shard(task.shard)) for task in tasks)
     watch = None if report is None else (lambda done: report(done, total, "comparing the object cache"))
