@@ -107,6 +107,10 @@ class DetectionError(OpenVimaError, ValueError):
     """An invalid detection: a box outside the image, or a score that is not a number."""
 
 
+class InputFileError(OpenVimaError, ValueError):
+    """A file to read is no regular file, too large, nested too deep or of another format."""
+
+
 class CheckpointError(OpenVimaError, ValueError):
     """A checkpoint is damaged or does not match the model."""
 

@@ -136,7 +136,7 @@ def test_the_closed_vocabulary_is_for_networks_that_were_made_for_it(policy) -> 
 
 def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(CheckpointError, match=r"notes\.txt is no published checkpoint"):
+    with pytest.raises(CheckpointError, match=r"notes\.txt is no torch zip archive"):
         load_policy(str(tmp_path / "notes.txt"))
 
 

@@ -311,7 +311,7 @@ def test_gated_encoders_of_later_versions_are_refused(reference, small_sizes, tm
 @pytest.mark.parametrize("name", ["model.safetensors", "pytorch_model.bin"])
 def test_damaged_weights_are_refused(name, small_sizes, tmp_path) -> None:
     (tmp_path / name).write_bytes(b"these are no weights")
-    with pytest.raises(CheckpointError, match="no weights that can be read"):
+    with pytest.raises(CheckpointError, match=r"no weights that can be read|is damaged"):
         loaded(small_sizes, tmp_path)
 
 

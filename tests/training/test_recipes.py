@@ -171,7 +171,7 @@ def test_only_the_first_of_several_processes_prints(trained, monkeypatch, capsys
     [
         ("schedule: {stepps: 3}", "no setting in .* called 'schedule.stepps'. Did you mean 'schedule.steps'"),
         ("- 3", "must hold settings"),
-        ("a: [", "cannot be read as YAML"),
+        ("a: [", "is no valid YAML"),
     ],
 )
 def test_a_file_that_holds_no_settings_is_named(text: str, message: str, tmp_path) -> None:

@@ -5,17 +5,19 @@ from pathlib import Path
 
 import torch
 import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, restore_folder
 from openvima.detector.config import DetectorConfig
 from openvima.detector.network import MaskRCNN
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.input_files import read_yaml
 from openvima.policies.differences import described, listed
 from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE
+from openvima.policies.nn.meta_init import MetaInit
 from openvima.policies.sources import checkpoint_folder
+from openvima.policies.tensor_files import read_safetensors
 
 _KIND = "detector"
 _MAX_LISTED = 5  # names per kind of problem in a message
@@ -71,9 +73,8 @@ def load_network(path: str | Path) -> MaskRCNN:
     path = Path(path)
     restore_folder(path)
     folder = checkpoint_folder(path)
-    network = MaskRCNN(read_config(folder))
-    load_weights(network, folder / WEIGHTS_FILE)
-    return network.eval()
+    file = folder / WEIGHTS_FILE
+    return built(read_config(folder), read_safetensors(file), source=file)
 
 
 def read_config(folder: Path) -> DetectorConfig:
@@ -84,11 +85,11 @@ def read_config(folder: Path) -> DetectorConfig:
     """
     file = folder / CONFIG_FILE
     try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        values = read_yaml(file)
     except OSError as error:
         raise CheckpointError(f"{folder} is no checkpoint: it contains no {CONFIG_FILE}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{file} is no valid YAML: {error}") from error
+    except InputFileError as error:
+        raise CheckpointError(str(error)) from error
     if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
         raise CheckpointError(f"{file} does not describe a {_KIND}; `openvima policies` is for policies.")
     try:
@@ -103,19 +104,31 @@ def load_weights(network: MaskRCNN, file: Path) -> None:
     Raises:
         CheckpointError: The file is missing or damaged, or names or shapes differ.
     """
-    try:
-        tensors = load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{file} cannot be read ({error}).") from error
-    copy_weights(network, tensors, source=str(file))
+    tensors = read_safetensors(file)
+    _check(network, tensors, source=file)
+    network.load_state_dict(tensors, strict=False)
 
 
-def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:
-    """Copy weights into a network.
+def built(config: DetectorConfig, tensors: Mapping[str, torch.Tensor], *, source: Path) -> MaskRCNN:
+    """Build a network of weights, in evaluation mode.
 
     Raises:
-        CheckpointError: Names or shapes differ; the message lists them.
+        CheckpointError: Config and weights do not match, or describe no network.
     """
+    try:
+        with MetaInit():  # takes no memory, whatever the config says
+            outline = MaskRCNN(config)
+    except MemoryError:
+        raise
+    except Exception as error:  # sizes within their limits can contradict each other in many ways
+        raise CheckpointError(f"the config of {source} describes no network: {error}") from error
+    _check(outline, tensors, source=source)
+    network = MaskRCNN(config)
+    network.load_state_dict(tensors, strict=False)
+    return network.eval()
+
+
+def _check(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, source: Path) -> None:
     expected = {name: own for name, own in network.state_dict().items() if not name.endswith(_COUNTER)}
     wrong = [
         f"{name} is {described(tensors[name].dtype, tensors[name].shape)} instead of "
@@ -130,4 +143,3 @@ def copy_weights(network: MaskRCNN, tensors: Mapping[str, torch.Tensor], *, sour
     ]
     if problems:
         raise CheckpointError(f"{source} does not match the config of the detector: {'; '.join(problems)}.")
-    network.load_state_dict(tensors, strict=False)

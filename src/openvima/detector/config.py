@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from reprlib import repr as short
+from typing import Any, Literal, get_type_hints
 
 from openvima.errors import ConfigError, unknown_name
+from openvima.policies.limits import check_field
 
 FIRST_STRIDE = 4  # of the finest pyramid level, in pixels
 
@@ -135,6 +137,8 @@ class DetectorConfig:
         Raises:
             ConfigError: A field is missing or unknown, or the sizes contradict each other.
         """
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"detector is {short(values)}; it must be a mapping of sizes.")
         given = dict(values)
         backbone = _build(BackboneConfig, given.pop("backbone", None), "backbone")
         return _build(DetectorConfig, {**given, "backbone": backbone}, "detector")
@@ -208,11 +212,14 @@ def _plain(value: Any) -> Any:  # Any: nested plain values
 
 def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of two kinds
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where} is {values!r}; it must be a mapping of the fields of {kind.__name__}.")
+        raise ConfigError(f"{where} is {short(values)}; it must be a mapping, of fields of {kind.__name__}.")
     names = [field.name for field in fields(kind)]
     unknown = [str(name) for name in values if name not in names]
     if unknown:
         raise ConfigError(f"{where} has unknown fields {', '.join(unknown)}; allowed: {', '.join(names)}.")
+    hints = get_type_hints(kind)
+    for name, value in values.items():
+        check_field(hints[name], value, f"{where}.{name}")
     arguments = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     try:
         return kind(**arguments)

@@ -10,17 +10,20 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
 import numpy as np
 import torch
 
-from openvima.detector.checkpoint import copy_weights
+from openvima.detector.checkpoint import built
 from openvima.detector.config import DetectorConfig, resnet50
 from openvima.detector.heads import WEIGHTS as BOX_WEIGHTS
 from openvima.detector.network import MaskRCNN
 from openvima.detector.rpn import WEIGHTS as PROPOSAL_WEIGHTS
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import CheckpointError, InputFileError
+from openvima.policies.limits import check_limits
+from openvima.policies.tensor_files import check_finite, read_archive
 
 _CLASS_WEIGHTS = "roi_heads.box_predictor.cls_score.weight"
 # Patterns of module names in Detectron2, and ours. Detectron2 counts these indices from other numbers.
@@ -99,11 +102,12 @@ def load_detectron2(file: str | Path) -> MaskRCNN:
     weights, settings = _weights_in(values, file), values.get("cfg")
     try:
         config = detectron2_config(weights, settings if isinstance(settings, Mapping) else None)
-    except (ConfigError, TypeError, ValueError) as error:  # settings may be anything
+        check_limits(config, "detector")
+    except (TypeError, ValueError, LookupError, RuntimeError) as error:  # settings may be anything
         raise CheckpointError(f"{file} contains invalid settings: {error}") from error
-    network = MaskRCNN(config)
-    copy_weights(network, from_detectron2(weights), source=str(file))
-    return network.eval()
+    tensors = from_detectron2(weights)
+    check_finite(tensors, file)
+    return built(config, tensors, source=file)
 
 
 def detectron2_config(
@@ -142,7 +146,7 @@ def _chosen(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
     for path, expected in _FIXED.items():
         value = _setting(settings, path)
         if value is not None and _as_list(value) != _as_list(expected):
-            raise CheckpointError(f"{path} is {value!r}; only {expected!r} is supported.")
+            raise CheckpointError(f"{path} is {short(value)}; only {expected!r} is supported.")
     chosen = {
         own: value for path, own in _SETTINGS.items() if (value := _setting(settings, path)) is not None
     }
@@ -152,7 +156,7 @@ def _chosen(settings: Mapping[str, Any]) -> dict[str, Any]:  # Any: as stored
     if "anchor_sizes" in chosen:
         if any(len(sizes) != 1 for sizes in chosen["anchor_sizes"]):
             raise CheckpointError(
-                f"anchors have sizes {chosen['anchor_sizes']}; only one per level is supported."
+                f"anchors have sizes {short(chosen['anchor_sizes'])}; only one per level is supported."
             )
         chosen["anchor_sizes"] = tuple(float(sizes[0]) for sizes in chosen["anchor_sizes"])
     if "channel_order" in chosen:
@@ -195,18 +199,14 @@ def _class_of_settings(module: str) -> type:
 
 
 def _values_in(file: Path) -> Mapping[str, Any]:  # Any: any content
-    if not file.is_file():
+    if not file.exists():
         raise CheckpointError(f"there is no file {file}.")
     try:
-        with torch.serialization.safe_globals([*map(_class_of_settings, _CLASSES_OF_SETTINGS)]):
-            values: Any = torch.load(file, map_location="cpu", weights_only=True)  # Any: as above
-    except MemoryError:
-        raise
-    except Exception as error:  # a malicious file can fail in any way
-        reason = (str(error).splitlines() or [""])[0]
+        values = read_archive(file, classes=[*map(_class_of_settings, _CLASSES_OF_SETTINGS)])
+    except InputFileError as error:
         raise CheckpointError(
-            f"{file} cannot be read as plain tensors ({type(error).__name__}: {reason}). Nothing in it was "
-            'executed. Give a .pth file of torch; of a training checkpoint, save only the entry "model".'
+            f"{error} Nothing in it was executed. Give a .pth file of torch; of a training checkpoint, save "
+            'only the entry "model".'
         ) from error
     if not isinstance(values, Mapping):
         raise CheckpointError(f"{file} contains a {type(values).__name__} instead of weights by name.")

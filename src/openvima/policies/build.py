@@ -6,6 +6,7 @@ from openvima.policies.config import PolicyConfig
 from openvima.policies.flamingo.model import Flamingo
 from openvima.policies.gato.model import Gato
 from openvima.policies.gpt.model import Gpt
+from openvima.policies.limits import check_limits
 from openvima.policies.midas.model import Midas
 from openvima.policies.nn.meta_init import MetaInit
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -33,6 +34,10 @@ def outline_network(config: PolicyConfig) -> PolicyNetwork:
     """Build a network on the meta device, to count parameters or to assign weights.
 
     It allocates no memory. `network.load_state_dict(weights, assign=True)` makes it usable.
+
+    Raises:
+        ConfigError: A size lies beyond its limit.
     """
+    check_limits(config, "policy")
     with MetaInit():
         return MODELS[config.architecture](config)

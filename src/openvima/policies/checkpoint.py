@@ -8,15 +8,16 @@ tokenizer/           files of the T5 tokenizer, for policies that use it
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as short
 
 import torch
 import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from openvima import __version__
 from openvima.atomic_io import atomic_folder, restore_folder
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.input_files import read_yaml
 from openvima.policies.build import outline_network
 from openvima.policies.config import PolicyConfig, config_from_dict, config_to_dict
 from openvima.policies.differences import described, listed
@@ -25,6 +26,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.checkpoint import load_published
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import T5Tokenizer
+from openvima.policies.tensor_files import read_safetensors
 from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
@@ -125,8 +127,8 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     folder = Path(folder)
     restore_folder(folder)
     info = read_info(folder)
+    network = _outline(folder, info.config)
     tensors = _read_weights(folder / WEIGHTS_FILE)
-    network = outline_network(info.config)
     _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
     dtype = _COMPUTE_DTYPES.get(info.dtype, info.dtype)
     network.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()}, assign=True)
@@ -140,17 +142,17 @@ def read_info(folder: Path) -> CheckpointInfo:
         CheckpointError: The config is missing or invalid.
     """
     file = folder / CONFIG_FILE
-    if not file.is_file():
+    if not file.exists():
         raise CheckpointError(f"{folder} is no checkpoint: it holds no {CONFIG_FILE}.")
     try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"{file} is no valid YAML: {error}") from error
+        values = read_yaml(file)
+    except InputFileError as error:
+        raise CheckpointError(str(error)) from error
     if not isinstance(values, dict) or values.get("policy") != _KIND or "config" not in values:
         raise CheckpointError(f"{file} does not describe a {_KIND!r} policy.")
     precision = values.get("precision", "float32")
-    if precision not in _PRECISIONS:
-        raise CheckpointError(f"{file}: precision is {precision!r}; allowed: {', '.join(_PRECISIONS)}.")
+    if not isinstance(precision, str) or precision not in _PRECISIONS:
+        raise CheckpointError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
     try:
         return CheckpointInfo(config_from_dict(values["config"]), _PRECISIONS[precision])
     except ConfigError as error:
@@ -237,13 +239,20 @@ def _sizes(tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
     return sizes
 
 
-def _read_weights(file: Path) -> dict[str, torch.Tensor]:
-    if not file.is_file():
-        raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
+def _outline(folder: Path, config: PolicyConfig) -> PolicyNetwork:
+    """Build the network of a config without weights, to check them before they are read."""
     try:
-        return load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{file} is damaged ({error}). Take another checkpoint of the run.") from error
+        return outline_network(config)
+    except MemoryError:
+        raise
+    except Exception as error:  # sizes within their limits can contradict each other in many ways
+        raise CheckpointError(f"{folder / CONFIG_FILE} describes no network: {error}") from error
+
+
+def _read_weights(file: Path) -> dict[str, torch.Tensor]:
+    if not file.exists():
+        raise CheckpointError(f"{file.parent} is no checkpoint: it holds no {WEIGHTS_FILE}.")
+    return read_safetensors(file)
 
 
 def _check_replaceable(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
+from reprlib import repr as short
 from types import NoneType, UnionType
 from typing import Any, get_args, get_type_hints
 
@@ -9,6 +10,7 @@ from openvima.errors import ConfigError, unknown_name
 from openvima.policies.flamingo.config import FlamingoConfig
 from openvima.policies.gato.config import GatoConfig
 from openvima.policies.gpt.config import GptConfig
+from openvima.policies.limits import check_field
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.bins import BinsConfig
@@ -31,10 +33,10 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whateve
         ConfigError: A field is missing or unknown, or sizes are inconsistent.
     """
     if not isinstance(values, Mapping):
-        raise ConfigError(f"policy is {values!r}; it must be a mapping of architecture and sizes.")
+        raise ConfigError(f"policy is {short(values)}; it must be a mapping of architecture and sizes.")
     architecture = values.get("architecture")
-    if architecture not in ARCHITECTURES:
-        raise ConfigError(unknown_name("architecture", str(architecture), ARCHITECTURES))
+    if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
+        raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), ARCHITECTURES))
     sizes = {name: value for name, value in values.items() if name != "architecture"}
     return _build(ARCHITECTURES[architecture], sizes, "policy")
 
@@ -70,16 +72,20 @@ def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyCon
 
 def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of several kinds
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where} is {values!r}; it must be a mapping of the fields of {kind.__name__}.")
+        raise ConfigError(
+            f"{where} is {short(values)}; it must be a mapping of the fields of {kind.__name__}."
+        )
     hints = get_type_hints(kind)
     names = [field.name for field in fields(kind)]
     unknown = [str(name) for name in values if name not in names]
     if unknown:
         raise ConfigError(f"{where} has unknown fields {', '.join(unknown)}; allowed: {', '.join(names)}.")
+    for name, value in values.items():
+        check_field(hints[name], value, f"{where}.{name}")
     arguments = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
     try:
         return kind(**arguments)
-    except TypeError as error:
+    except (TypeError, ArithmeticError) as error:
         raise ConfigError(f"{where}: {error}.") from error
 
 

@@ -12,13 +12,14 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import torch
-from safetensors import safe_open
 
-from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError
+from openvima.errors import CheckpointError, InputFileError, MissingExtraError, PolicyError, PromptError
+from openvima.input_files import open_regular
 from openvima.policies.hub import fetch_from_hub
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
+from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, END_ID, PADDING_ID, Tokenizer
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")  # T5 may be n
 _FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
 _TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
 _SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
+_MAX_TOKENIZER_BYTES = 16 * 2**20  # of each file; those of t5-base have up to 1.4 MB
 _MAX_LISTED = 6  # differences that a message lists
 
 
@@ -150,6 +152,8 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
         raise CheckpointError(f"{path_or_hub_id} holds neither {_FAST_FILE} nor {_SENTENCEPIECE_FILE}.")
     if not (folder / _FAST_FILE).is_file():
         _require("sentencepiece", f"{folder / _SENTENCEPIECE_FILE}", "sentencepiece protobuf")
+    for name in _TOKENIZER_FILES:
+        _check_size(folder / name)
     transformers = _require("transformers", "the tokenizer of T5", "'openvima[t5]'")
     try:
         tokenizer = transformers.T5TokenizerFast.from_pretrained(str(folder), local_files_only=True)
@@ -157,6 +161,19 @@ def _read_tokenizer(path_or_hub_id: str | Path) -> "PreTrainedTokenizerFast":
         raise CheckpointError(f"{path_or_hub_id} holds no tokenizer that can be read: {error}") from error
     _check_is_t5(tokenizer, str(path_or_hub_id))
     return tokenizer
+
+
+def _check_size(file: Path) -> None:
+    """Refuse what is no regular file, or much larger than the files of T5; it may be missing."""
+    if not file.exists():
+        return
+    try:
+        with open_regular(file) as stream:
+            num_bytes = stream.seek(0, 2)
+    except InputFileError as error:
+        raise CheckpointError(str(error)) from error
+    if num_bytes > _MAX_TOKENIZER_BYTES:
+        raise CheckpointError(f"{file} has {num_bytes} bytes; at most {_MAX_TOKENIZER_BYTES} are read.")
 
 
 def _check_is_t5(tokenizer: "PreTrainedTokenizerFast", source: str) -> None:
@@ -193,13 +210,12 @@ def _differences(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, tor
 def _read_encoder(file: Path) -> dict[str, torch.Tensor]:
     """Load word embedding and encoder, without decoder and language model head."""
     try:
-        if file.name == _SAFE_FILE:
-            with safe_open(file, framework="pt") as weights:
-                tensors = {name: weights.get_tensor(name) for name in _of_encoder(weights.keys())}
-        else:
-            weights = torch.load(file, map_location="cpu", weights_only=True)
-            tensors = {name: weights[name] for name in _of_encoder(weights)}
-    except Exception as error:  # damage to a pickled file shows as an error of any kind
+        weights = read_safetensors(file) if file.name == _SAFE_FILE else read_archive(file)
+        tensors = {name: weights[name] for name in _of_encoder(weights)}
+        check_finite(tensors, file)
+    except CheckpointError:
+        raise
+    except (InputFileError, OSError, TypeError, AttributeError) as error:  # a pickle may hold anything
         raise CheckpointError(f"{file} holds no weights that can be read ({error}).") from error
     copy = tensors.pop("encoder.embed_tokens.weight", None)  # the same table under its other name
     return tensors if copy is None else {"shared.weight": copy, **tensors}

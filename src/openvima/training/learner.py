@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import nn
 
 from openvima.errors import CheckpointError, ConfigError
@@ -19,6 +19,7 @@ from openvima.policies.config import config_to_dict
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
+from openvima.policies.tensor_files import read_safetensors
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example, stack_images
@@ -69,7 +70,7 @@ class Learner(nn.Module):
         """
         file = folder / WEIGHTS_FILE
         try:
-            self.load_state_dict(read_tensors(file))
+            self.load_state_dict(read_safetensors(file))
         except RuntimeError as error:
             raise CheckpointError(f"{file} does not fit: {error}") from None
 
@@ -132,7 +133,7 @@ class PolicyLearner(Learner):
     def read(self, folder: Path) -> None:
         """Load the weights of a checkpoint."""
         file = folder / WEIGHTS_FILE
-        load_weights(self.network, read_tensors(file), source=str(file))
+        load_weights(self.network, read_safetensors(file), source=str(file))
 
     def description(self) -> dict[str, Any]:  # Any: plain YAML values
         """Return all sizes of the network."""
@@ -199,22 +200,6 @@ def make_learner(name: str) -> Learner:
     if not isinstance(learner, Learner):
         raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
     return learner
-
-
-def read_tensors(file: Path) -> dict[str, torch.Tensor]:
-    """Read a file of tensors.
-
-    Raises:
-        CheckpointError: It is missing or damaged.
-    """
-    from safetensors import SafetensorError
-
-    try:
-        return load_file(file)
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(
-            f"{file} cannot be read ({error}); delete {file.parent} and repeat the command."
-        ) from error
 
 
 def _stacked(examples: Sequence[Example], processor: Processor) -> tuple[list[Example], torch.Tensor]:

@@ -5,9 +5,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import yaml
-
-from openvima.errors import ConfigError, unknown_name
+from openvima.errors import ConfigError, InputFileError, unknown_name
+from openvima.input_files import read_yaml
 from openvima.training.config import TrainingConfig
 from openvima.training.validation import converted, flattened, setting_types
 
@@ -120,9 +119,11 @@ def read_settings(file: Path) -> dict[str, Any]:
         ConfigError: It is missing, no YAML, or holds a name that is no setting.
     """
     try:
-        values = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} cannot be read as YAML ({str(error).splitlines()[0]}).") from None
+        values = read_yaml(file)
+    except OSError as error:
+        raise ConfigError(f"{file} cannot be read ({error.strerror}).") from None
+    except InputFileError as error:
+        raise ConfigError(str(error)) from None
     if isinstance(values, dict) and isinstance(values.get("training"), dict):
         values = values["training"]
     if not isinstance(values, dict):

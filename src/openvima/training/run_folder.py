@@ -23,9 +23,11 @@ import yaml
 from safetensors.torch import save_file
 
 from openvima.atomic_io import atomic_write_file
-from openvima.errors import CheckpointError, ConfigError
+from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.input_files import read_json, read_yaml
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
-from openvima.training.learner import Learner, read_tensors
+from openvima.policies.tensor_files import read_safetensors
+from openvima.training.learner import Learner
 from openvima.training.tensorboard import BOARD_FOLDER
 from openvima.training.validation import flattened
 
@@ -168,7 +170,7 @@ class RunFolder:
         if checkpoint is None:
             raise CheckpointError(f"{self.checkpoints} holds no checkpoint to resume from.")
         state: dict[str, dict[str, torch.Tensor]] = {}
-        for key, tensor in read_tensors(checkpoint / OPTIMIZER_FILE).items():
+        for key, tensor in read_safetensors(checkpoint / OPTIMIZER_FILE).items():
             parameter, _, name = key.partition("|")
             state.setdefault(parameter, {})[name] = tensor
         return state
@@ -205,9 +207,9 @@ class RunFolder:
                 return [f"it is not empty and has no {CONFIG_FILE}"]
             return []
         try:
-            old = yaml.safe_load(file.read_text(encoding="utf-8"))
-        except yaml.YAMLError:
-            return [f"its {CONFIG_FILE} is no valid YAML"]
+            old = read_yaml(file)
+        except InputFileError as error:
+            return [str(error).rstrip(".")]
         old, new = flattened(old), flattened(settings)
         names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         return [f"{name} is {old.get(name)!r} there and {new.get(name)!r} here" for name in names]
@@ -228,6 +230,6 @@ class RunFolder:
 def _read_progress(checkpoint: Path) -> Progress:
     file = checkpoint / STATE_FILE
     try:
-        return Progress(**json.loads(file.read_text(encoding="utf-8")))
+        return Progress(**read_json(file))
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error

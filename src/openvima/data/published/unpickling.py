@@ -7,17 +7,16 @@ arguments and state; other names are refused. Arrays and numbers are decoded fro
 
 import io
 import pickle
-import pickletools
 import re
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
-from openvima.errors import MemberError
+from openvima.errors import InputFileError, MemberError
+from openvima.pickle_opcodes import check_opcodes
 
 MAX_OPERATIONS = 100_000  # opcodes; the largest known file has about 3,000
-_MAX_TUPLE_SIZE = 1_000  # values in a tuple and in the tuples inside it
 _MAX_TEXT = 200  # characters of a name or reason that a message quotes
 # What `pickle` raises when it is given damaged bytes.
 _ODD_ERRORS = (
@@ -59,16 +58,6 @@ _NAMES = frozenset(
             for function in ("_kit_obj_common", "container_replace_fn", "_google_scanned_obj_common")
         ),
     ]
-)
-_OPCODES = frozenset(
-    (
-        *("PROTO", "FRAME", "STOP", "MARK", "NONE", "NEWTRUE", "NEWFALSE", "BININT1", "BININT2", "BININT"),
-        *("LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
-        *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "EMPTY_TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "TUPLE"),
-        *("EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS"),
-        *("BINPUT", "LONG_BINPUT", "MEMOIZE", "BINGET", "LONG_BINGET"),
-        *("GLOBAL", "STACK_GLOBAL", "REDUCE", "NEWOBJ", "BUILD"),
-    )
 )
 
 
@@ -126,10 +115,12 @@ def read_pickle(content: bytes) -> Any:  # Any: whatever the file holds
         MemberError: It is damaged, too large, or more than data.
     """
     try:
-        _check_opcodes(content)
+        check_opcodes(content, max_operations=MAX_OPERATIONS)
         return _Unpickler(io.BytesIO(content)).load()
     except MemberError:
         raise
+    except InputFileError as error:
+        raise MemberError(str(error)) from None
     except _ODD_ERRORS as error:
         reason = str(error)[:_MAX_TEXT] or type(error).__name__
         raise MemberError(f"it is truncated or no pickle of data ({reason}).") from None
@@ -146,43 +137,6 @@ class _Unpickler(pickle.Unpickler):
         if dotted in _NAMES:
             return Global(dotted)
         raise MemberError(f"it names {dotted[:_MAX_TEXT]}, which no published file needs; nothing was run.")
-
-
-def _check_opcodes(content: bytes) -> None:
-    """Refuse opcodes that published files do not have, and what would cost much time or memory.
-
-    A tuple whose items repeat one tuple, and so on, takes exponential time to hash. Sizes of tuples are
-    therefore followed through stack and memo.
-    """
-    sizes: list[int] = []  # of the values on the stack; 1 for all that is no tuple
-    marks: list[int] = []
-    memo: dict[int, int] = {}
-    for number, (opcode, argument, _) in enumerate(pickletools.genops(content)):
-        name, consumed = opcode.name, len(opcode.stack_before)
-        if number >= MAX_OPERATIONS:
-            raise MemberError(f"it has more than {MAX_OPERATIONS:,} opcodes; published files are shorter.")
-        if name not in _OPCODES:
-            raise MemberError(f"it has the opcode {name}, which no published file needs; nothing was run.")
-        if name == "MARK":
-            marks.append(len(sizes))
-            continue
-        if name in ("MEMOIZE", "BINPUT", "LONG_BINPUT"):
-            index = len(memo) if argument is None else argument
-            if index > MAX_OPERATIONS:  # `pickle` would allocate as many entries
-                raise MemberError(f"it has the memo index {index:,}; published files have smaller ones.")
-            memo[index] = sizes[-1]
-            continue
-        if pickletools.markobject in opcode.stack_before:  # which, with "stackslice", stands for the values
-            consumed += len(sizes) - marks.pop() - 2
-        rest = len(sizes) - consumed
-        if rest < (marks[-1] if marks else 0):
-            raise pickle.UnpicklingError("stack underflow")
-        size = 1 + sum(sizes[rest:]) if "TUPLE" in name else 1
-        if name in ("BINGET", "LONG_BINGET"):
-            size = memo[argument or 0]
-        if size > _MAX_TUPLE_SIZE:
-            raise MemberError(f"it has a tuple of more than {_MAX_TUPLE_SIZE:,} values, with nested ones.")
-        sizes[rest:] = [size] * len(opcode.stack_after)
 
 
 def as_array(value: object) -> np.ndarray:

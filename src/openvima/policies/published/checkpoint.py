@@ -1,23 +1,20 @@
 """Load published checkpoint files without executing code from them."""
 
-import pickle
-import re
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any
 
 import torch
 
-from openvima.errors import CheckpointError
+from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.policies.build import outline_network
 from openvima.policies.differences import described, listed
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.config import config_from_published
 from openvima.policies.published.names import from_published, is_unused, to_published, without_prefix
+from openvima.policies.tensor_files import check_finite, read_archive
 
-_ZIP_START = b"PK\x03\x04"
 _MAX_LISTED = 20  # names that a message lists per kind of problem
 
 
@@ -37,56 +34,23 @@ def load_published(file: str | Path) -> PolicyNetwork:
             up to 20 of each.
     """
     file = Path(file)
-    weights, cfg = _contents(file, _unpickled(file))
+    if not file.exists() or file.is_dir():
+        raise CheckpointError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
+    try:
+        weights, cfg = _contents(file, read_archive(file))
+    except InputFileError as error:
+        raise CheckpointError(str(error)) from error
     try:
         network = outline_network(config_from_published(weights, cfg))
         _check_fit(network, weights)
         network.load_state_dict(from_published(weights), assign=True)
-    except CheckpointError as error:
+    except (CheckpointError, ConfigError) as error:
         raise CheckpointError(f"{file}: {error}") from error
+    except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
+        # Sizes within their limits can contradict each other in many ways.
+        raise CheckpointError(f"{file} describes no network: {error}") from error
+    check_finite(network.state_dict(), file)
     return network.eval()
-
-
-def _unpickled(file: Path) -> Any:  # Any: whatever the file holds
-    _check_archive(file)
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
-    except Exception as error:  # a malicious file can fail in any way
-        raise CheckpointError(f"{file} {_refusal(error)}") from error
-
-
-def _refusal(error: Exception) -> str:
-    wanted = re.search(r"GLOBAL (\S+)", str(error)) if isinstance(error, pickle.UnpicklingError) else None
-    if wanted:
-        return (
-            f"wants {wanted[1]} to be loaded, which could execute code. Nothing was executed. Published "
-            "checkpoints hold nothing but tensors and numbers; take the file from where they are published."
-        )
-    reason = (str(error).splitlines() or [""])[0]
-    return f"is a zip archive, but no torch checkpoint ({type(error).__name__}: {reason})."
-
-
-def _check_archive(file: Path) -> None:
-    """Reject incomplete or damaged zip archives; torch itself does not detect damaged weights."""
-    if not file.is_file():
-        raise CheckpointError(f"{file} is no file. A published checkpoint is a single file such as 2M.ckpt.")
-    if not zipfile.is_zipfile(file):
-        with file.open("rb") as stream:
-            is_cut = stream.read(len(_ZIP_START)) == _ZIP_START
-        raise CheckpointError(
-            f"{file} ends too early (interrupted download?). Download it again."
-            if is_cut
-            else f"{file} is no published checkpoint, which would be a torch zip archive."
-        )
-    try:
-        with zipfile.ZipFile(file) as archive:
-            damaged = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError) as error:
-        raise CheckpointError(f"{file} is damaged ({error}). Download it again.") from error
-    if damaged is not None:
-        raise CheckpointError(f"{file} is damaged (in its entry {damaged}). Download it again.")
 
 
 def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapping[str, object]]:
@@ -94,15 +58,19 @@ def _contents(file: Path, values: Any) -> tuple[Mapping[str, torch.Tensor], Mapp
     if not isinstance(values, Mapping) or any(
         not isinstance(values.get(name), Mapping) for name in ("state_dict", "cfg")
     ):
-        keys = list(map(str, values)) if isinstance(values, Mapping) else []
+        keys = [short(key).strip("'") for key in values] if isinstance(values, Mapping) else []
         found = listed("the keys", keys, limit=_MAX_LISTED) or [f"a {type(values).__name__}"]
         raise CheckpointError(
             f"{file} holds {found[0]}; a published checkpoint holds the mappings state_dict and cfg. "
             "The number of heads cannot be inferred from weights alone."
         )
     weights = values["state_dict"]
-    others = [str(name) for name, value in weights.items() if not isinstance(value, torch.Tensor)]
-    if others or not all(isinstance(name, str) for name in weights):
+    others = [
+        short(name).strip("'")
+        for name, value in weights.items()
+        if not isinstance(value, torch.Tensor) or not isinstance(name, str)
+    ]
+    if others:
         raise CheckpointError(
             f"{file}: state_dict holds more than weights: {', '.join(others[:_MAX_LISTED])}."
         )

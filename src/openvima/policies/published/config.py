@@ -3,11 +3,13 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from reprlib import repr as short
 
 import torch
 
 from openvima.errors import CheckpointError, ConfigError
 from openvima.policies.config import PolicyConfig
+from openvima.policies.limits import MAX_WIDTH
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
@@ -98,10 +100,12 @@ def _decoder(
 
 def _read_cfg(cfg: Mapping[str, object], names: tuple[str, ...]) -> dict[str, int]:
     given = {name: cfg.get(name) for name in names}
-    numbers = {name: value for name, value in given.items() if type(value) is int and value > 0}
+    numbers = {name: value for name, value in given.items() if type(value) is int and 0 < value <= MAX_WIDTH}
     if numbers.keys() != given.keys():
-        wrong = ", ".join(f"{name} {value!r}" for name, value in given.items() if name not in numbers)
-        raise CheckpointError(f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers above 0.")
+        wrong = ", ".join(f"{name} {short(value)}" for name, value in given.items() if name not in numbers)
+        raise CheckpointError(
+            f"cfg has {wrong}; it must hold {', '.join(names)} as whole numbers from 1 to {MAX_WIDTH}."
+        )
     return numbers
 
 

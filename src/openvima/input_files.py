@@ -1,0 +1,128 @@
+"""Bounded reading of files that others wrote: regular files only, limited size, plain values only."""
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import yaml
+
+from openvima.errors import InputFileError
+
+MAX_TEXT_BYTES = 256 * 1024  # of a config; the longest of the package has 10 kB
+_MAX_DEPTH = 32
+_MAX_INTEGER = 2**63
+_MAX_REASON = 200  # characters
+
+
+def open_regular(file: Path) -> BinaryIO:
+    """Open a regular file for reading. A FIFO or device is refused and never waited for.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        InputFileError: It is no regular file.
+    """
+    descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise InputFileError(f"{file} is no regular file, but a folder, pipe or device; give a regular file.")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Read a regular UTF-8 file of limited size.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        InputFileError: It is no regular file, longer than `max_bytes`, or no UTF-8.
+    """
+    with open_regular(file) as stream:
+        content = stream.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise InputFileError(f"{file} has more than {max_bytes} bytes, the most that is read.")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputFileError(f"{file} is no UTF-8 text ({error.reason} at byte {error.start}).") from None
+
+
+def read_yaml(file: Path) -> Any:  # Any: plain values
+    """Read a YAML file of plain values: mappings with text keys, lists, text, numbers, booleans and null.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+        InputFileError: It is no YAML, too large or nested too deep, or holds aliases or other values.
+    """
+    try:
+        values = yaml.load(read_text(file), _PlainLoader)
+    except InputFileError:
+        raise
+    except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError) as error:
+        raise InputFileError(f"{file} is no valid YAML: {_reason(error)}.") from None
+    return _checked(values, file)
+
+
+def read_json(file: Path) -> Any:  # Any: plain values
+    """Read a JSON file; see `read_yaml`."""
+    try:
+        values = json.loads(read_text(file))
+    except InputFileError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputFileError(f"{file} is no valid JSON: {_reason(error)}.") from None
+    return _checked(values, file)
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """A safe loader without aliases, which could multiply a file's size, and with limited nesting."""
+
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:  # Any: as in yaml
+        """Compose a node, unless it is an alias or lies too deep."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it holds an alias; write the value itself")
+        if self._depth >= _MAX_DEPTH:
+            raise yaml.YAMLError(f"it is nested deeper than {_MAX_DEPTH}")
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+def _checked(values: Any, file: Path) -> Any:  # Any: whatever the file holds
+    """Return the values, if all are plain and of limited size."""
+    level = [values]
+    for _ in range(_MAX_DEPTH + 1):
+        below = []
+        for value in level:
+            if isinstance(value, dict):
+                if others := [key for key in value if not isinstance(key, str)]:
+                    raise InputFileError(f"{file} has the key {_shown(others[0])}; keys must be text.")
+                below += value.values()
+            elif isinstance(value, list):
+                below += value
+            elif isinstance(value, int) and not -_MAX_INTEGER <= value < _MAX_INTEGER:
+                raise InputFileError(f"{file} holds a whole number beyond 64 bits.")
+            elif not isinstance(value, str | int | float | None):
+                raise InputFileError(
+                    f"{file} holds a {type(value).__name__}; allowed: mappings, lists, text, numbers, true, "
+                    "false, null."
+                )
+        if not below:
+            return values
+        level = below
+    raise InputFileError(f"{file} is nested deeper than {_MAX_DEPTH}.")
+
+
+def _shown(value: object) -> str:
+    """Quote a value, unless it could be long."""
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 2**63):
+        return repr(value)
+    return f"of type {type(value).__name__}"
+
+
+def _reason(error: Exception) -> str:
+    """One line about an error."""
+    return " ".join(str(error).split())[:_MAX_REASON].rstrip(".") or type(error).__name__

@@ -1,0 +1,224 @@
+"""Checkpoints made to harm: pipes, bombs, huge sizes, repeated values, weights that are not finite."""
+
+import os
+import pickle
+import struct
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+import yaml  # noqa: E402
+from safetensors.torch import load_file, save_file  # noqa: E402
+
+from openvima.errors import CheckpointError, ConfigError  # noqa: E402
+from openvima.policies.build import build_network, outline_network  # noqa: E402
+from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE  # noqa: E402
+from openvima.policies.published.checkpoint import load_published  # noqa: E402
+from published_policies import small_vima, write_published  # noqa: E402
+
+
+@pytest.fixture
+def saved(small_sizes, tmp_path) -> Path:
+    """A checkpoint folder of a small network."""
+    folder = tmp_path / "checkpoint"
+    save_checkpoint(build_network(small_sizes, seed=3), folder)
+    return folder
+
+
+@pytest.fixture
+def published(tmp_path) -> Path:
+    """A published file of a small network."""
+    return write_published(build_network(small_vima(), seed=0), tmp_path / "policy.ckpt")
+
+
+def repacked(file: Path, method: int = zipfile.ZIP_STORED, **replaced: bytes) -> Path:
+    """Write the archive again with some entries replaced, by the last part of their names."""
+    with zipfile.ZipFile(file) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(file, "w", method) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, replaced.get(Path(name).stem, content))
+    return file
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+@pytest.mark.parametrize("name", [CONFIG_FILE, WEIGHTS_FILE])
+def test_a_pipe_is_refused_and_not_waited_for(saved, name: str) -> None:
+    (saved / name).unlink()
+    os.mkfifo(saved / name)
+    with pytest.raises(CheckpointError, match=f"{name}.* no regular file"):
+        load_checkpoint(saved)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
+def test_a_published_file_that_is_a_pipe_or_device_is_refused(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe.ckpt")
+    for file in (tmp_path / "pipe.ckpt", Path("/dev/zero")):
+        with pytest.raises(CheckpointError, match="no regular file"):
+            load_published(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: &a [1]\nb: [*a, *a]\n", "holds an alias"),
+        ("a: {b: 1}\nc: {<<: {d: " + "[" * 40 + "]" * 40 + "}}\n", "nested deeper than 32"),
+        ("a: " + "[" * 5000 + "]" * 5000, "nested deeper than 32"),
+        ("a: " + "x" * 300_000, "more than 262144 bytes"),
+        ("a: 0x" + "f" * 9000, "whole number beyond 64 bits"),
+        ("a: 2026-13-77", "no valid YAML"),
+        ("a: 2026-11-22", "holds a date"),
+        ("? [1, 2]\n: 3\n", "no valid YAML|keys must be text"),
+        ("1: 3\n", "keys must be text"),
+        ("a: !!python/object/apply:os.mkdir [executed]\n", "no valid YAML"),
+        ("a: \udcff", "no UTF-8"),
+    ],
+    ids=[
+        "alias",
+        "merge",
+        "depth",
+        "size",
+        "integer",
+        "no date",
+        "date",
+        "list key",
+        "int key",
+        "code",
+        "bytes",
+    ],
+)
+def test_a_config_of_more_than_plain_values_is_refused(saved, text: str, message: str) -> None:
+    (saved / CONFIG_FILE).write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(saved)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("decoder.num_layers", 10**9, "between 0 and 128"),
+        ("decoder.width", 2**40, "between 0 and 16384"),
+        ("prompt.vocabulary_size", 10**12, "between 0 and 1000000"),
+        ("decoder.num_layers", "many", "whole number"),
+        ("decoder.dropout", float("nan"), "a number between"),
+        ("prompt.train_words", "yes", "true or false"),
+        ("prompt.text.num_heads", 0, "describes no network|does not fit"),
+        ("images.crop.width", [1] * 9000, "whole number"),
+    ],
+)
+def test_sizes_beyond_all_reason_are_refused_before_anything_is_built(
+    saved, path: str, value: object, message: str
+) -> None:
+    values = yaml.safe_load((saved / CONFIG_FILE).read_text())
+    *parents, last = path.split(".")
+    section = values["config"]
+    for name in parents:
+        section = section[name]
+    section[last] = value
+    (saved / CONFIG_FILE).write_text(yaml.safe_dump(values))
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_checkpoint(saved)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused(saved, published, value: float) -> None:
+    weights = load_file(saved / WEIGHTS_FILE)
+    weights["query"][..., 0] = value
+    save_file(weights, saved / WEIGHTS_FILE)
+    with pytest.raises(CheckpointError, match="not finite: query"):
+        load_checkpoint(saved)
+    contents = torch.load(published, weights_only=True)
+    contents["state_dict"]["policy.end_effector_encoder.weight"][0, 0] = value
+    torch.save(contents, published)
+    with pytest.raises(CheckpointError, match="not finite: "):
+        load_published(published)
+
+
+def test_a_huge_header_is_not_read(saved) -> None:
+    with (saved / WEIGHTS_FILE).open("r+b") as file:
+        file.write(struct.pack("<Q", 90_000_000))
+    with pytest.raises(CheckpointError, match="header has 90000000 bytes"):
+        load_checkpoint(saved)
+
+
+def test_a_compressed_archive_is_refused_before_it_is_unpacked(published) -> None:
+    repacked(published, zipfile.ZIP_DEFLATED, **{"0": bytes(10_000_000)})
+    with pytest.raises(CheckpointError, match="is a compressed zip archive"):
+        load_published(published)
+
+
+def test_overlapping_and_repeated_entries_are_refused(published) -> None:
+    with zipfile.ZipFile(published) as archive:
+        infos = archive.infolist()
+    with zipfile.ZipFile(published, "a") as archive:
+        largest = max(infos, key=lambda info: info.file_size)
+        for number in range(9000):  # each is the same bytes
+            copy = zipfile.ZipInfo(f"policy/data/{10_000 + number}")
+            for name in ("header_offset", "file_size", "compress_size", "CRC"):
+                setattr(copy, name, getattr(largest, name))
+            archive.filelist.append(copy)
+        archive._didModify = True
+    with pytest.raises(CheckpointError, match="overlapping zip entries"):
+        load_published(published)
+
+
+def test_a_repeated_entry_is_refused(published) -> None:
+    with (
+        zipfile.ZipFile(published, "a") as archive,
+        pytest.warns(UserWarning, match="Duplicate name"),
+    ):
+        archive.writestr(archive.namelist()[0], b"another pickle")
+    with pytest.raises(CheckpointError, match="several zip entries of one name"):
+        load_published(published)
+
+
+def test_tensors_that_repeat_one_number_are_refused(published) -> None:
+    contents = torch.load(published, weights_only=True)
+    words = "policy.prompt_embedding._embed_layer.weight"
+    contents["state_dict"][words] = torch.zeros(1).expand(500_000, 32)
+    torch.save(contents, published)
+    with pytest.raises(CheckpointError, match="repeat their numbers"):
+        load_published(published)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        # ((((…),),),) as a key: its hash takes exponential time, or more stack than there is.
+        (b"\x80\x02}" + b"(K\x01q\x00" + b"".join(b"h%c\x86q%c" % (n, n + 1) for n in range(60)), "tuple"),
+        (b"\x80\x02})" + b"\x85" * 200_000 + b"K\x01s.", "tuple of more than"),
+        (b"\x80\x02cbuiltins\nbytearray\n\x8a\x06\x00\x00\x00\x00\x00\x01\x85R.", "builtins.bytearray to be"),
+        (b"\x80\x02c_codecs\nencode\n.", "_codecs.encode to be loaded"),
+        (b"\x80\x02Nr\xff\xff\xff\xff.", "memo index"),
+        (pickle.dumps(os.mkdir, protocol=0), "opcode"),
+    ],
+    ids=["repeated", "deep", "bytearray", "encode", "memo", "protocol 0"],
+)
+def test_pickles_that_cost_more_than_they_hold_are_refused(published, content: bytes, message: str) -> None:
+    repacked(published, data=content)
+    with pytest.raises(CheckpointError, match=message):
+        load_published(published)
+
+
+def test_a_setting_of_a_published_file_beyond_all_reason_is_refused(published) -> None:
+    contents = torch.load(published, weights_only=True)
+    for name, value in (("embed_dim", 2**40), ("xf_n_layers", 10**9), ("sattn_n_heads", 10**300)):
+        hostile = {**contents, "cfg": {**contents["cfg"], name: value}}
+        torch.save(hostile, published)
+        with pytest.raises(CheckpointError) as caught:
+            load_published(published)
+        assert len(str(caught.value)) < 500
+
+
+def test_a_network_beyond_the_limits_is_not_outlined(small_sizes) -> None:
+    decoder = replace(small_sizes.decoder, num_layers=10**6)
+    with pytest.raises(ConfigError, match=r"policy\.decoder\.num_layers is 1000000"):
+        outline_network(replace(small_sizes, decoder=decoder))
