@@ -78,7 +78,13 @@ class Envelope:
 
 
 def mapped(path: Path) -> memoryview:
-    """Map a file into memory; its bytes are read when they are touched."""
+    """Map a file into memory; its bytes are read when they are touched.
+
+    Raises:
+        FileNotFoundError: There is no regular file; to open a pipe would block.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(path)
     with pa.memory_map(str(path)) as file:  # the buffer keeps the mapping
         return memoryview(file.read_buffer())
 

@@ -2,9 +2,10 @@
 
 import itertools
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_origin
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSIO
 from openvima.errors import ShardError, unknown_name
 
 _METADATA_KEY = b"openvima"
+_WORD = re.compile(r"\w[\w .+-]{0,100}")
 _NAMES = COLUMNS.names
 _TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
 # Texts, records and single numbers are made at once: each call into Arrow costs some microseconds.
@@ -104,9 +106,16 @@ class ShardInfo:
                 raise ShardError("it is an Arrow file, but holds no demonstrations of this package.")
             if written_as != SCHEMA_VERSION:
                 raise ShardError(f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}.")
-            return ShardInfo(**fields)
+            info = ShardInfo(**fields)
+            for name, kind in ShardInfo.__annotations__.items():
+                if not isinstance(value := getattr(info, name), get_origin(kind) or kind):
+                    raise TypeError(f"{name} is {value!r:.80}")
         except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, TypeError) as error:
             raise ShardError(f"what it says of itself is damaged ({error}).") from None
+        for name in ("task", "level", "domain", "assets"):  # of which names of files are made
+            if not _WORD.fullmatch(getattr(info, name)):
+                raise ShardError(f"its {name} is {getattr(info, name)!r:.80}, which is no plain name.")
+        return info
 
 
 def encode(

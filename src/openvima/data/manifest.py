@@ -2,8 +2,9 @@
 
 import hashlib
 import json
+import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -49,7 +50,11 @@ _TYPES: dict[str, type] = {
     "content_hash": str,
     **dict.fromkeys(("counts", "tasks", "index", "shards"), dict),
 }
-_SHARD_KEYS = ("episodes", "steps", "bytes", "sha256", "head_bytes", "tail_bytes", "frame_crc32")
+_SHARD_KEYS: dict[str, type] = {
+    **dict.fromkeys(("episodes", "steps", "bytes", "head_bytes", "tail_bytes", "frame_crc32"), int),
+    "sha256": str,
+}
+_SHARD_NAME = re.compile(r"\w[\w.+-]{0,200}\.arrow")
 
 _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
 # What the index and the counts need of each shard.
@@ -218,6 +223,7 @@ def parse_manifest(content: bytes) -> dict[str, Any]:  # Any: JSON
         raise DatasetError("it is damaged or was edited (its checksum is wrong)")
     if lacking := _lacking(manifest):
         raise DatasetError(f"it lacks {', '.join(lacking)}, or has other things there")
+    _check_names(manifest["shards"])
     return manifest
 
 
@@ -235,16 +241,67 @@ def parse_index(content: bytes, manifest: Mapping[str, Any]) -> pa.Table:  # Any
         raise DatasetError(f"it is no Parquet file ({error})") from None
     if not index.schema.equals(INDEX_SCHEMA):
         raise DatasetError(f"it has other columns than schema version {SCHEMA_VERSION} asks for")
+    _check_rows(index, manifest["shards"])
     return index
 
 
 def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
     """Name what a manifest lacks that something else than this package wrote."""
     lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
-    if not lacking:
-        entries = manifest["shards"].items()
-        lacking = [f"{key} of {name}" for name, entry in entries for key in _SHARD_KEYS if key not in entry]
-    return lacking
+    if lacking:
+        return lacking
+    return [
+        f"{key} of {name}"
+        for name, entry in manifest["shards"].items()
+        for key, kind in _SHARD_KEYS.items()
+        if not isinstance(entry, dict) or not isinstance(entry.get(key), kind)
+    ]
+
+
+def _check_names(names: Iterable[str]) -> None:
+    """Refuse shards that are not plain names of files inside the folder."""
+    for name in names:
+        if not _SHARD_NAME.fullmatch(name):
+            raise DatasetError(f"it names the shard {name!r:.80}, which is no plain file name like a.arrow")
+
+
+def _check_rows(index: pa.Table, shards: Mapping[str, Any]) -> None:  # Any: JSON
+    """Refuse an index of shards or rows that the manifest does not have."""
+    names = index.column("shard").combine_chunks().dictionary_encode()
+    if unknown := sorted(set(names.dictionary.to_pylist()) - shards.keys()):
+        raise DatasetError(f"it names the shard {unknown[0]!r:.80}, which the manifest does not list")
+    counts = np.array([shards[name]["episodes"] for name in names.dictionary.to_pylist()], np.int64)
+    rows = index.column("row").to_numpy()
+    if ((rows < 0) | (rows >= counts[names.indices.to_numpy()])).any():
+        raise DatasetError("it names rows that its shards do not have, says the manifest")
+
+
+def is_inside(path: Path) -> bool:
+    """Whether a file is a regular one, and no link that leads out of its folder."""
+    return path.is_file() and path.resolve().is_relative_to(path.parent.resolve())
+
+
+def check_failed(folder: Path) -> None:
+    """Refuse a folder whose `failed` is a link out of it, for its files are written and deleted too.
+
+    Raises:
+        DatasetError: It is.
+    """
+    failed = folder / FAILED_FOLDER
+    if not failed.resolve().is_relative_to(folder.resolve()):
+        raise DatasetError(f"{failed} is a link that leads out of the folder. Delete it.")
+
+
+def read_inside(path: Path) -> bytes:
+    """Read a manifest or an index.
+
+    Raises:
+        FileNotFoundError: There is none.
+        DatasetError: It is no regular file, or a link out of its folder; the message is the bare cause.
+    """
+    if not is_inside(path) and (path.exists() or path.is_symlink()):
+        raise DatasetError("it is no regular file, or a link that leads out of the folder")
+    return path.read_bytes()
 
 
 def fingerprint(path: Path) -> dict[str, Any]:  # Any: a number and a text

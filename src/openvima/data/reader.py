@@ -9,7 +9,14 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.data.checksums import Envelope, Span
-from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, parse_index, parse_manifest
+from openvima.data.manifest import (
+    INDEX_NAME,
+    MANIFEST_NAME,
+    is_inside,
+    parse_index,
+    parse_manifest,
+    read_inside,
+)
 from openvima.data.records import Demonstration, Step
 from openvima.data.schema import VIEWS
 from openvima.data.shard import Shard, remedy
@@ -118,10 +125,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:  # Any: JSON
         DatasetError: There is none, or it is damaged or of another version.
     """
     path = folder / MANIFEST_NAME
-    if not path.is_file():
-        raise DatasetError(why_no_data_set(folder))
     try:
-        return parse_manifest(path.read_bytes())
+        return parse_manifest(read_inside(path))
+    except (FileNotFoundError, NotADirectoryError):
+        raise DatasetError(why_no_data_set(folder)) from None
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}. {remedy(folder)}") from None
 
@@ -173,7 +180,7 @@ def _reopened(path: Path, tasks: tuple[str, ...] | None) -> Dataset:
 def _read_index(folder: Path, manifest: dict[str, Any]) -> pa.Table:  # Any: JSON
     path = folder / INDEX_NAME
     try:
-        return parse_index(path.read_bytes(), manifest)
+        return parse_index(read_inside(path), manifest)
     except FileNotFoundError:
         raise DatasetError(f"{path} is missing. {remedy(folder)}") from None
     except DatasetError as error:
@@ -186,3 +193,6 @@ def _check_shards(folder: Path, names: Sequence[str]) -> None:
         raise DatasetError(
             f"{folder} lacks {len(missing)} of {len(names)} shards, first {missing[0]}. {remedy(folder)}"
         )
+    outside = [name for name in names if not is_inside(folder / name)]
+    if outside:
+        raise DatasetError(f"{folder / outside[0]} is a link that leads out of the folder. {remedy(folder)}")

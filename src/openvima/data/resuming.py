@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME, check_failed
 from openvima.data.planning import COMMAND, Block, GenerateConfig
 from openvima.data.reader import read_manifest
 from openvima.data.shard import Shard
@@ -41,6 +41,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         DatasetError: It holds shards of other settings or versions, or more episodes than are asked for.
         ShardError: A shard is damaged.
     """
+    check_failed(config.out)
     _check_origin(config.out)
     wanted = {block.path.name: block for block in blocks}
     for path in sorted(config.out.glob("*.arrow")):
@@ -66,6 +67,7 @@ def check_folder(config: GenerateConfig, blocks: Sequence[Block]) -> None:
 
 def clear(folder: Path) -> None:
     """Delete a data set, its failed episodes too; other files stay."""
+    check_failed(folder)
     for part in (folder, folder / FAILED_FOLDER):
         names = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
         for path in [*(part / name for name in names), *part.glob("*.arrow")]:

@@ -8,6 +8,7 @@ from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
     ShardSummary,
+    check_failed,
     compose,
     joint_hash,
 )
@@ -37,6 +38,7 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
         WorkerError: A worker died.
     """
     folder = Path(folder)
+    check_failed(folder)
     found = _verify(folder, folder, config, report)
     failed = folder / FAILED_FOLDER
     if (failed / MANIFEST_NAME).is_file() or any(failed.glob("*.arrow")):

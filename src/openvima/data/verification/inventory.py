@@ -16,6 +16,7 @@ from openvima.data.manifest import (
     ORIGIN_TYPES,
     parse_index,
     parse_manifest,
+    read_inside,
 )
 from openvima.data.planning import COMMAND
 from openvima.data.reader import why_no_data_set
@@ -101,14 +102,14 @@ def take_inventory(folder: Path) -> Inventory:
     manifest, index = None, None
     found = Inventory(folder, None, None, (), ())
     try:
-        manifest = parse_manifest((folder / MANIFEST_NAME).read_bytes())
+        manifest = parse_manifest(read_inside(folder / MANIFEST_NAME))
     except FileNotFoundError:
         unfinished = "If the command that wrote it was stopped, repeat it; otherwise"
         problems.append(Problem(MANIFEST_NAME, "it is missing", f"{unfinished} {found.remedy}"))
     except DatasetError as error:
         problems.append(Problem(MANIFEST_NAME, str(error), found.remedy))
     try:
-        index_bytes = (folder / INDEX_NAME).read_bytes()
+        index_bytes = read_inside(folder / INDEX_NAME)
         index = None if manifest is None else parse_index(index_bytes, manifest)
     except FileNotFoundError:
         problems.append(Problem(INDEX_NAME, "it is missing", found.remedy))
@@ -125,9 +126,9 @@ def take_inventory(folder: Path) -> Inventory:
 def _doubtful(path: Path) -> dict[str, Any] | None:  # Any: JSON
     """Read the origin in a damaged manifest, if it is intact."""
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = json.loads(read_inside(path))
         origin = {key: manifest[key] for key in ORIGIN_TYPES}
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # DatasetError is a ValueError
         return None
     is_valid = all(isinstance(origin[key], kind) for key, kind in ORIGIN_TYPES.items())
     return origin if is_valid else None

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from openvima.data.checksums import Envelope, mapped, spans_of
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import ShardSummary, fingerprint, summarise
+from openvima.data.manifest import ShardSummary, fingerprint, is_inside, summarise
 from openvima.data.shard import Shard, remedy
 from openvima.data.verification.episodes import faults
 from openvima.data.verification.findings import Problem, by_cause
@@ -101,6 +101,9 @@ def _byte_faults(task: ShardTask) -> Iterator[str]:
     """Yield damage of the bytes, with its place."""
     if not task.path.is_file():
         yield "it is missing"
+        return
+    if not is_inside(task.path):
+        yield "it is a link that leads out of the folder"
         return
     if task.entry is None:
         return
