@@ -1,5 +1,6 @@
 """Files and folders are whole under their name, whatever happens while they are written."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from openvima.atomic_io import atomic_folder, remove_stale, restore_folder
+from openvima.atomic_io import atomic_folder, atomic_write, remove_stale, restore_folder
 
 KILLED = 9
 # Writes a folder and dies at the n-th time that a folder is to be renamed or deleted.
@@ -107,3 +108,19 @@ def test_files_of_processes_that_still_run_are_not_abandoned(tmp_path: Path) -> 
         (tmp_path / name).touch()
     remove_stale(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {names[0], names[2]}
+
+
+def test_an_error_without_a_name_names_what_was_to_be_written(tmp_path: Path) -> None:
+    for write_it in (atomic_write, atomic_folder):
+        with pytest.raises(OSError, match="No space left") as found, write_it(tmp_path / "name"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        assert found.value.filename == str(tmp_path / "name")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only POSIX tells which processes run")
+def test_a_folder_that_a_killed_writer_began_goes_with_the_next(tmp_path: Path) -> None:
+    (tmp_path / f".folder.{10**30}.tmp").mkdir()
+    (tmp_path / f".other.{10**30}.tmp").mkdir()
+    write(tmp_path / "folder", "new")
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", f".other.{10**30}.tmp"}

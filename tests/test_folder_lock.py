@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -11,41 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from lock_holders import holding
 from openvima import folder_lock as module
 from openvima.errors import FolderLockedError, StorageError
 from openvima.folder_lock import LOCK_NAME, folder_lock
-
-HOLDER = """
-import sys, time
-from pathlib import Path
-from openvima.folder_lock import folder_lock
-
-part = (int(sys.argv[2]), int(sys.argv[3])) if len(sys.argv) > 2 else None
-with folder_lock(Path(sys.argv[1]), part):
-    print("locked", flush=True)
-    sys.stdin.read()
-"""
-
-
-@pytest.fixture
-def holder():
-    """Start a process that holds a lock until its standard input is closed."""
-    started: list[subprocess.Popen] = []
-
-    def start(folder: Path, *part: int) -> subprocess.Popen:
-        words = [sys.executable, "-c", HOLDER, str(folder), *map(str, part)]
-        process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        started.append(process)
-        assert process.stdout is not None
-        assert process.stdout.readline() == "locked\n"
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
-        for stream in (process.stdin, process.stdout):
-            stream.close()
 
 
 def write_owner(folder: Path, host: str, process: int, **changes: object) -> Path:
@@ -58,24 +26,28 @@ def write_owner(folder: Path, host: str, process: int, **changes: object) -> Pat
 def test_nothing_of_a_lock_stays(tmp_path) -> None:
     with folder_lock(tmp_path / "made"):
         assert (tmp_path / "made" / LOCK_NAME).is_file()
-    assert not list((tmp_path / "made").iterdir())
-
-
-def test_a_second_writer_is_refused_by_name_until_the_first_ends(tmp_path, holder) -> None:
-    process = holder(tmp_path)
-    with pytest.raises(FolderLockedError, match=rf"written to by process {process.pid} on .* 0 min") as found:
-        folder_lock(tmp_path).__enter__()
-    assert "\n" not in str(found.value)
-    process.stdin.close()
-    with folder_lock(tmp_path, timeout_s=10):
+    assert not (tmp_path / "made").exists()
+    with folder_lock(tmp_path):
         pass
     assert not list(tmp_path.iterdir())
 
 
-def test_the_lock_of_a_killed_writer_is_free_and_its_files_go(tmp_path, holder) -> None:
-    process = holder(tmp_path)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+def test_a_second_writer_is_refused_by_name_until_the_first_ends(tmp_path) -> None:
+    with holding(tmp_path) as process:
+        with pytest.raises(FolderLockedError, match=rf"written to by process {process.pid} on .* 0 min") as e:
+            folder_lock(tmp_path).__enter__()
+        assert "\n" not in str(e.value)
+        assert process.stdin is not None
+        process.stdin.close()
+        with folder_lock(tmp_path, timeout_s=10):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_lock_of_a_killed_writer_is_free_and_its_files_go(tmp_path) -> None:
+    with holding(tmp_path) as process:
+        process.kill()
+        process.wait()
     (tmp_path / f".dataset.json.{process.pid}.tmp").write_text("half")
     (tmp_path / f".checkpoint.{process.pid}.tmp").mkdir()
     assert (tmp_path / LOCK_NAME).exists()
@@ -85,15 +57,14 @@ def test_the_lock_of_a_killed_writer_is_free_and_its_files_go(tmp_path, holder) 
     assert not list(tmp_path.iterdir())
 
 
-def test_disjoint_parts_have_a_writer_each_and_exclude_one_of_the_whole(tmp_path, holder) -> None:
-    first = holder(tmp_path, 0, 3)
-    with folder_lock(tmp_path, (3, 5)):
-        pass
-    for part in ((2, 4), None):
-        with pytest.raises(FolderLockedError, match=f"process {first.pid}"):
-            folder_lock(tmp_path, part).__enter__()
-    first.stdin.close()
-    with folder_lock(tmp_path, timeout_s=10):
+def test_disjoint_parts_have_a_writer_each_and_exclude_one_of_the_whole(tmp_path) -> None:
+    with holding(tmp_path, 0, 3) as first:
+        with folder_lock(tmp_path, (3, 5)):
+            pass
+        for part in ((2, 4), None):
+            with pytest.raises(FolderLockedError, match=f"process {first.pid}"):
+                folder_lock(tmp_path, part).__enter__()
+    with folder_lock(tmp_path):
         pass
 
 
@@ -105,7 +76,7 @@ def test_threads_of_one_process_exclude_each_other(tmp_path) -> None:
             folder_lock(tmp_path / ".." / tmp_path.name).__enter__()
 
 
-def test_a_forked_child_neither_keeps_nor_releases_the_lock(tmp_path, holder) -> None:
+def test_a_forked_child_neither_keeps_nor_releases_the_lock(tmp_path) -> None:
     context = multiprocessing.get_context("fork")
     go_on = context.Event()
     with folder_lock(tmp_path):
@@ -188,4 +159,4 @@ def test_one_of_many_processes_gets_in_at_a_time(tmp_path) -> None:
     folder = tmp_path / "folder"
     workers = [subprocess.Popen([sys.executable, "-c", script, str(folder)]) for _ in range(2)]
     assert [worker.wait(60) for worker in workers] == [0, 0]
-    assert not list(folder.iterdir())
+    assert not list(folder.glob("*"))

@@ -1,6 +1,7 @@
 """Atomic writes of files and folders."""
 
 import contextlib
+import glob
 import os
 import shutil
 from collections.abc import Iterator
@@ -28,6 +29,9 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
         _sync_folder(path.parent)
+    except OSError as error:
+        _name(error, path, temporary)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -65,6 +69,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     restore_folder(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    remove_stale(path.parent, path.name)
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     try:
@@ -77,6 +82,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         _sync_folder(path.parent)
         shutil.rmtree(backup, ignore_errors=True)
+    except OSError as error:
+        _name(error, path, temporary)
+        raise
     finally:
         restore_folder(path)
         shutil.rmtree(temporary, ignore_errors=True)
@@ -90,11 +98,16 @@ def restore_folder(path: Path) -> None:
         os.replace(backup, path)
 
 
-def remove_stale(folder: Path) -> None:
-    """Delete the temporary files and folders that killed writers left in a folder; on POSIX systems only."""
+def remove_stale(folder: Path, name: str | None = None) -> None:
+    """Delete the temporary files and folders that killed writers left in a folder; on POSIX systems only.
+
+    Args:
+        folder: The folder.
+        name: Delete only those of this file or folder.
+    """
     if os.name != "posix":
         return
-    for path in folder.glob(".*.tmp"):
+    for path in folder.glob(".*.tmp" if name is None else f".{glob.escape(name)}.*.tmp"):
         process = path.name.split(".")[-2]
         if not process.isdecimal() or process_runs(int(process)):
             continue
@@ -113,6 +126,12 @@ def process_runs(process_id: int) -> bool:
     except PermissionError:  # another user's process
         pass
     return True
+
+
+def _name(error: OSError, path: Path, temporary: Path) -> None:
+    """Let an error that names no file, such as that of a full disk, or a temporary one name the final one."""
+    if error.errno and (error.filename is None or str(error.filename).startswith(str(temporary))):
+        error.filename = str(path)
 
 
 def _backup_path(path: Path) -> Path:

@@ -69,7 +69,8 @@ class Owner:
 def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.0) -> Iterator[None]:
     """Hold the lock of a folder while the block runs.
 
-    The lock on the whole folder also deletes the temporary files that killed writers left in it.
+    The lock on the whole folder also deletes the temporary files that killed writers left in it. A folder
+    that the lock created is deleted if it is empty at the end.
 
     Args:
         folder: The folder; it is created if missing.
@@ -82,7 +83,7 @@ def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.
         StorageError: The lock file is no regular file.
         OSError: The folder cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    is_new = not folder.exists()
     path = folder.resolve() / LOCK_NAME
     own = Owner(_host(), os.getpid(), _command(), time.time(), part or (0, _END))
     deadline = time.monotonic() + timeout_s
@@ -96,6 +97,11 @@ def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.
                     f"{folder} is being written to by {error}. Wait for it, stop it, or give another folder."
                 ) from None
             time.sleep(_POLL_S)
+        except OSError as error:
+            if error.errno != errno.EROFS:
+                raise
+            yield  # nobody can write to a read-only file system
+            return
     stop = threading.Event()
     threading.Thread(target=_beat, args=(_owner_file(path, own), stop), daemon=True).start()
     try:
@@ -105,6 +111,9 @@ def folder_lock(folder: Path, part: Part | None = None, *, timeout_s: float = 0.
     finally:
         stop.set()
         _release(path, own, descriptor)
+        if is_new:
+            with contextlib.suppress(OSError):  # it is not empty
+                folder.rmdir()
 
 
 def is_lock_file(path: Path) -> bool:
@@ -129,12 +138,16 @@ def _acquire(path: Path, own: Owner) -> int:
                 raise FolderLockedError(" and ".join(map(str, owners)) or "another process")
             if owners := _alive(path, own, has_lock=bool(is_locked)):
                 raise FolderLockedError(" and ".join(map(str, owners)))
-            atomic_write_file(_owner_file(path, own), json.dumps(asdict(own)))
         except BaseException:
             os.close(descriptor)
             raise
         _held.add(path)
-        return descriptor
+    try:
+        atomic_write_file(_owner_file(path, own), json.dumps(asdict(own)))
+    except BaseException:
+        _release(path, own, descriptor)
+        raise
+    return descriptor
 
 
 def _release(path: Path, own: Owner, descriptor: int) -> None:
@@ -153,7 +166,11 @@ def _locked_file(path: Path, part: Part) -> tuple[int, bool | None]:
     while True:
         if path.is_symlink() or (path.exists() and not path.is_file()):
             raise StorageError(f"{path} is no regular file, so the folder cannot be locked; delete it.")
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        except FileNotFoundError:  # another process deletes the folder that it created
+            continue
         try:
             is_locked, mine = _lock(descriptor, part), os.fstat(descriptor)
             with contextlib.suppress(FileNotFoundError):

@@ -17,7 +17,10 @@ from openvima.data.resuming import (
     storage_error,
 )
 from openvima.errors import ConfigError, DatasetError
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import Counts, imap_with_progress
+
+FINISH_S = 600.0  # to wait for another process that writes index and manifest
 
 
 def generate(config: GenerateConfig, report: Report | None = None) -> Path:
@@ -37,6 +40,7 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
         DatasetError: The folder holds a data set of other settings or versions, or a larger one.
         ShardError: A shard in the folder is damaged.
         StorageError: The disk is full, or the folder cannot be written to.
+        FolderLockedError: Another process writes to the folder, or to the same shards of it.
         WorkerError: A worker died.
         OracleError: The oracle solved too few episodes.
     """
@@ -45,21 +49,20 @@ def generate(config: GenerateConfig, report: Report | None = None) -> Path:
     blocks = plan(config)
     own = _own(config, blocks)
     config.out.mkdir(parents=True, exist_ok=True)
-    if config.force:
-        clear(config.out)
-    check_folder(config, blocks)
-    remove_leftovers(config, own)
-    missing = [block for block in own if not is_done(block)]
-    missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
     try:
-        _write(config, missing, reporter(report, own, missing))
-        _finish(config, blocks, own)
+        with folder_lock(config.out, config.shard_range):
+            if config.force:
+                clear(config.out)
+            check_folder(config, blocks)
+            _write_missing(config, own, report)
+            if config.shard_range is None and not is_finished(config.out):
+                finish(config, blocks)
+        if config.shard_range is not None:
+            _finish_with_others(config, blocks)
     except BrokenPipeError:  # of `report`
         raise
     except OSError as error:
         raise storage_error(config.out, [block.path for block in blocks], error) from error
-    finally:
-        remove_leftovers(config, own)
     return config.out
 
 
@@ -79,13 +82,35 @@ def _own(config: GenerateConfig, blocks: Sequence[Block]) -> Sequence[Block]:
     return blocks[start:stop]
 
 
-def _write(config: GenerateConfig, missing: Sequence[Block], watch: Callable[[Counts], None]) -> None:
+def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report | None) -> None:
+    """Write those shards of this run that are not there.
+
+    Raises:
+        DatasetError: A shard is not where it should be.
+    """
+    _remove_leftovers(config, own)
+    missing = [block for block in own if not is_done(block)]
+    missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
+    watch = reporter(report, own, missing)
     if not missing:
         return
     for folder in (config.out, config.out / FAILED_FOLDER):
         (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
-    for _ in _engine(config, missing, watch):
-        pass  # a block's result is its file
+    try:
+        for _ in _engine(config, missing, watch):
+            pass  # a block's result is its file
+    finally:
+        _remove_leftovers(config, own)
+    lost = [block.path for block in own if not block.path.is_file()]
+    if lost:
+        raise DatasetError(
+            f"{lost[0]} was written on another machine and is not to be seen on this one. "
+            "Give an --out that all machines of the cluster share."
+        )
+
+
+def _remove_leftovers(config: GenerateConfig, own: Sequence[Block]) -> None:
+    remove_leftovers(config.out, None if config.shard_range is None else [block.path for block in own])
 
 
 def _engine(
@@ -102,23 +127,13 @@ def _engine(
     )
 
 
-def _finish(config: GenerateConfig, blocks: Sequence[Block], own: Sequence[Block]) -> None:
-    """Write index and manifest if all shards are there, also those of other runs.
-
-    Raises:
-        DatasetError: A shard of this run is not where it should be.
-    """
-    lost = [block.path for block in own if not block.path.is_file()]
-    if lost:
-        raise DatasetError(
-            f"{lost[0]} was written on another machine and is not to be seen on this one. "
-            "Give an --out that all machines of the cluster share."
-        )
-    if is_finished(config.out) or not all(block.path.is_file() for block in blocks):
+def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+    """Write index and manifest if the shards of all ranges are there."""
+    if is_finished(config.out) or not all(is_done(block) for block in blocks):
         return
-    if len(own) < len(blocks) and not all(is_done(block) for block in blocks):
-        return
-    finish(config, blocks)
+    with folder_lock(config.out, timeout_s=FINISH_S):  # others may have come to the same conclusion
+        if not is_finished(config.out):
+            finish(config, blocks)
 
 
 def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:

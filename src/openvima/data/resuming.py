@@ -12,6 +12,7 @@ from openvima.data.shard import Shard
 from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -69,20 +70,22 @@ def clear(folder: Path) -> None:
     """Delete a data set, its failed episodes too; other files stay."""
     check_failed(folder)
     for part in (folder, folder / FAILED_FOLDER):
-        names = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
-        for path in [*(part / name for name in names), *part.glob("*.arrow")]:
+        for path in [*(part / name for name in _NAMES), *part.glob("*.arrow")]:
             path.unlink(missing_ok=True)
 
 
-def remove_leftovers(config: GenerateConfig, blocks: Iterable[Block]) -> None:
-    """Delete what killed writers left of these blocks; those of others may still be at work."""
-    names = {block.path.name for block in blocks}
-    if config.shard_range is None:
-        names |= {MANIFEST_NAME, INDEX_NAME}
-    for folder in (config.out, config.out / FAILED_FOLDER):
-        for file in folder.glob(".*.tmp"):  # .NAME.PROCESS.tmp
-            if file.name[1:].rsplit(".", 2)[0] in names:
-                file.unlink(missing_ok=True)
+def remove_leftovers(folder: Path, shards: Iterable[Path] | None = None) -> None:
+    """Delete what killed writers, perhaps on other machines, left in a folder that is locked.
+
+    Args:
+        folder: The data folder; its failed episodes count too.
+        shards: The locked shards; None means the whole folder.
+    """
+    names = None if shards is None else {path.name for path in shards}
+    for file in (*folder.glob(".*.tmp"), *(folder / FAILED_FOLDER).glob(".*.tmp")):  # .NAME.PROCESS.tmp
+        name = file.name[1:].rsplit(".", 2)[0]
+        if name in names if names is not None else name in _NAMES or name.endswith(".arrow"):
+            file.unlink(missing_ok=True)
 
 
 def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> StorageError:

@@ -11,7 +11,6 @@ import pyarrow as pa
 from openvima.atomic_io import atomic_write
 from openvima.data.encoding import ShardInfo, Skipped, encode
 from openvima.data.image_layout import ImageBuffers
-from openvima.data.manifest import BROKEN_NAME, INDEX_NAME, MANIFEST_NAME
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
 
@@ -23,7 +22,7 @@ class ShardWriter:
     """Writes one shard; a context manager.
 
     The file gets its name when the block ends without an exception, so a file with that name is whole. After
-    an exception nothing is left; after a crash a hidden temporary file is, which `remove_leftovers` finds.
+    an exception nothing is left; after a crash a hidden temporary file is, which the next run deletes.
 
     Args:
         path: Final name of the shard.
@@ -91,10 +90,3 @@ class _Sink:
 
     def close(self) -> None:
         """Nothing, likewise."""
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete what writers that were killed have left in a folder."""
-    for name in ("*.arrow", INDEX_NAME, MANIFEST_NAME, BROKEN_NAME):
-        for file in folder.glob(f".{name}.*.tmp"):
-            file.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
+from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.video.encoder import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
@@ -90,7 +91,7 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     if not len(dataset):
         raise DatasetError(f"{config.data} has no episodes to export.")
     _check_out(config)
-    with atomic_folder(config.out) as folder:
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
             survey(dataset),
@@ -138,7 +139,7 @@ def _lengths(lists: pa.ListArray) -> np.ndarray:
 
 def _check_out(config: LerobotConfig) -> None:
     out = config.out
-    is_taken = any(out.iterdir()) if out.is_dir() else out.exists()
+    is_taken = not all(map(is_lock_file, out.iterdir())) if out.is_dir() else out.exists()
     if is_taken and not config.force:
         raise DatasetError(f"{out} is there already; give another folder, or --force to replace it.")
     if is_taken and not (out / layout.INFO_PATH).is_file():

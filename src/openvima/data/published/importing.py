@@ -19,10 +19,11 @@ from openvima.data.published.reader import (
     open_source,
     read_place,
 )
-from openvima.data.resuming import FULL_DISK, clear, is_finished, storage_error
+from openvima.data.resuming import FULL_DISK, clear, is_finished, remove_leftovers, storage_error
 from openvima.data.shard import Shard
-from openvima.data.writer import ShardWriter, remove_leftovers
+from openvima.data.writer import ShardWriter
 from openvima.errors import ConfigError, DatasetError
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import MAX_WORKERS, Counts, imap_with_progress
 
 COMMAND = "openvima data import"
@@ -108,13 +109,21 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
             set.
         ConfigError: The settings do not fit.
         StorageError: The disk is full. Whole shards are kept.
+        FolderLockedError: Another process writes to the folder.
         WorkerError: A worker died. Whole shards are kept, and the same command goes on from there.
     """
     tasks = None if config.tasks == ("all",) else config.tasks
     data = PublishedData(config.source, tasks=tasks, split=config.split)
     blocks = plan(config, data)
     _probe(blocks)
-    config.out.mkdir(parents=True, exist_ok=True)
+    with folder_lock(config.out):
+        _import(config, data, blocks, report)
+    return config.out
+
+
+def _import(
+    config: ImportConfig, data: PublishedData, blocks: Sequence[Block], report: Report | None
+) -> None:
     if config.force:
         clear(config.out)
     _check_folder(config.out, blocks)
@@ -136,7 +145,6 @@ def import_published(config: ImportConfig, report: Report | None = None) -> Path
         remove_leftovers(config.out)
     if not is_finished(config.out):
         _finish(config, data, blocks, [entry for block in blocks for entry in broken[block.path] or ()])
-    return config.out
 
 
 def plan(config: ImportConfig, data: PublishedData) -> list[Block]:

@@ -6,6 +6,7 @@ from typing import Any
 
 from openvima.data.manifest import BROKEN_NAME, CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.errors import DatasetError
+from openvima.folder_lock import is_lock_file
 
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
 
@@ -30,7 +31,7 @@ def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:
             raise DatasetError(f"{out} lies in the source {source}, which must stay as it is. Give another.")
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file. Give the name of a folder.")
-    if not out.exists() or not any(out.iterdir()):
+    if not out.exists() or all(map(is_lock_file, out.iterdir())):
         return
     if not force:
         raise DatasetError(f"{out} is not empty. Give another folder, or --force to replace it.")
@@ -60,8 +61,7 @@ def _joined(words: Sequence[str | None], between: str) -> str:
 
 def _holds_data_sets_only(folder: Path) -> bool:
     """Whether a folder is a data set, or holds some, and nothing besides."""
+    entries = [entry for entry in folder.iterdir() if not is_lock_file(entry)]
     if (folder / MANIFEST_NAME).is_file():
-        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in folder.iterdir())
-    return all(
-        (entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in folder.iterdir()
-    )
+        return all(entry.suffix == ".arrow" or entry.name in _NAMES for entry in entries)
+    return all((entry / MANIFEST_NAME).is_file() and _holds_data_sets_only(entry) for entry in entries)

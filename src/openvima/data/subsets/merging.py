@@ -16,6 +16,7 @@ from openvima.data.reader import Dataset
 from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, provenance
 from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shards
 from openvima.errors import DatasetError, unknown_name
+from openvima.folder_lock import folder_lock
 
 Duplicates = Literal["refuse", "skip"]
 Report = Callable[[int, int, str], None]
@@ -92,7 +93,7 @@ def merge(config: MergeConfig, *, report: Report | None = None) -> Path:
         "compression": config.compression,
     }
     manifests = [dataset.manifest for dataset in datasets]
-    with atomic_folder(config.out) as folder:
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
         shards = _plan(parts, folder, config.compression)
         write_shards(shards, config.workers, report)
         finish_folder(

@@ -14,6 +14,7 @@ from openvima.data.subsets.choosing import Splits, assign_splits, select_sample
 from openvima.data.subsets.folders import check_out, provenance
 from openvima.data.subsets.shards import NewShard, plan_shards, write_shards
 from openvima.errors import DatasetError
+from openvima.folder_lock import folder_lock
 
 Report = Callable[[int, int, str], None]
 
@@ -75,7 +76,7 @@ def sample(config: SubsetConfig, fraction: float, *, report: Report | None = Non
         dataset.index, config.tasks, dataset.path
     )
     settings = {**config.settings(dataset), "fraction": fraction}
-    with atomic_folder(config.out) as folder:
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
         _write([_Subset(folder, chosen, "openvima data sample", settings)], dataset, config, report)
     return config.out
 
@@ -109,7 +110,7 @@ def split(config: SubsetConfig, splits: Splits, *, report: Report | None = None)
             "Give it a larger fraction, or another --seed."
         )
     settings = {**config.settings(dataset), "splits": dict(splits.fractions)}
-    with atomic_folder(config.out) as folder:
+    with folder_lock(config.out), atomic_folder(config.out) as folder:
         subsets = [
             _Subset(folder / name, mask, "openvima data split", {**settings, "split": name})
             for name, mask in chosen.items()

@@ -24,6 +24,7 @@ from openvima.data.verification.findings import Report, Verification, VerifyConf
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.salvage import rewrite
 from openvima.errors import DatasetError, OpenVimaError
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import Counts, imap_with_progress
 
 _STAGING = ".repair.tmp"
@@ -70,11 +71,17 @@ def repair(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
     Raises:
         DatasetError: There is no data set, or the installed versions cannot repair it.
         ShardError: A damaged shard has whole records that cannot be kept.
+        FolderLockedError: Another process writes to the folder.
         WorkerError: A worker died; repeat the command.
     """
     folder = Path(folder)
     if take_inventory(folder).holds_failed:
         raise DatasetError(f"{folder} belongs to {folder.parent}; repair that, and both are repaired.")
+    with folder_lock(folder):
+        return _repair(folder, config, report)
+
+
+def _repair(folder: Path, config: VerifyConfig, report: Report | None) -> Repair:
     before = verify(folder, replace(config, replay=0), report)
     if before.is_clean:
         return Repair(before, verify(folder, config, report))
