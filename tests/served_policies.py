@@ -86,9 +86,9 @@ def scripted_server(*frames: object, metadata: object = None) -> Iterator[str]:
 
 
 @contextmanager
-def running(converse: Callable[[Any], None], port: int = 0) -> Iterator[str]:
+def running(converse: Callable[[Any], None], **options: Any) -> Iterator[str]:  # Any: of websockets
     """Serve in a thread; each connection is given to a function."""
-    server = serve(converse, "127.0.0.1", port, compression=None)
+    server = serve(converse, "127.0.0.1", 0, compression=None, **options)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:

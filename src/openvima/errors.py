@@ -131,6 +131,22 @@ class MissingExtraError(OpenVimaError, ImportError):
     """An optional dependency is not installed; the message names the extra."""
 
 
+MAX_ECHO = 200  # characters of what others sent that an error repeats
+
+
+def echo(text: str, limit: int = MAX_ECHO) -> str:
+    """Shorten text of others for an error and replace its control characters.
+
+    Args:
+        text: What a client, a server or a file holds; it may be hostile to the terminal that shows it.
+        limit: Characters to keep.
+    """
+    kept = "".join(
+        c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text[:limit]
+    )
+    return kept if len(text) <= limit else kept[: limit - 1] + "…"
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") -> str:
     """Compose the message for an unknown name, with the nearest known one as a suggestion.
 
@@ -144,8 +160,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], hint: str = "") 
         One line for an `UnknownNameError`.
     """
     known = list(known)
-    near = difflib.get_close_matches(str(name), known, n=1)
+    near = difflib.get_close_matches(str(name)[:MAX_ECHO], known, n=1)
     suggestion = f" Did you mean {near[0]!r}?" if near else ""
     if not hint and len(known) <= 20:
         hint = f"Allowed: {', '.join(known)}."
-    return f"there is no {kind} {name!r}.{suggestion} {hint}".rstrip()
+    return f"there is no {kind} {echo(repr(name))}.{suggestion} {hint}".rstrip()

@@ -309,3 +309,14 @@ def test_observations_and_prompt_images_of_another_size_are_refused() -> None:
         observe({"rgb": rgb, "segm": segm, "ee": 0})
     with pytest.raises(ShapeError, match=r"\(3, 128, 256\)"):
         observe_prompt_image(PromptImage("scene", "scene", rgb, segm, ()))
+
+
+def test_an_image_of_more_objects_than_any_scene_is_refused_before_it_is_cropped(monkeypatch) -> None:
+    monkeypatch.setattr("openvima.perception.objects.crop_box", lambda *_: pytest.fail("cropped"))
+    many = {view: np.arange(128 * 256, dtype=np.uint8).reshape(128, 256) for view in ("front", "top")}
+    for look in (
+        lambda: observe({"rgb": noise(), "segm": many, "ee": 0}),
+        lambda: extract_objects(noise(), many, [7] * 65),
+    ):
+        with pytest.raises(PolicyError, match=r"objects; at most 64 are allowed"):
+            look()

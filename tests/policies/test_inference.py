@@ -334,10 +334,22 @@ def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:
         policy.reset([RenderedPrompt(prompts[0].text, images)])
 
 
-def test_a_prompt_longer_than_the_position_table_is_refused(policy, prompts) -> None:
+def test_a_prompt_longer_than_the_position_table_is_refused_before_it_is_encoded(
+    policy, prompts, monkeypatch
+) -> None:
     text = "put the " * 150 + prompts[0].text
+    monkeypatch.setattr(policy.network, "encode_images", lambda images: pytest.fail("encoded"))
+    monkeypatch.setattr(policy.network, "encode_prompt", lambda *inputs: pytest.fail("encoded"))
     with pytest.raises(PolicyError, match=r"the prompt has 3\d\d tokens; this policy takes 256"):
         policy.reset([prompts[1], RenderedPrompt(text, prompts[0].images)])
+
+
+def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy, monkeypatch) -> None:
+    monkeypatch.setattr("openvima.policies.processor.preprocess_prompt", lambda *_: pytest.fail("split"))
+    with pytest.raises(PromptError, match="the prompt has 400,000 characters; this policy takes 4,096"):
+        policy.reset([RenderedPrompt("put the " * 50_000, {})])
+    with pytest.raises(PromptError, match="1,300 images; this policy takes 64"):
+        policy.reset([RenderedPrompt("{a}" * 1300, {})])
 
 
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:

@@ -180,3 +180,9 @@ def test_a_placeholder_without_image_is_refused() -> None:
 def test_empty_text_has_no_ids() -> None:
     assert encode_text("") == []
     assert encoded(RenderedPrompt("", {})) == [END_ID]
+
+
+def test_unknown_words_are_shown_short_and_without_control_characters() -> None:
+    with pytest.raises(PromptError) as error:
+        encode_text("put \x1b[2J\u202e " + "juggle " * 5000 + "x" * 5000)
+    assert str(error.value).isprintable() and len(str(error.value)) < 400

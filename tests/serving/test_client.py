@@ -16,6 +16,7 @@ from served_policies import (
     Telltale,
     made_up_observation,
     made_up_prompt,
+    running,
     scripted_server,
     told,
 )
@@ -61,7 +62,13 @@ def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.Monke
         ({"hello": "other server"}, "speaks None, this client"),
         ([1], "a list came where a map must be"),
         ("not now", "refuses: not now"),
-        ({"protocol": PROTOCOL, "mean": np.zeros(3)}, "other than plain values"),
+        ({"protocol": PROTOCOL, "mean": np.zeros(3)}, "other than plain, finite values"),
+        ({"protocol": PROTOCOL, "score": float("nan")}, "other than plain, finite values"),
+        (
+            {"protocol": PROTOCOL, "policy": {"scores": [1.0, float("-inf")]}},
+            "other than plain, finite values",
+        ),
+        ({"protocol": PROTOCOL, "notes": "x" * 2**16}, "metadata has 65,[0-9]+ bytes; 65,536 are allowed"),
     ],
 )
 def test_a_server_of_another_protocol_is_told_apart(metadata: object, message: str) -> None:
@@ -135,6 +142,68 @@ def test_a_server_that_falls_silent_is_given_up() -> None:
         policy.reset([made_up_prompt(1)])
         with pytest.raises(ServerError, match=r"has not answered within 0\.1 s"):
             policy.act([made_up_observation(1)])
+
+
+def test_a_server_that_is_silent_before_the_handshake_is_named_with_the_time() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"ws://127.0.0.1:{listening.getsockname()[1]}"
+        with pytest.raises(ServerError, match=rf"{url}: no handshake within 0\.2 s"):
+            RemotePolicy(url, timeout_s=0.2)
+
+
+def test_a_server_that_is_silent_after_the_handshake_is_named_with_the_time(monkeypatch) -> None:
+    monkeypatch.setattr("openvima.serving.connection.CONNECT_S", 0.2)
+    with (
+        running(lambda connection: connection.recv()) as url,
+        pytest.raises(ServerError, match=rf"{url} sent no first frame within 0\.2 s after the handshake"),
+    ):
+        RemotePolicy(url)
+
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\n\u202e\x9b31m" + "y" * 5000
+
+
+def assert_harmless(error: ServerError) -> None:
+    """Nothing that moves a terminal's cursor, and little of what was sent."""
+    assert str(error).isprintable() and str(error).count("y") <= 200 and len(str(error)) < 500
+
+
+def test_what_a_hostile_server_says_is_cut_and_cleaned() -> None:
+    for frames in (
+        [HOSTILE],
+        [RESET, HOSTILE],
+        [RESET, {"type": "act", HOSTILE: 1}],
+        [RESET, {"type": HOSTILE}],
+    ):
+        with scripted_server(*frames) as url, RemotePolicy(url) as policy:
+            with pytest.raises(ServerError) as error:
+                policy.reset([made_up_prompt(1)])
+                policy.act([made_up_observation(1)])
+            assert_harmless(error.value)
+    for metadata in (HOSTILE, {"protocol": HOSTILE}, {HOSTILE: {1.5: b"bytes"}, "protocol": PROTOCOL}):
+        with scripted_server(metadata=metadata) as url, pytest.raises(ServerError) as error:
+            RemotePolicy(url)
+        assert_harmless(error.value)
+
+
+def test_the_reason_of_a_hostile_end_is_cleaned() -> None:
+    def end(connection) -> None:
+        connection.close(4000, HOSTILE[:40])
+
+    with scripted_server(end) as url, RemotePolicy(url) as policy:
+        with pytest.raises(ServerError, match="has ended the connection") as error:
+            policy.reset([made_up_prompt(1)])
+        assert_harmless(error.value)
+
+
+def test_a_hostile_page_in_place_of_a_handshake_is_cut_and_cleaned() -> None:
+    def refuse(connection, request):
+        return connection.respond(403, HOSTILE)
+
+    with running(lambda connection: None, process_request=refuse) as url:
+        with pytest.raises(ServerError, match="HTTP 403") as error:
+            RemotePolicy(url)
+        assert_harmless(error.value)
 
 
 def test_a_server_that_does_not_read_is_given_up() -> None:

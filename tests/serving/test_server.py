@@ -69,7 +69,14 @@ def test_the_first_frame_says_what_is_served(url: str) -> None:
         "protocol": PROTOCOL,
         "versions": {"openvima": __version__},
         "policy": {"name": "telltale"},
-        "limits": {"message_bytes": 2**16, "episodes": 3, "idle_s": 600.0},
+        "limits": {
+            "message_bytes": 2**16,
+            "episodes": 3,
+            "idle_s": 600.0,
+            "prompt_chars": 4096,
+            "prompt_images": 64,
+            "prompt_objects": 256,
+        },
     }
 
 

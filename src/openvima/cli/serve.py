@@ -18,7 +18,7 @@ def main(
     device: str = "cpu",
     threads: int = 1,
     max_connections: int = 16,
-    max_episodes: int = 256,
+    max_episodes: int = 64,
     max_message_mb: int = 128,
     idle_s: float = 600.0,
 ) -> int:

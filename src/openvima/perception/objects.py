@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from openvima.errors import PolicyError, ShapeError
+from openvima.errors import PolicyError, ShapeError, echo
 from openvima.perception.kernels import (
     CROP_SIZE,
     halve_frame,
@@ -23,6 +23,7 @@ from openvima.perception.kernels import (
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import BACKGROUND_ID, END_EFFECTORS, FIRST_OBJECT_ID, PromptImage
 
+MAX_OBJECTS = 64  # of an image; the hardest scenes of the benchmark have 9
 MIN_PIXELS = 2  # an object that shows fewer pixels in a view counts as hidden there
 FRONT, TOP = VIEWS.index("front"), VIEWS.index("top")
 _NUM_IDS = 256  # of a segmentation
@@ -225,12 +226,14 @@ def extract_objects(
         One slot for each id, in both views, hidden or not.
 
     Raises:
-        PolicyError: A view is missing, or an id is not one of 0 to 255.
+        PolicyError: A view is missing, an id is not one of 0 to 255, or there are more than `MAX_OBJECTS`.
         ShapeError: An image has another shape or dtype.
     """
     ids = np.asarray(object_ids, dtype=np.int64)
     if not np.isin(ids, np.arange(_NUM_IDS)).all():
-        raise PolicyError(f"object ids are {ids.tolist()}; they must lie in 0 … 255, as segmentations do.")
+        raise PolicyError(
+            f"object ids are {echo(str(ids.tolist()))}; they must lie in 0 … 255, as segmentations do."
+        )
     return _cut_out(_measure(rgb, segm), ids)
 
 
@@ -249,7 +252,8 @@ def observe(observation: Mapping, *, left_to_right: bool = True) -> ObjectViews:
         The objects that show at least two pixels in some view.
 
     Raises:
-        PolicyError: A part or a view is missing, or there is no such end effector.
+        PolicyError: A part or a view is missing, there is no such end effector, or there are more than
+            `MAX_OBJECTS` objects.
         ShapeError: An image has another shape or dtype.
     """
     first = FIRST_OBJECT_ID[END_EFFECTORS[end_effector_of(observation)]]
@@ -376,6 +380,8 @@ def _measure(rgb: Mapping[str, np.ndarray], segm: Mapping[str, np.ndarray]) -> l
 
 
 def _cut_out(views: Sequence[_Measured], ids: np.ndarray) -> ObjectViews:
+    if len(ids) > MAX_OBJECTS:
+        raise PolicyError(f"an image has {len(ids)} objects; at most {MAX_OBJECTS} are allowed.")
     objects = replace(see_nothing(len(ids)), ids=ids)
     for v, view in enumerate(views):
         objects.masks[v] = view.num_pixels[ids] >= MIN_PIXELS

@@ -17,11 +17,12 @@ from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.policy_network import PolicyNetwork
-from openvima.policies.processor import Processor
+from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 
+MAX_CROPS = 1024  # images that are encoded at once, which bounds the memory of a large batch
 NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swap their order
 
 
@@ -91,6 +92,8 @@ class NetworkPolicy(Policy):
         PolicyError: The temperature is negative, or above 0 without a generator; the network needs the T5
             tokenizer and none is given; or the device is not available.
     """
+
+    prompt_limits = PROMPT_LIMITS
 
     def __init__(
         self,
@@ -279,7 +282,8 @@ class NetworkPolicy(Policy):
         """
         images, keys = stack.images(), stack.digests()
         new = [number for number, key in enumerate(keys) if key not in cached]
-        encoded = self.network.encode_images(torch.from_numpy(images[new]).to(self.device))
+        chunks = torch.from_numpy(images[new]).split(MAX_CROPS)
+        encoded = torch.cat([self.network.encode_images(chunk.to(self.device)) for chunk in chunks])
         if len(new) == len(keys):
             return encoded, dict(zip(keys, encoded, strict=True))
         by_key = {**cached, **dict(zip((keys[number] for number in new), encoded, strict=True))}

@@ -30,7 +30,8 @@ from openvima.perception.preprocessing import (
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.actions import ActionTargets
-from openvima.policies.nn.decoder import MAX_POSITIONS
+from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
+from openvima.policies.prompt_limits import PromptLimits
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
 from openvima.render.camera import CAMERAS, VIEWS, unproject
 from openvima.scene import RenderedPrompt
@@ -39,6 +40,8 @@ if TYPE_CHECKING:  # inference needs no demonstrations
     from openvima.data.object_cache.episode import PreprocessedEpisode
 
 MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
+# A token takes a character at least, and 16 are more than any word of the vocabularies has on average.
+PROMPT_LIMITS = PromptLimits(16 * MAX_PROMPT_POSITIONS, objects=MAX_PROMPT_POSITIONS)
 
 _LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
 
@@ -96,10 +99,13 @@ class Processor:
             The batch, and its image stack.
 
         Raises:
-            PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
-            PolicyError: An image lacks a view.
+            PromptError: A prompt is empty or too large, a word is unknown, or placeholders and images do not
+                match.
+            PolicyError: An image lacks a view, or a prompt has too many tokens.
             ShapeError: An image has another shape or dtype.
         """
+        for prompt in prompts:
+            PROMPT_LIMITS.check(prompt)
         if not all(prompt.sequence() for prompt in prompts):
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
         stack = stack or ImageStack(self.image_size)
@@ -353,6 +359,9 @@ class Processor:
                 tokens += [(PADDING_ID, count + k, 0) for k in range(counts[piece])]
             count += sizes[-1]
         tokens.append((self.tokenizer.end_id, WORD, 0))
+        check_length(
+            len(tokens), MAX_PROMPT_POSITIONS, "the prompt"
+        )  # before the encoder, whose cost is quadratic
         words, entries, parts = np.array(tokens).T
         is_word, images = entries == WORD, np.repeat(np.arange(len(sizes)), sizes)
         in_other_order = None if order == list(range(starts[-1])) else np.array(order)

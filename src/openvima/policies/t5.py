@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from openvima.errors import CheckpointError, InputFileError, MissingExtraError, PolicyError, PromptError
+from openvima.errors import (
+    CheckpointError,
+    InputFileError,
+    MissingExtraError,
+    PolicyError,
+    PromptError,
+    echo,
+)
 from openvima.input_files import open_regular
 from openvima.policies.hub import fetch_from_hub
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -32,6 +39,7 @@ _FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
 _TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
 _SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
 _MAX_TOKENIZER_BYTES = 16 * 2**20  # of each file; those of t5-base have up to 1.4 MB
+_MAX_WORDS = 2**16  # words whose pieces are kept
 _MAX_LISTED = 6  # differences that a message lists
 
 
@@ -74,8 +82,8 @@ class T5Tokenizer:
         if unknown:
             shown = ", ".join(repr(word) for word in dict.fromkeys(unknown))
             raise PromptError(
-                f"the prompt text {text!r} contains {shown}, which the vocabulary of T5 lacks. "
-                "Write it in other letters, without special tokens."
+                f"the prompt text {echo(repr(text), 100)} contains {echo(shown, 100)}, which the vocabulary "
+                "of T5 lacks. Write it in other letters, without special tokens."
             )
         return [piece for word in words for piece in self._encode_word(word)]
 
@@ -85,6 +93,8 @@ class T5Tokenizer:
 
     def _encode_word(self, word: str) -> list[int]:
         if word not in self._words:
+            if len(self._words) >= _MAX_WORDS:
+                self._words.clear()
             backend = self._tokenizer.backend_tokenizer
             self._words[word] = backend.encode(word, add_special_tokens=False).ids
         return self._words[word]

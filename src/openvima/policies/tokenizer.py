@@ -11,12 +11,13 @@ from importlib import resources
 from typing import Protocol
 
 from openvima.catalog import TEXTURES
-from openvima.errors import PromptError
+from openvima.errors import PromptError, echo
 
 PADDING_ID, END_ID = 0, 1
 LARGEST_NUMBER = 360
 _FIRST_NUMBER_ID = 2
 _FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
+_MAX_SHOWN = 100  # characters of the text, and of its unknown words, in an error
 _PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|[0-9]+|\S")
 
 
@@ -100,10 +101,10 @@ def _number_id(digits: str) -> int | None:
 
 
 def _unknown_words(unknown: list[str], text: str) -> str:
-    shown = ", ".join(repr(word) for word in dict.fromkeys(unknown))
-    near = difflib.get_close_matches(unknown[0], word_ids(), n=1)
+    shown = echo(", ".join(repr(word) for word in dict.fromkeys(unknown)), _MAX_SHOWN)
+    near = difflib.get_close_matches(unknown[0][:_MAX_SHOWN], word_ids(), n=1)
     suggestion = f" Did you mean {near[0]!r}?" if near else ""
     return (
-        f"the prompt text {text!r} contains {shown}, which the policy's vocabulary lacks.{suggestion} "
-        f"It holds the words of the 17 tasks and whole numbers from 0 to {LARGEST_NUMBER}."
+        f"the prompt text {echo(repr(text), _MAX_SHOWN)} contains {shown}, which the policy's vocabulary "
+        f"lacks.{suggestion} It holds the words of the 17 tasks and whole numbers from 0 to {LARGEST_NUMBER}."
     )

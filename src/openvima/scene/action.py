@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openvima.errors import ActionError
+from openvima.errors import ActionError, echo
 from openvima.scene.pose import IDENTITY, Quaternion, normalised, yaw_quaternion
 from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -115,7 +115,7 @@ def _key_problems(action: Mapping[str, object]) -> list[str]:
     unknown = [str(key) for key in action if key not in ACTION_SHAPES]
     problems = [f"{', '.join(missing)} missing."] if missing else []
     if unknown:
-        problems.append(f"unknown keys {', '.join(unknown)}; allowed are {', '.join(ACTION_SHAPES)}.")
+        problems.append(f"unknown keys {echo(', '.join(unknown))}; allowed are {', '.join(ACTION_SHAPES)}.")
     return problems
 
 

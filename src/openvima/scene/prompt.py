@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from openvima.errors import PromptError
+from openvima.errors import PromptError, echo
 from openvima.scene.scene import Placement, Scene
 
 FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
@@ -139,7 +139,8 @@ class RenderedPrompt:
         names = _PLACEHOLDER.findall(self.text)
         if set(names) != set(self.images):
             raise PromptError(
-                f"prompt {self.text!r} names images {sorted(set(names))}, but got {sorted(self.images)}."
+                f"prompt {echo(repr(self.text), 100)} names images {echo(str(sorted(set(names))), 100)}, "
+                f"but got {echo(str(sorted(self.images)), 100)}."
             )
         pieces = _PLACEHOLDER.split(self.text)  # text at even places, names at odd ones
         parts = [self.images[piece] if i % 2 else piece.strip() for i, piece in enumerate(pieces)]

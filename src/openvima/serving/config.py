@@ -32,7 +32,7 @@ class ServerConfig:
     port: int = 8000
     token: str | None = field(default=None, repr=False)
     max_message_bytes: int = 128 * 2**20
-    max_episodes: int = 256
+    max_episodes: int = 64
     max_connections: int = 16
     idle_s: float = 600.0
     num_threads: int = 1

@@ -8,10 +8,10 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from openvima.errors import ConfigError, MessageError, ServerError
+from openvima.errors import MessageError, ServerError, echo
 from openvima.serving.config import is_loopback
 from openvima.serving.packing import unpack
-from openvima.serving.protocol import PROTOCOL, TOKEN_VARIABLE, check_protocol, is_remote, type_of
+from openvima.serving.protocol import PROTOCOL, TOKEN_VARIABLE, check_address, check_protocol, type_of
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CONNECT_S = 10.0
 CLOSE_S = 2.0
 MAX_REPLY_BYTES = 16 * 2**20  # actions are small
-_SHOWN = 1000  # characters of a server's error that are passed on
+MAX_METADATA_BYTES = 2**16  # all of it gets into results
 
 
 class Connection:
@@ -36,12 +36,14 @@ class Connection:
     """
 
     def __init__(self, url: str, token: str | None, timeout_s: float) -> None:
-        self.url = _checked_url(url)
+        check_address(url)
+        self.url = url
         self._timeout_s = timeout_s
         self._open = ExitStack()  # the library gives connections as context managers
-        self._socket = self._open.enter_context(_opened(url, token))
-        with self._closed_by_errors():
-            self.metadata = self._read_metadata()
+        self._socket = self._open.enter_context(_opened(url, token, min(CONNECT_S, timeout_s)))
+        greet_s = min(CONNECT_S, timeout_s)
+        with self._closed_by_errors(f"sent no first frame within {greet_s:g} s after the handshake"):
+            self.metadata = self._read_metadata(greet_s)
 
     @property
     def is_open(self) -> bool:
@@ -60,12 +62,12 @@ class Connection:
         Raises:
             ServerError: The server is lost, refuses, or answers what it must not.
         """
-        with self._closed_by_errors():
+        with self._closed_by_errors(f"has not answered within {self._timeout_s:g} s"):
             with self._limited():
                 self._socket.send(request)
             data = self._socket.recv(timeout=self._timeout_s)
         if isinstance(data, str):  # a refusal; the connection stays as it is
-            raise ServerError(f"{self.url} refuses: {data[:_SHOWN]}")
+            raise ServerError(f"{self.url} refuses: {echo(data)}")
         with self._closed_by_errors():
             answer = _map_in(data)
             if type_of(answer) != kind:
@@ -75,31 +77,37 @@ class Connection:
     def broken(self, what: str) -> ServerError:
         """Close the connection, and return the error for an answer that must not be."""
         self.close()
-        return ServerError(f"{self.url} does not keep to {PROTOCOL}: {what}")
+        return ServerError(f"{self.url} does not keep to {PROTOCOL}: {echo(what)}")
 
     def close(self) -> None:
         """Say goodbye to the server."""
         self._open.close()
 
-    def _read_metadata(self) -> dict[str, Any]:
+    def _read_metadata(self, timeout_s: float) -> dict[str, Any]:
         """Read the first frame: what is served, and in which protocol."""
-        data = self._socket.recv(timeout=min(CONNECT_S, self._timeout_s))
+        data = self._socket.recv(timeout=timeout_s)
         if isinstance(data, str):
-            raise ServerError(f"{self.url} refuses: {data[:_SHOWN]}")
+            raise ServerError(f"{self.url} refuses: {echo(data)}")
+        if len(data) > MAX_METADATA_BYTES:
+            raise MessageError(f"its metadata has {len(data):,} bytes; {MAX_METADATA_BYTES:,} are allowed")
         metadata = _map_in(data)
         try:
             check_protocol(metadata.get("protocol"), theirs=self.url, ours="this client")
         except MessageError as error:
             raise ServerError(str(error)) from None
         try:
-            json.dumps(metadata)
+            json.dumps(metadata, allow_nan=False)  # it gets into results.json
         except (TypeError, ValueError, RecursionError) as error:
-            raise MessageError(f"its metadata holds other than plain values ({error})") from None
+            raise MessageError(f"its metadata holds other than plain, finite values ({error})") from None
         return metadata
 
     @contextmanager
-    def _closed_by_errors(self) -> Iterator[None]:
-        """Close the connection if the block fails: answers that come later would be taken for others."""
+    def _closed_by_errors(self, silence: str = "is silent") -> Iterator[None]:
+        """Close the connection if the block fails: answers that come later would be taken for others.
+
+        Args:
+            silence: What the error says of a server that sends nothing.
+        """
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -109,13 +117,11 @@ class Connection:
         except ConnectionClosed as error:
             self.close()
             raise ServerError(
-                f"the policy server at {self.url} has ended the connection ({error})."
+                f"the policy server at {self.url} has ended the connection ({echo(str(error))})."
             ) from error
         except TimeoutError as error:
             self.close()
-            raise ServerError(
-                f"the policy server at {self.url} has not answered within {self._timeout_s:g} s."
-            ) from error
+            raise ServerError(f"the policy server at {self.url} {silence}.") from error
         except BaseException:
             self.close()
             raise
@@ -137,7 +143,7 @@ class Connection:
 
 
 @contextmanager
-def _opened(url: str, token: str | None) -> "Iterator[ClientConnection]":
+def _opened(url: str, token: str | None, timeout_s: float) -> "Iterator[ClientConnection]":
     from websockets.exceptions import InvalidStatus, WebSocketException
     from websockets.sync.client import connect
 
@@ -147,7 +153,7 @@ def _opened(url: str, token: str | None) -> "Iterator[ClientConnection]":
                 url,
                 compression=None,
                 max_size=MAX_REPLY_BYTES,
-                open_timeout=CONNECT_S,
+                open_timeout=timeout_s,
                 close_timeout=CLOSE_S,
                 ping_interval=None,  # a server may compute for longer than a ping may take
                 proxy=None if is_loopback(urlsplit(url).hostname or "") else True,
@@ -157,13 +163,18 @@ def _opened(url: str, token: str | None) -> "Iterator[ClientConnection]":
         except InvalidStatus as error:
             said = (error.response.body or b"").decode(errors="replace").strip()
             raise ServerError(
-                f"{url} refuses the connection (HTTP {error.response.status_code}: {said[:_SHOWN]}); a token "
+                f"{url} refuses the connection (HTTP {error.response.status_code}: {echo(said)}); a token "
                 f"can be given in the environment variable {TOKEN_VARIABLE}."
             ) from None
-        except (OSError, WebSocketException) as error:
+        except TimeoutError as error:
             raise ServerError(
-                f"no policy server answers at {url} ({error or type(error).__name__}); start one with: "
+                f"no policy server answers at {url}: no handshake within {timeout_s:g} s; start one with: "
                 "openvima serve RUN"
+            ) from error
+        except (OSError, WebSocketException) as error:
+            reason = echo(str(error)) or type(error).__name__
+            raise ServerError(
+                f"no policy server answers at {url} ({reason}); start one with: openvima serve RUN"
             ) from error
         yield connection
 
@@ -173,14 +184,3 @@ def _map_in(data: bytes) -> dict[str, Any]:  # Any: what was sent
     if not isinstance(message, dict):
         raise MessageError(f"a {type(message).__name__} came where a map must be")
     return message
-
-
-def _checked_url(url: str) -> str:
-    try:
-        parts = urlsplit(url)
-        usable = is_remote(url) and bool(parts.hostname) and parts.port != 0 and not parts.fragment
-    except ValueError:  # the port is no number
-        usable = False
-    if not usable:
-        raise ConfigError(f"the address of a policy server is {url!r}; it must be ws://HOST:PORT or wss://….")
-    return url

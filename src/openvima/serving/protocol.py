@@ -1,11 +1,14 @@
 """What a policy server and its clients say to each other; docs/serving.md tells it for other languages."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 import numpy as np
 
-from openvima.errors import ConfigError, MessageError
+from openvima.errors import ConfigError, MessageError, echo
+from openvima.render.camera import VIEWS
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 
 # The number counts versions that do not understand each other: whatever is added, removed or changes its
@@ -13,6 +16,7 @@ from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 PROTOCOL = "openvima-policy/1"
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
 SCHEMES = ("ws://", "wss://")
+MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
 _RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": str}
@@ -21,6 +25,22 @@ _RECORD_TYPES: dict[str, type] = {"object_id": int, "object": str, "texture": st
 def is_remote(source: str) -> bool:
     """Whether the name of a policy is the address of a server."""
     return source.startswith(SCHEMES)
+
+
+def check_address(url: str) -> None:
+    """Check that a text can be the address of a server.
+
+    Raises:
+        ConfigError: It has another scheme, no host, a port that is none, or a fragment.
+    """
+    try:
+        parts = urlsplit(url)
+        usable = is_remote(url) and bool(parts.hostname) and parts.port != 0 and not parts.fragment
+    except ValueError:  # the port is no number
+        usable = False
+    if not usable or not url.isprintable():
+        shown = echo(repr(url))
+        raise ConfigError(f"the address of a policy server is {shown}; it must be ws://HOST:PORT or wss://….")
 
 
 def check_token(token: str | None) -> None:
@@ -57,6 +77,9 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
     by_name = {image.name: image for image in images}
     if len(by_name) < len(images):
         raise MessageError(f"{where}: two images have one name; each placeholder has one image.")
+    for number, image in enumerate(images):
+        if len({record.object_id for record in image.objects}) < len(image.objects):
+            raise MessageError(f"{where}: image {number}: two objects have one object_id.")
     return RenderedPrompt(text, by_name)
 
 
@@ -176,14 +199,18 @@ def _decode_record(message: object, where: str) -> ObjectRecord:
     fields = _map(message, where, required=tuple(_RECORD_TYPES))
     for key, kind in _RECORD_TYPES.items():
         _typed(fields[key], kind, f"{where}: {key}")
+    if not 0 <= fields["object_id"] <= 255:
+        raise MessageError(f"{where}: object_id is {fields['object_id']}; it must lie in 0 … 255.")
     return ObjectRecord(**fields)
 
 
 def _check_views(fields: Mapping[str, Any], where: str) -> None:  # Any: what was sent
-    """Check `rgb` and `segm`: uint8 images of any size, which for one view is the same in both."""
+    """Check `rgb` and `segm`: uint8 images of one size a view, with at most `MAX_PIXELS`."""
     sizes: dict[object, tuple[int, ...]] = {}
     for part in (part for part in ("rgb", "segm") if part in fields):
         for view, image in _typed(fields[part], dict, f"{where}: {part}").items():
+            if view not in VIEWS:
+                raise MessageError(f"{where}: {part} has a view {_shown(view)}; allowed: {', '.join(VIEWS)}.")
             array = _typed(image, np.ndarray, f"{where}: {part} {_shown(view)}")
             lead = (3,) if part == "rgb" else ()
             size = array.shape[len(lead) :]
@@ -193,6 +220,11 @@ def _check_views(fields: Mapping[str, Any], where: str) -> None:  # Any: what wa
                 raise MessageError(
                     f"{where}: {part} {_shown(view)} is {array.dtype} {array.shape}; it must be uint8 "
                     f"{wanted}."
+                )
+            if math.prod(size) > MAX_PIXELS:
+                raise MessageError(
+                    f"{where}: {part} {_shown(view)} has {size[0]} × {size[1]} pixels; at most "
+                    f"{MAX_PIXELS:,} are allowed."
                 )
 
 

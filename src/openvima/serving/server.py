@@ -9,11 +9,13 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from openvima import __version__
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, echo
 from openvima.policies.base import Policy
+from openvima.policies.prompt_limits import PromptLimits
 from openvima.serving.config import ServerConfig
 from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import PROTOCOL
@@ -114,8 +116,9 @@ def serve_in_thread(
 class _PolicyServer:
     """A served policy.
 
-    Connections share one event loop, in which nothing takes long: requests are read, answered and packed in
-    one other thread, one after the other, so that policies need not be safe to use from several.
+    Connections share one event loop, in which nothing takes long. Requests are read and checked in threads of
+    their own, and answered and packed in one other thread, one after the other, so that policies need not be
+    safe to use from several.
     """
 
     def __init__(self, policy: Policy, config: ServerConfig, about: Mapping[str, Any]) -> None:
@@ -123,6 +126,8 @@ class _PolicyServer:
         self._new_policy: Callable[[], Policy] = getattr(policy, "new_session", lambda: policy)
         self._max_connections = config.max_connections if hasattr(policy, "new_session") else 1
         self._num_connections = 0
+        limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
+        prompt_limits = {f"prompt_{name}": number for name, number in asdict(limits).items()}
         self._metadata = pack(
             {
                 "protocol": PROTOCOL,
@@ -132,6 +137,7 @@ class _PolicyServer:
                     "message_bytes": config.max_message_bytes,
                     "episodes": config.max_episodes,
                     "idle_s": config.idle_s,
+                    **prompt_limits,
                 },
             }
         )
@@ -142,7 +148,10 @@ class _PolicyServer:
 
         config = self._config
         threads = (config.num_threads,)
-        with ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as self._computing:
+        with (
+            ThreadPoolExecutor(2, "openvima-reading") as self._reading,
+            ThreadPoolExecutor(1, "openvima-policy", _set_threads, threads) as self._computing,
+        ):
             try:
                 server = await serve(
                     self._serve_client,
@@ -201,7 +210,7 @@ class _PolicyServer:
             _LOG.warning("%s: dropped, %s", _name(connection), reason)
             await connection.close(CloseCode.POLICY_VIOLATION, reason)
         except ConnectionClosed as closed:
-            _LOG.info("%s: gone (%s)", _name(connection), closed)
+            _LOG.info("%s: gone (%s)", _name(connection), echo(str(closed)))
         finally:
             self._num_connections -= 1
 
@@ -212,8 +221,13 @@ class _PolicyServer:
         while True:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
-                request = await connection.recv()
-            reply = await loop.run_in_executor(self._computing, session.reply, request)
+                data = await connection.recv()
+            request = await loop.run_in_executor(self._reading, session.read, data)
+            del data  # it may be large, and the policy may be busy with others
+            reply = request
+            if not isinstance(request, str):
+                reply = await loop.run_in_executor(self._computing, session.answer, request)
+            del request
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
 

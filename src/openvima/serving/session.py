@@ -1,11 +1,14 @@
 """One client of a policy server: its episodes, and the answers to its requests."""
 
 import logging
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from openvima.errors import MessageError, OpenVimaError
+from openvima.errors import MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy
+from openvima.policies.prompt_limits import PromptLimits
 from openvima.scene import RenderedPrompt
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import (
@@ -18,37 +21,50 @@ from openvima.serving.protocol import (
     type_of,
 )
 
+MAX_OBJECTS = 4096  # in the images of all prompts of a request, 64 for each of 64 episodes
+_MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 _LOG = logging.getLogger(__name__)
+
+Answer = Callable[[], dict[str, Any] | None]  # plain values and arrays
 
 
 class Session:
     """Answers the requests of one client.
 
+    A request is read and checked in one thread and answered in that of the policy, so one that is refused
+    keeps no other client waiting. Neither method raises: a refusal is a text, and the next request may be a
+    better one.
+
     Args:
-        policy: Has no other user.
+        policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
         max_episodes: Episodes of the largest batch.
     """
 
     def __init__(self, policy: Policy, max_episodes: int) -> None:
         self._policy = policy
+        self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         self._max_episodes = max_episodes
         self._num_episodes = 0
 
-    def reply(self, data: bytes | str) -> bytes | str:
-        """Answer a request, whatever it is.
-
-        Returns:
-            The packed answer; or a text that says why there is none. The next request may be a better one.
-        """
+    def read(self, data: bytes | str) -> Answer | str:
+        """Read a request, whatever it is, and return what answers it."""
         try:
-            return self._answer(data)
+            return self._read(data)
         except OpenVimaError as error:
-            return f"{type(error).__name__}: {error}"
-        except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
-            _LOG.exception("the policy failed")
-            return f"the policy failed: {type(error).__name__}: {error}"[:1000]
+            return _refusal(error)
 
-    def _answer(self, data: bytes | str) -> bytes:
+    def answer(self, request: Answer) -> bytes | str:
+        """Answer a request that `read` returned."""
+        try:
+            return pack(request())
+        except OpenVimaError as error:
+            return _refusal(error)
+        except Exception as error:  # of a policy that others wrote; the client learns that, we where it was
+            where = "\n".join(map(echo, traceback.format_exc().splitlines()[-40:]))
+            _LOG.error("the policy failed\n%s", where)
+            return f"the policy failed: {type(error).__name__}: {echo(str(error))}"
+
+    def _read(self, data: bytes | str) -> Answer:
         if isinstance(data, str):
             raise MessageError("a text frame came in; requests are binary frames of MessagePack.")
         message = unpack(data)
@@ -58,19 +74,32 @@ class Session:
             protocol = message.get("protocol", PROTOCOL)
             check_protocol(protocol, theirs="the client", ours="this server")
             prompts = read_list(message, "reset", "prompts", self._max_episodes, optional=("protocol",))
-            self._reset([decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(prompts)])
-            return pack({"type": "reset", "episodes": self._num_episodes})
+            return partial(self._begin, self._decoded(prompts))
         if kind == "act":
             seen = read_list(message, "act", "observations", self._max_episodes)
-            actions = self._act([decode_observation(one, f"observation {n}") for n, one in enumerate(seen)])
-            near_ties = getattr(self._policy, "near_ties", None)
-            extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
-            return pack({"type": "act", "actions": actions, **extra})
+            return partial(
+                self._act, [decode_observation(one, f"observation {n}") for n, one in enumerate(seen)]
+            )
         if isinstance(message, dict) and "type" not in message:
-            return pack(self._infer(message))
+            prompt = message.pop("prompt", None)
+            sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
+            return partial(self._infer, decode_observation(message), self._decoded(sent))
         raise MessageError(
             f"a request must be a map with type 'reset' or 'act', or an observation ({PROTOCOL})."
         )
+
+    def _decoded(self, sent: Sequence[object]) -> list[RenderedPrompt]:
+        prompts = [decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(sent)]
+        for prompt in prompts:
+            self._limits.check(prompt)
+        total = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
+        if total > MAX_OBJECTS:
+            raise MessageError(f"the prompts have {total:,} objects; at most {MAX_OBJECTS:,} are allowed.")
+        return prompts
+
+    def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:  # Any: plain values
+        self._reset(prompts)
+        return {"type": "reset", "episodes": self._num_episodes}
 
     def _reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         if not prompts:
@@ -79,7 +108,13 @@ class Session:
         self._policy.reset(prompts)
         self._num_episodes = len(prompts)
 
-    def _act(self, observations: Sequence[dict[str, Any] | None]) -> list[dict[str, Any] | None]:
+    def _act(self, observations: Sequence[dict[str, Any] | None]) -> dict[str, Any]:  # Any: values and arrays
+        actions = self._actions(observations)
+        near_ties = getattr(self._policy, "near_ties", None)
+        extra = {} if near_ties is None else {"near_ties": [bool(near) for near in near_ties]}
+        return {"type": "act", "actions": actions, **extra}
+
+    def _actions(self, observations: Sequence[dict[str, Any] | None]) -> list[dict[str, Any] | None]:
         """Ask the policy; Any: plain values and arrays."""
         if not self._num_episodes:
             raise MessageError("there are no episodes yet; send a reset with their prompts first.")
@@ -95,11 +130,14 @@ class Session:
             )
         return actions
 
-    def _infer(self, message: dict[str, Any]) -> dict[str, Any] | None:
+    def _infer(
+        self, observation: dict[str, Any] | None, prompts: Sequence[RenderedPrompt]
+    ) -> dict[str, Any] | None:
         """Act in a single episode, which an observation with a prompt begins."""
-        fields = dict(message)
-        prompt = fields.pop("prompt", None)
-        observation = decode_observation(fields)
-        if prompt is not None:
-            self._reset([decode_prompt({"text": prompt} if isinstance(prompt, str) else prompt)])
-        return self._act([observation])[0]
+        if prompts:
+            self._reset(prompts)
+        return self._actions([observation])[0]
+
+
+def _refusal(error: OpenVimaError) -> str:
+    return echo(f"{type(error).__name__}: {error}", _MAX_REFUSAL)

@@ -175,7 +175,9 @@ class CausalDecoder(nn.Module):
         if (
             cache.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_POSITIONS
         ):  # only then synchronise with the device
-            _check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
+            check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
+            padded = cache.mask_BS.shape[1] + tokens_BLD.shape[1]
+            check_length(padded, 2 * MAX_POSITIONS, f"{self.sequence_name}, padded to the batch,")
         positions_BL = (cache.length_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
         unpadder = Unpadder(torch.ones_like(mask_BL) if valid_BL is None else valid_BL)
         x_ND = self.dropout(unpadder.unpad(tokens_BLD + self.positions(positions_BL)))
@@ -245,7 +247,7 @@ class Decoder(CausalDecoder):
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Compute the keys and values of the prompt for every cross block."""
-        _check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
+        check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         prompt_BPD = prompt_BPD + self.prompt_positions(position_ids(mask_BP))
         blocks = (cast(CrossBlock, block) for block in self.cross_blocks)
         prompt = tuple(block.keys_values(prompt_BPD) for block in blocks)
@@ -269,7 +271,7 @@ class PrefixDecoder(CausalDecoder):
 
     def init_cache(self, prompt_BPD: torch.Tensor, mask_BP: torch.Tensor) -> KVCache:
         """Decode prompt and separator; the prompt is causal as well."""
-        _check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
+        check_length(prompt_BPD.shape[1], MAX_PROMPT_POSITIONS, "the prompt")
         separator_B1D = self.separator.expand(len(prompt_BPD), 1, -1)
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
@@ -377,7 +379,8 @@ def _causal_mask(past_BS: torch.Tensor, new_BL: torch.Tensor) -> torch.Tensor:
     return torch.cat([past_BS[:, None, :].expand(-1, length, -1), causal_LL & new_BL[:, None, :]], dim=2)
 
 
-def _check_length(length: int, limit: int, what: str) -> None:
+def check_length(length: int, limit: int, what: str) -> None:
+    """Raise a PolicyError if a sequence has more tokens than the policy takes."""
     if length > limit:
         raise PolicyError(
             f"{what} has {length} tokens; this policy takes {limit}. Give a shorter prompt, fewer objects in "

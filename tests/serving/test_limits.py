@@ -1,0 +1,147 @@
+"""What one request may ask for: counted before anything is computed, while other clients are answered."""
+
+import logging
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openvima.policies.prompt_limits import PromptLimits
+from openvima.scene import RenderedPrompt
+from openvima.serving import RemotePolicy, serve_in_thread
+from openvima.serving.packing import pack, unpack
+from openvima.serving.protocol import MAX_PIXELS, encode_prompt
+from openvima.serving.session import MAX_OBJECTS, Session
+from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
+
+
+class Untouched(Telltale):
+    """Fails if anything is asked of it."""
+
+    def reset(self, prompts) -> None:
+        pytest.fail("the policy was asked")
+
+
+def refusal(message: Any, policy: Any = None) -> str:  # Any: whatever can be packed, and a policy
+    session = Session(policy or Untouched(), 64)
+    answer = session.read(pack(message))
+    assert isinstance(answer, str)
+    return answer
+
+
+def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]:  # Any: of a message
+    sent = encode_prompt(made_up_prompt(1))
+    return {"text": text, "images": [{**sent["images"][0], **fields}]}
+
+
+def records(*ids: int) -> list[dict[str, Any]]:  # Any: of a message
+    return [{"object_id": number, "object": "bowl", "texture": "red"} for number in ids]
+
+
+def test_every_count_of_a_prompt_is_bounded_before_the_policy_sees_it() -> None:
+    names = [f"i{n}" for n in range(65)]
+    many = {
+        "text": " ".join(f"{{{n}}}" for n in names),
+        "images": [prompt_with(name=n)["images"][0] for n in names],
+    }
+    few = {"text": "{a}" * 65, "images": prompt_with(name="a")["images"]}
+    full = {
+        "text": "{a} {b}",
+        "images": [prompt_with(name=n, objects=records(*range(200)))["images"][0] for n in "ab"],
+    }
+    for sent, reason in (
+        (
+            {"text": "put the " * 50_000},
+            "PromptError: the prompt has 400,000 characters; this policy takes 4,096.",
+        ),
+        (many, "65 images; this policy takes 64"),
+        (few, "65 images; this policy takes 64"),
+        (full, "400 objects; this policy takes 256"),
+        (prompt_with(objects=records(3, 3)), "two objects have one object_id"),
+        (prompt_with(objects=records(256)), "object_id is 256; it must lie in 0 … 255"),
+        (prompt_with(objects=records(2**63)), "must lie in 0 … 255"),
+    ):
+        assert reason in refusal({"type": "reset", "prompts": [sent]})
+        assert reason in refusal({**made_up_observation(1), "prompt": sent})
+
+
+def test_objects_are_bounded_over_all_prompts_of_a_request() -> None:
+    prompts = [prompt_with(objects=records(*range(200)))] * 21
+    assert f"4,200 objects; at most {MAX_OBJECTS:,}" in refusal({"type": "reset", "prompts": prompts})
+
+
+def test_images_are_bounded_in_size_and_views() -> None:
+    large = {"top": np.zeros((3, 2, MAX_PIXELS // 2 + 1), np.uint8)}
+    left = {"left": np.zeros((3, 4, 8), np.uint8)}
+    for rgb, reason in (
+        (large, "at most 1,048,576 are allowed"),
+        (left, "a view 'left'; allowed: front, top"),
+    ):
+        assert reason in refusal({"type": "act", "observations": [{"rgb": rgb, "ee": 0}]})
+
+
+def test_a_policy_states_its_own_limits() -> None:
+    class Terse(ForMany):
+        prompt_limits = PromptLimits(chars=30)
+
+    with serve_in_thread(Terse()) as url, RemotePolicy(url) as policy:
+        assert policy.metadata["limits"]["prompt_chars"] == 30
+    sent = {
+        "type": "reset",
+        "prompts": [encode_prompt(RenderedPrompt("Put it back where it was before.", {}))],
+    }
+    assert "32 characters; this policy takes 30" in refusal(sent, Terse())
+
+
+def test_a_request_that_takes_long_to_read_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, finished = threading.Event(), threading.Event()
+
+    def slow(data: bytes) -> Any:  # Any: what was sent
+        if data == b"slow":
+            reading.set()
+            assert finished.wait(10)
+        return unpack(data)
+
+    monkeypatch.setattr("openvima.serving.session.unpack", slow)
+    with serve_in_thread(ForMany()) as url, RemotePolicy(url) as bad, RemotePolicy(url) as good:
+        assert bad._connection is not None
+        bad._connection._socket.send(b"slow")
+        assert reading.wait(10)
+        good.reset([made_up_prompt(3)])
+        assert told(good.act([made_up_observation(4)])[0]) == (3, 4, 1)
+        finished.set()
+        assert "no whole MessagePack" in str(bad._connection._socket.recv())
+
+
+def test_refusals_are_short_and_hold_no_control_characters(caplog: pytest.LogCaptureFixture) -> None:
+    hostile = "\x1b[2J\u202e\n" + "y" * 10_000
+
+    class Failing(Telltale):
+        def reset(self, prompts) -> None:
+            raise KeyError(hostile)
+
+    session = Session(Failing(), 64)
+    request = session.read(pack({"type": "reset", "prompts": [prompt_with()]}))
+    assert not isinstance(request, str)
+    with caplog.at_level(logging.ERROR):
+        answers = [session.answer(request)]
+    answers += [
+        refusal({"type": hostile}),
+        refusal({"type": "reset", hostile: 1}),
+        refusal({"type": "reset", "protocol": hostile, "prompts": []}),
+        refusal({"type": "reset", "prompts": [prompt_with(kind=hostile)]}),
+    ]
+    for answer in answers:
+        assert isinstance(answer, str)
+        assert answer.isprintable() and len(answer) <= 500 and answer.count("y") <= 200 + 10
+    assert all(line.isprintable() for line in caplog.text.splitlines()) and "\x1b" not in caplog.text
+
+
+def test_a_prompt_of_many_megabytes_is_refused_at_once() -> None:
+    sent = {"type": "reset", "prompts": [{"text": "put the {a} " * 2_000_000}]}
+    data = pack(sent)
+    started = time.process_time()
+    assert "24,000,000 characters" in str(Session(Untouched(), 64).read(data))
+    assert time.process_time() - started < 2
