@@ -61,7 +61,7 @@ def test_distractors_overlap_nothing_at_any_step_and_nothing_else_changes(stacke
         for seed, other in enumerate(examples):
             if other is example:
                 continue
-            more = with_distractors(example, other, np.random.default_rng(seed)).episode
+            more = with_distractors(replace(example, other=other), np.random.default_rng(seed)).episode
             before, source = example.episode, other.episode
             first = source.objects.split(source.objects_per_step)[0]
             distractors = None
@@ -126,7 +126,7 @@ def test_a_batch_contains_the_same_images_with_either_indexing(with_images, stac
     for b, example in enumerate(borrowing):
         numbers = batch.history.crop_index_BTVN[b, 0]
         shown = {images[n].numpy().tobytes() for n in numbers.flatten().tolist() if n}
-        expected = with_distractors(example, example.other, rngs_of(borrowing)[b]).episode
+        expected = with_distractors(example, rngs_of(borrowing)[b]).episode
         first = expected.objects.split(expected.objects_per_step)[0]
         assert shown == {stack[n].numpy().tobytes() for n in first.crop_index.flatten() if n}
 

@@ -15,10 +15,10 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.tasks.novel_words import NOUNS  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
-from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
+from openvima.training.augmentation.demonstrations import DemonstrationAugmentation, Randomly  # noqa: E402
 from openvima.training.augmentation.drop_unused_objects import without_unused_objects  # noqa: E402
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
-from openvima.training.augmentation.rename_objects import RenameObjects, renamed  # noqa: E402
+from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
 from openvima.training.augmentation.shuffle_sentences import shuffled  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
@@ -85,7 +85,7 @@ def test_prompts_with_novel_words_or_without_single_objects_are_unchanged(task, 
 
 def test_objects_are_renamed_in_training_and_not_in_validation(episodes):
     several = [Example(episodes[task], row=row) for row, task in enumerate(NAMED)]
-    naming = DemonstrationAugmentation(of_tasks=(RenameObjects(1.0),))
+    naming = DemonstrationAugmentation(of_tasks=(Randomly(1.0, renamed),))
     collate = PolicyCollate(Processor("objects"), 0.0, with_images=True, augmentation=naming)
     plain = PolicyCollate(Processor("objects"), 0.0, with_images=True)
     assert torch.equal(collate(several).prompts.word_ids_BL, plain(several).prompts.word_ids_BL)

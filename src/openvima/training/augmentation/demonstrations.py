@@ -1,20 +1,40 @@
 """Per-demonstration prompt and scene augmentation: the list of transforms, in the order of their draws."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
-from openvima.training.augmentation.distractor_insertion import DistractorInsertion
+from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.training.augmentation.distractor_insertion import with_distractors
 from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
-from openvima.training.augmentation.inverse_dynamics import InverseDynamics
-from openvima.training.augmentation.rename_objects import RenameObjects
-from openvima.training.augmentation.shuffle_sentences import ShuffleSentences
+from openvima.training.augmentation.inverse_dynamics import with_motion_prompt
+from openvima.training.augmentation.rename_objects import renamed
+from openvima.training.augmentation.shuffle_sentences import shuffled
 from openvima.training.config import AugmentationConfig
 from openvima.training.dataset import Example
 
 Transform: TypeAlias = Callable[[Example, np.random.Generator], Example]
+
+
+@dataclass(frozen=True, slots=True)
+class Randomly:
+    """Augments a fraction of the demonstrations.
+
+    Args:
+        prob: Probability per demonstration.
+        augment: What happens to these.
+    """
+
+    prob: float
+    augment: Callable[[PreprocessedEpisode, np.random.Generator], PreprocessedEpisode]
+
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration, or leave it as it is."""
+        if not self.prob or rng.random() >= self.prob:
+            return example
+        return replace(example, episode=self.augment(example.episode, rng))
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +49,14 @@ class DemonstrationAugmentation:
 
     inverse_dynamics_prob: float = 0.0
     of_inverse_dynamics: tuple[Transform, ...] = ()
-    of_tasks: tuple[Transform, ...] = (DistractorInsertion(),)
+    of_tasks: tuple[Transform, ...] = (with_distractors,)
 
     def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
         """Augment a demonstration; without a generator, as in validation, only what is certain happens."""
         prob = self.inverse_dynamics_prob
         is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
         if is_inverse:
-            example = InverseDynamics()(example)
+            example = replace(example, episode=with_motion_prompt(example.episode))
         if rng is not None:
             for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
                 example = transform(example, rng)
@@ -52,8 +72,8 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
         config.inverse_dynamics_prob,
         of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob),),
         of_tasks=(
-            DistractorInsertion(),  # acts where the loader supplies another demonstration
-            RenameObjects(config.rename_objects_prob),
-            ShuffleSentences(config.shuffle_sentences_prob),
+            with_distractors,  # acts where the loader supplies another demonstration
+            Randomly(config.rename_objects_prob, renamed),
+            Randomly(config.shuffle_sentences_prob, shuffled),
         ),
     )

@@ -1,6 +1,6 @@
 """Scene augmentation: objects of another demonstration are inserted as distractors (copy-paste)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -23,29 +23,23 @@ def allows_distractors(task: str) -> bool:
         return False
 
 
-@dataclass(frozen=True, slots=True)
-class DistractorInsertion:
-    """Inserts distractors where the loader has supplied another demonstration, `Example.other`."""
-
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
-        """Augment a demonstration."""
-        return example if example.other is None else with_distractors(example, example.other, rng)
-
-
-def with_distractors(example: Example, other: Example, rng: np.random.Generator) -> Example:
+def with_distractors(example: Example, rng: np.random.Generator) -> Example:
     """Insert up to three objects of another demonstration, where they are, at all steps.
 
     Their boxes overlap no other box of any step. Only table rows are copied, no images. In few episodes a
     distractor matches the prompt as well as the target does, which makes the prompt ambiguous.
 
     Args:
-        example: The demonstration.
-        other: Another one, whose images are part of the same stack; objects of its first step are taken.
+        example: The demonstration. Distractors come from the first step of `example.other`, if the loader
+            supplied one; its images are part of the same stack.
         rng: Draws how many, and which.
 
     Returns:
         The demonstration with numbers of images that count through the whole stack.
     """
+    other = example.other
+    if other is None:
+        return example
     episode = example.episode.with_image_offset(example.base)
     count = int(rng.integers(1, MAX_DISTRACTORS + 1))
     there = other.episode.objects.select(slice(0, int(other.episode.objects_per_step[0])))

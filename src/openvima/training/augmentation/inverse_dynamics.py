@@ -9,25 +9,15 @@ Source: MIDAS (Li et al. 2023), inverse-dynamics pretraining.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable, PreprocessedPrompt
 from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
-from openvima.training.dataset import Example
 
 MOTION_TEXT = "Follow this motion: {frames}."
-
-
-@dataclass(frozen=True, slots=True)
-class InverseDynamics:
-    """Replaces the prompt by the frames of the demonstration."""
-
-    def __call__(self, example: Example) -> Example:
-        """Augment a demonstration."""
-        return replace(example, episode=with_motion_prompt(example.episode))
 
 
 def with_motion_prompt(episode: PreprocessedEpisode) -> PreprocessedEpisode:

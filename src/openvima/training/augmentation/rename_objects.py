@@ -4,7 +4,7 @@
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,28 +12,10 @@ from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.perception.preprocessing import ObjectTable
 from openvima.tasks.novel_words import ADJECTIVES, NOUNS
 from openvima.training.augmentation.prompt_images import DEFINITION, images_by_name, with_prompt
-from openvima.training.dataset import Example
 
 MAX_NAMES = 2
 _NOVEL_WORD = re.compile(rf"\b({'|'.join(NOUNS + ADJECTIVES)})\b")
 _DETERMINERS = ("the", "same", "any", "all")  # words after which a noun needs no article
-
-
-@dataclass(frozen=True, slots=True)
-class RenameObjects:
-    """Names one or two single objects of a prompt by novel nouns, see `renamed`.
-
-    Args:
-        prob: Probability per demonstration.
-    """
-
-    prob: float
-
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
-        """Augment a demonstration."""
-        if not self.prob or rng.random() >= self.prob:
-            return example
-        return replace(example, episode=renamed(example.episode, rng))
 
 
 def renamed(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:

@@ -1,33 +1,14 @@
 """Prompt augmentation: sentences that define novel words come in any order."""
 
 import re
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
 from openvima.training.augmentation.prompt_images import DEFINITION, images_by_name, with_prompt
-from openvima.training.dataset import Example
 
 _SENTENCE_END = re.compile(r"(?<=\.) ")
 _IS_COMPARISON = re.compile(r"\} is \w+ than \{")
-
-
-@dataclass(frozen=True, slots=True)
-class ShuffleSentences:
-    """Shuffles the sentences that define novel words, see `shuffled`.
-
-    Args:
-        prob: Probability per demonstration.
-    """
-
-    prob: float
-
-    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
-        """Augment a demonstration."""
-        if not self.prob or rng.random() >= self.prob:
-            return example
-        return replace(example, episode=shuffled(example.episode, rng))
 
 
 def shuffled(episode: PreprocessedEpisode, rng: np.random.Generator) -> PreprocessedEpisode:
