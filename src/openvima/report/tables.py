@@ -15,7 +15,7 @@ class FailureCause(NamedTuple):
     """A cause of failed episodes, with its fraction of all episodes and the tasks with the most."""
 
     kind: str
-    count: int
+    episodes: int
     fraction: float
     tasks: str
 
