@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
+from openvima.policies.nn.action_encoder import ActionEncoder  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
     ActionTargets,
@@ -18,7 +19,6 @@ from openvima.policies.nn.actions import (  # noqa: E402
 )
 from openvima.policies.nn.bins import (  # noqa: E402
     NUM_BINS,
-    BinsConfig,
     BinsHead,
     decode_bins,
     encode_bins,
@@ -52,7 +52,7 @@ def loss_of(network: BinsHead, query, targets: ActionTargets):
 
 def head(width: int = 6) -> BinsHead:
     torch.manual_seed(0)
-    return BinsHead(BinsConfig(hidden_width=8), width)
+    return BinsHead(8, width, ActionEncoder(256, width))
 
 
 def test_x_has_50_bins_y_100_and_every_quaternion_component_50():

@@ -7,30 +7,19 @@ Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, 
 observation.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from openvima.policies.nn.actions import ActionTargets
+from openvima.policies.nn.tensor_record import TensorRecord
 
 WORD = -1  # object index at a position that holds a word
 
 
-class _Tensors:
-    """A record of tensors that move between devices together."""
-
-    __slots__ = ()
-
-    def to(self, device: torch.device | str) -> Self:
-        """Return the record on another device."""
-        values = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
-        return type(self)(*(value.to(device) for value in values))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class PromptBatch(_Tensors):
+class PromptBatch(TensorRecord):
     """Padded prompts; image tokens are numbered across the batch.
 
     Args:
@@ -58,7 +47,7 @@ class PromptBatch(_Tensors):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HistoryBatch(_Tensors):
+class HistoryBatch(TensorRecord):
     """Observations of a batch of episodes, padded to equal numbers of steps and objects.
 
     Args:
@@ -98,7 +87,7 @@ class FalsePositiveBatch:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Batch:
+class Batch(TensorRecord):
     """Several demonstrations, padded.
 
     Args:
@@ -115,13 +104,3 @@ class Batch:
     targets: ActionTargets
     false_positives: FalsePositiveBatch
     images: torch.Tensor | None = None
-
-    def to(self, device: torch.device | str) -> "Batch":
-        """Return the batch on another device, except false positives, which are inserted on the CPU."""
-        return replace(
-            self,
-            prompts=self.prompts.to(device),
-            history=self.history.to(device),
-            targets=self.targets.to(device),
-            images=None if self.images is None else self.images.to(device, non_blocking=True),
-        )

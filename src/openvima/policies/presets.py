@@ -10,15 +10,13 @@ from openvima.errors import UnknownPolicyError, unknown_name
 if TYPE_CHECKING:
     from openvima.policies.config import PolicyConfig
 
-PUBLISHED = (
-    "vima",
-    "gato",
-    "flamingo",
-    "gpt",
-    "midas",
-)  # architectures of the papers, available in all sizes
+PUBLISHED = ("vima", "gato", "flamingo", "gpt", "midas")  # architectures of the papers, in all sizes
 # Repeats the keys of `sizes.SIZES`, so that listing presets does not import torch; a test compares them.
 SIZE_NAMES = ("nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m")
+
+
+def _config(module: str, function: str) -> "PolicyConfig":
+    return getattr(import_module(f"openvima.policies.{module}.config"), function)()
 
 
 def _sized(architecture: str, size_name: str) -> "PolicyConfig":
@@ -28,28 +26,10 @@ def _sized(architecture: str, size_name: str) -> "PolicyConfig":
     return getattr(module, architecture)(size(size_name))
 
 
-def _nano() -> "PolicyConfig":
-    from openvima.policies.pointer.config import nano
-
-    return nano()
-
-
-def _small() -> "PolicyConfig":
-    from openvima.policies.pointer.config import small
-
-    return small()
-
-
-def _nano_bins() -> "PolicyConfig":
-    from openvima.policies.vima.config import nano_bins
-
-    return nano_bins()
-
-
 PRESETS: dict[str, Callable[[], "PolicyConfig"]] = {
-    "nano": _nano,
-    "nano-bins": _nano_bins,
-    "small": _small,
+    "nano": partial(_config, "pointer", "nano"),
+    "nano-bins": partial(_config, "vima", "nano_bins"),
+    "small": partial(_config, "pointer", "small"),
     **{f"{name}-{size}": partial(_sized, name, size) for name in PUBLISHED for size in SIZE_NAMES},
 }
 

@@ -10,6 +10,7 @@ from functools import cache
 import torch
 
 from openvima.policies.nn.action_encoder import ACTION_PARTS, ACTION_WIDTH
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 __all__ = [
@@ -33,7 +34,7 @@ _HIGH = (*WORKSPACE_HIGH, 1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ActionTargets:
+class ActionTargets(TensorRecord):
     """Demonstrated actions.
 
     Args:
@@ -47,11 +48,6 @@ class ActionTargets:
     pick_BT: torch.Tensor
     place_BT: torch.Tensor
     steps_BT: torch.Tensor
-
-    def to(self, device: torch.device | str) -> "ActionTargets":
-        """Return the targets on another device."""
-        tensors = (self.actions_BTC, self.pick_BT, self.place_BT, self.steps_BT)
-        return ActionTargets(*(tensor.to(device) for tensor in tensors))
 
 
 def greedy(logits: torch.Tensor) -> torch.Tensor:

@@ -52,21 +52,16 @@ class AutoregressiveHead(nn.Module):
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
 
-    def __init__(
-        self, config: AutoregressiveConfig, width: int, actions: "ComponentTokens | None" = None
-    ) -> None:
+    def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()
-        self.actions = actions or ComponentTokens(width, config.token_std)
-        self.classifiers = bin_classifiers(config.hidden_width, width)
+        self.actions = actions
+        self.classifiers = bin_classifiers(hidden_width, width)
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Return the loss of whole histories and its metrics, with teacher forcing; see `bins_loss`."""
-        segments = [
-            observations.segment(),
-            self._segment(targets.actions_BTC, targets.steps_BT),
-        ]
+        segments = [observations.segment(), self._segment(targets.actions_BTC, targets.steps_BT)]
         (outputs_BTQD, actions_BTCD), _ = decoder.decode_segments(cache, segments)
         query_BT1D = observations.query(outputs_BTQD)[:, :, None]
         outputs_BTCD = torch.cat([query_BT1D, actions_BTCD[:, :, :-1]], dim=2)

@@ -47,10 +47,10 @@ class BinsConfig:
 class BinsHead(nn.Module):
     """Twelve classifiers on the action query; a past action is one token of the history."""
 
-    def __init__(self, config: BinsConfig, width: int, actions: ActionEncoder | None = None) -> None:
+    def __init__(self, hidden_width: int, width: int, actions: ActionEncoder) -> None:
         super().__init__()
-        self.actions = actions or ActionEncoder(config.action_width, width)
-        self.classifiers = bin_classifiers(config.hidden_width, width)
+        self.actions = actions
+        self.classifiers = bin_classifiers(hidden_width, width)
 
     def loss(
         self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
@@ -83,11 +83,9 @@ class BinsHead(nn.Module):
         self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
     ) -> TokenSegment:
         # Bins need all digits, whatever the network computes in.
-        unit_BTC = to_unit_range(actions_BTC.to(torch.float64))
-        unit_BTC = decode_bins(
-            encode_bins(unit_BTC), unit_BTC.dtype
-        )  # past actions as the head would express them
-        return action_segment(self.actions(unit_BTC.to(dtype))[:, :, None], exists_BT)
+        bins_BTC = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))
+        unit_BTC = decode_bins(bins_BTC, torch.float64).to(dtype)  # past actions as the head expresses them
+        return action_segment(self.actions(unit_BTC)[:, :, None], exists_BT)
 
 
 def bin_classifiers(hidden_width: int, width: int) -> nn.ModuleList:

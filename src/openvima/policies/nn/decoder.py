@@ -19,6 +19,7 @@ from torch.nn import functional as F
 from openvima.errors import ConfigError, PolicyError
 from openvima.policies.nn.linear import Linear
 from openvima.policies.nn.mlp import normal_weights
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.policies.nn.unpad import Unpadder
 
 MAX_POSITIONS = 512  # of the history; with a prefix, of prompt and history together
@@ -80,7 +81,7 @@ class PrefixDecoderConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KVCache:
+class KVCache(TensorRecord):
     """Keys and values of everything decoded so far.
 
     Args:
@@ -96,17 +97,6 @@ class KVCache:
     length_B: torch.Tensor
     prompt: tuple[KeysValues, ...]
     prompt_mask_BP: torch.Tensor
-
-    def select(self, rows: Sequence[int]) -> "KVCache":
-        """Return the cache of some rows of the batch."""
-        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BS.device)
-        return KVCache(
-            tuple((key[index], value[index]) for key, value in self.past),
-            self.mask_BS[index],
-            self.length_B[index],
-            tuple((key[index], value[index]) for key, value in self.prompt),
-            self.prompt_mask_BP[index],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,11 +162,9 @@ class CausalDecoder(nn.Module):
             PolicyError: The history is longer than the position table.
         """
         length_B = cache.length_B + mask_BL.sum(dim=1)
-        if (
-            cache.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_POSITIONS
-        ):  # only then synchronise with the device
+        padded = cache.mask_BS.shape[1] + tokens_BLD.shape[1]
+        if padded > MAX_POSITIONS:  # only then synchronise with the device
             check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
-            padded = cache.mask_BS.shape[1] + tokens_BLD.shape[1]
             check_length(padded, 2 * MAX_POSITIONS, f"{self.sequence_name}, padded to the batch,")
         positions_BL = (cache.length_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
         unpadder = Unpadder(torch.ones_like(mask_BL) if valid_BL is None else valid_BL)

@@ -4,7 +4,6 @@ Shape suffixes: B batch, T steps, L prompt positions, Q tokens of a step, K imag
 features, D width of the decoder, E width of an image token, C components of an action.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,13 +19,14 @@ from openvima.policies.nn.decoder import CausalDecoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.scene import END_EFFECTORS
 
 NUM_END_EFFECTORS = len(END_EFFECTORS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EncodedPrompt:
+class EncodedPrompt(TensorRecord):
     """Encoded prompts; constant within an episode.
 
     Args:
@@ -36,11 +36,6 @@ class EncodedPrompt:
 
     tokens_BLD: torch.Tensor
     mask_BL: torch.Tensor
-
-    def select(self, rows: Sequence[int]) -> "EncodedPrompt":
-        """Return the prompts of some rows of the batch."""
-        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BL.device)
-        return EncodedPrompt(self.tokens_BLD[index], self.mask_BL[index])
 
 
 class PolicyNetwork(nn.Module):
@@ -171,9 +166,7 @@ def build_action_tokens(
 def build_bins_head(
     config: BinsConfig | AutoregressiveConfig, width: int, actions: ActionEncoder | ComponentTokens
 ) -> BinsHead | AutoregressiveHead:
-    """Build the head that a config describes, with the tokens of past actions."""
-    if isinstance(config, AutoregressiveConfig):
-        assert isinstance(actions, ComponentTokens)
-        return AutoregressiveHead(config, width, actions)
-    assert isinstance(actions, ActionEncoder)
-    return BinsHead(config, width, actions)
+    """Build the head that goes with the tokens of past actions."""
+    if isinstance(actions, ComponentTokens):
+        return AutoregressiveHead(config.hidden_width, width, actions)
+    return BinsHead(config.hidden_width, width, actions)

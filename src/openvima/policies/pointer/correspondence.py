@@ -8,7 +8,7 @@ Shape suffixes: V views, N objects, M objects they attend to, H heads, F width o
 appearance, D width of an object token, R bins of rotations; `...` any axes, such as batch and steps.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from openvima.policies.nn.mlp import mlp, scale_last
 from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
+from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
 from openvima.policies.pointer.config import CorrespondenceConfig
 
 _UNIT_M = 0.1  # positions are compared in decimetres, so that differences are of the order of 1
@@ -30,7 +31,7 @@ RotationBetween = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tens
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjectFeatures:
+class ObjectFeatures(TensorRecord):
     """Appearance and position of a set of objects.
 
     Args:
@@ -52,21 +53,13 @@ class ObjectFeatures:
     in_scene_N: torch.Tensor
     image_index_N: torch.Tensor
 
-    def _tensors(self) -> tuple[torch.Tensor, ...]:
-        return tuple(getattr(self, name) for name in ObjectFeatures.__slots__)
-
-    def select(self, rows: Sequence[int]) -> "ObjectFeatures":
-        """Return those of some rows of the batch, the first axis."""
-        index = torch.as_tensor(rows, dtype=torch.int64, device=self.masks_VN.device)
-        return ObjectFeatures(*(tensor[index] for tensor in self._tensors()))
-
     def at_each_step(self) -> "ObjectFeatures":
         """Insert an axis of length 1 after the batch, which broadcasts with steps."""
-        return ObjectFeatures(*(tensor.unsqueeze(1) for tensor in self._tensors()))
+        return map_tensors(self, lambda tensor: tensor.unsqueeze(1))
 
     def at_step(self, step: int) -> "ObjectFeatures":
         """Return those of one step, the second axis."""
-        return ObjectFeatures(*(tensor[:, step] for tensor in self._tensors()))
+        return map_tensors(self, lambda tensor: tensor[:, step])
 
     @property
     def exists_N(self) -> torch.Tensor:

@@ -4,16 +4,16 @@ Shape suffixes: B batch, T steps, N objects in view, L positions of the prompt, 
 width of appearance, C components of an action, R bins of rotations.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.policies.pointer.correspondence import ObjectFeatures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObjectSet:
+class ObjectSet(TensorRecord):
     """Objects that were seen before, each at its position then.
 
     Args:
@@ -45,14 +45,9 @@ class ObjectSet:
             rotations_BKR,
         )
 
-    def select(self, rows: Sequence[int]) -> "ObjectSet":
-        """Return those of some rows of the batch."""
-        index = torch.as_tensor(rows, dtype=torch.int64, device=self.masks_BK.device)
-        return ObjectSet(*(getattr(self, name)[index] for name in ObjectSet.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointerPrompt:
+class PointerPrompt(TensorRecord):
     """Encoded prompts; constant within an episode.
 
     Args:
@@ -75,20 +70,6 @@ class PointerPrompt:
     text_appearance_BLA: torch.Tensor
     features: ObjectFeatures
     objects: ObjectSet
-
-    def select(self, rows: Sequence[int]) -> "PointerPrompt":
-        """Return the prompts of some rows of the batch."""
-        index = torch.as_tensor(rows, dtype=torch.int64, device=self.mask_BL.device)
-        return PointerPrompt(
-            self.tokens_BLD[index],
-            self.masked_BLD[index],
-            self.mask_BL[index],
-            self.object_mask_BL[index],
-            self.appearance_BLA[index],
-            self.text_appearance_BLA[index],
-            self.features.select(rows),
-            self.objects.select(rows),
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,6 @@ prompts, M objects in one prompt, V views, N objects in view, Q tokens of a step
 features, A width of appearance, D width of the decoder, C components of an action, R bins of rotations.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -25,6 +24,7 @@ from openvima.policies.nn.history import (
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
 from openvima.policies.pointer.coreference import Coreference, coreference
@@ -45,7 +45,7 @@ SUCTION = END_EFFECTORS.index("suction")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DecodingState:
+class DecodingState(TensorRecord):
     """What is known of the steps so far; all episodes of a batch have equally many.
 
     Args:
@@ -57,11 +57,6 @@ class DecodingState:
     cache: KVCache
     num_steps: int = 0
     first_step: ObjectSet | None = None
-
-    def select(self, rows: Sequence[int]) -> "DecodingState":
-        """Return the state of some rows of the batch."""
-        first_step = self.first_step.select(rows) if self.first_step else None
-        return DecodingState(self.cache.select(rows), self.num_steps, first_step)
 
 
 class Pointer(PolicyNetwork):

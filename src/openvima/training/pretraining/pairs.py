@@ -16,6 +16,7 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool, pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
+from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode
@@ -30,7 +31,7 @@ _DOMAIN = "user"  # neither training nor evaluation episodes are reused
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SecondView:
+class SecondView(TensorRecord):
     """K objects in the rearranged view of their scene.
 
     Args:
@@ -46,7 +47,7 @@ class SecondView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+class Pairs(TensorRecord):
     """K objects, each in a prompt image and in a scene.
 
     Args:
@@ -71,14 +72,6 @@ class Pairs:
     is_grayscale: torch.Tensor
     second_view: SecondView | None = None
 
-    def to(self, device: torch.device) -> "Pairs":
-        """Return the pairs on another device."""
-        return self._each(lambda column: column.to(device))
-
-    def select(self, rows: torch.Tensor) -> "Pairs":
-        """Return some of the pairs."""
-        return self._each(lambda column: column[rows])
-
     def second_view_pairs(self) -> "Pairs":
         """Return the pairs with the second view as prompt images, where it shows the object."""
         view = self.second_view
@@ -87,20 +80,6 @@ class Pairs:
         in_colour = torch.zeros_like(self.is_grayscale)
         pairs = replace(self, prompt_crops=view.crops, prompt_masks=view.masks, is_grayscale=in_colour)
         return pairs.select(is_visible)
-
-    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "Pairs":
-        view = self.second_view
-        return Pairs(
-            change(self.prompt_crops),
-            change(self.prompt_masks),
-            change(self.scene_crops),
-            change(self.scene_masks),
-            change(self.appearances),
-            change(self.scenes),
-            change(self.shapes),
-            change(self.is_grayscale),
-            SecondView(change(view.crops), change(view.masks), change(view.rotations)) if view else None,
-        )
 
 
 @dataclass(frozen=True, slots=True)
