@@ -10,7 +10,7 @@ import yaml
 
 from openvima.errors import InputFileError
 
-MAX_TEXT_BYTES = 256 * 1024  # of a config; the longest of the package has 10 kB
+MAX_TEXT_BYTES = 64 * 1024  # of a config; the longest of the package has 10 kB
 _MAX_DEPTH = 32
 _MAX_INTEGER = 2**63
 _MAX_REASON = 200  # characters

@@ -69,7 +69,7 @@ def test_a_published_file_that_is_a_pipe_or_device_is_refused(tmp_path) -> None:
         ("a: &a [1]\nb: [*a, *a]\n", "holds an alias"),
         ("a: {b: 1}\nc: {<<: {d: " + "[" * 40 + "]" * 40 + "}}\n", "nested deeper than 32"),
         ("a: " + "[" * 5000 + "]" * 5000, "nested deeper than 32"),
-        ("a: " + "x" * 300_000, "more than 262144 bytes"),
+        ("a: " + "x" * 70_000, "more than 65536 bytes"),
         ("a: 0x" + "f" * 9000, "whole number beyond 64 bits"),
         ("a: 2026-13-77", "no valid YAML"),
         ("a: 2026-11-22", "holds a date"),
@@ -110,7 +110,7 @@ def test_a_config_of_more_than_plain_values_is_refused(saved, text: str, message
         ("decoder.dropout", float("nan"), "a number between"),
         ("prompt.train_words", "yes", "true or false"),
         ("prompt.text.num_heads", 0, "describes no network|does not fit"),
-        ("images.crop.width", [1] * 9000, "whole number"),
+        ("images.crop.width", [1] * 900, "whole number"),
     ],
 )
 def test_sizes_beyond_all_reason_are_refused_before_anything_is_built(

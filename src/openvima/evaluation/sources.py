@@ -9,6 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError
+from openvima.input_files import open_regular
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.presets import PRESETS
 from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
@@ -97,7 +98,7 @@ def weights_hash(source: str | Path) -> str:
         raise CheckpointError(f"{source} holds no weights; give the folder of a training run.")
     digest = hashlib.sha256()
     for file in files:
-        with open(file, "rb") as stream:
+        with open_regular(file) as stream:
             digest.update(hashlib.file_digest(stream, "sha256").digest())
     return digest.hexdigest()
 

@@ -26,7 +26,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.checkpoint import load_published
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import T5Tokenizer
-from openvima.policies.tensor_files import read_safetensors
+from openvima.policies.tensor_files import file_digest, read_safetensors
 from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
@@ -47,10 +47,12 @@ class CheckpointInfo:
     Args:
         config: Config of the network.
         dtype: Precision of the stored weights.
+        digest: Of the file of weights; "" if it is not recorded.
     """
 
     config: PolicyConfig
     dtype: torch.dtype
+    digest: str = ""
 
 
 def save_checkpoint(
@@ -103,6 +105,7 @@ def write_checkpoint(
         "policy": _KIND,
         "openvima": __version__,
         "precision": precision,
+        "digest": file_digest(folder / WEIGHTS_FILE),
         "config": config_to_dict(network.config),
     }
     (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
@@ -130,6 +133,11 @@ def load_checkpoint(folder: str | Path) -> PolicyNetwork:
     network = _outline(folder, info.config)
     tensors = _read_weights(folder / WEIGHTS_FILE)
     _check(network, tensors, info.dtype, source=str(folder / WEIGHTS_FILE))
+    if info.digest and info.digest != file_digest(folder / WEIGHTS_FILE):
+        raise CheckpointError(
+            f"{folder / WEIGHTS_FILE} is damaged: its digest is not the one in {CONFIG_FILE}. Take another "
+            "checkpoint, or delete the line `digest` if you changed the weights on purpose."
+        )
     dtype = _COMPUTE_DTYPES.get(info.dtype, info.dtype)
     network.load_state_dict({name: tensor.to(dtype) for name, tensor in tensors.items()}, assign=True)
     return network.to(dtype).eval()  # buffers, too
@@ -154,7 +162,8 @@ def read_info(folder: Path) -> CheckpointInfo:
     if not isinstance(precision, str) or precision not in _PRECISIONS:
         raise CheckpointError(f"{file}: precision is {short(precision)}; allowed: {', '.join(_PRECISIONS)}.")
     try:
-        return CheckpointInfo(config_from_dict(values["config"]), _PRECISIONS[precision])
+        config = config_from_dict(values["config"])
+        return CheckpointInfo(config, _PRECISIONS[precision], str(values.get("digest", "")))
     except ConfigError as error:
         raise CheckpointError(f"{file}: {error}") from error
 

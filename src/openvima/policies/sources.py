@@ -5,6 +5,7 @@ from pathlib import Path
 
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, unknown_name
+from openvima.input_files import read_text
 from openvima.policies.bundled import BUNDLED, bundled_folder
 from openvima.policies.file_names import (
     BEST_FILE,
@@ -72,7 +73,7 @@ def checkpoint_folder(folder: Path) -> Path:
         return folder
     best = checkpoints / BEST_FILE
     if best.is_file():
-        named = checkpoints / best.read_text(encoding="utf-8").strip()
+        named = checkpoints / Path(read_text(best).strip()).name  # never a folder elsewhere
         if named.is_dir():
             return named
     found = sorted(path for path in checkpoints.iterdir() if path.is_dir() and not path.suffix)

@@ -1,5 +1,6 @@
 """Reading files of tensors that others wrote: bounded in time and memory, without executing anything."""
 
+import hashlib
 import re
 import struct
 import zipfile
@@ -83,6 +84,12 @@ def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:  # Any: 
             reason = f"{type(error).__name__}: {_reason(error)}"
             raise InputFileError(f"{file} is a zip archive, but no torch checkpoint ({reason}).") from error
     return values
+
+
+def file_digest(file: Path) -> str:
+    """Return a hash of a file's content."""
+    with open_regular(file) as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:

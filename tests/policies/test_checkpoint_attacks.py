@@ -1,0 +1,21 @@
+"""A short run of each attack of `benchmarks/attack_checkpoints.py`."""
+
+import pytest
+
+pytest.importorskip("torch")
+
+from attack_checkpoints import ATTACKS, run
+
+
+@pytest.mark.parametrize("kind", [kind for kind in ATTACKS if kind != "bombs"])
+def test_mutated_and_damaged_checkpoints_do_no_harm(kind: str) -> None:
+    findings = run(kind, 300, seed=1)
+    assert findings.problems == []
+    assert findings.attacks > 15
+    assert findings.loaded + findings.refused == findings.attacks
+
+
+@pytest.mark.slow
+def test_bombs_do_no_harm() -> None:
+    findings = run("bombs", 0, seed=1)
+    assert findings.problems == []
