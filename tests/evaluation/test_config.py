@@ -13,6 +13,7 @@ from openvima.errors import (
     UnknownTaskError,
 )
 from openvima.evaluation.config import EvaluationConfig, cells, plan
+from openvima.evaluation.runner import evaluate
 from openvima.evaluation.sources import policy_sources, weights_hash
 
 
@@ -133,6 +134,23 @@ def test_names_that_are_no_file_names_are_refused(given):
 def test_an_unknown_policy_is_refused_with_the_names_there_are():
     with pytest.raises(UnknownPolicyError, match="Did you mean 'oracle'"):
         policy_sources(("oracel",))[0].record()
+
+
+@pytest.mark.parametrize(
+    ("policy", "error"),
+    [
+        ("mine=ws://host:port", ConfigError),
+        ("mine=ws://", ConfigError),
+        ("mine=ws://host:1/\x1b[2J", ConfigError),
+        ("mine=http://host:1", UnknownPolicyError),
+        ("nowhere/runs/first", UnknownPolicyError),
+    ],
+)
+def test_names_of_policies_are_checked_before_any_weights_are_read(monkeypatch, tmp_path, policy, error):
+    monkeypatch.setattr("openvima.evaluation.sources.weights_hash", lambda source: pytest.fail("work began"))
+    with pytest.raises(error) as refusal:
+        evaluate(EvaluationConfig(("openvima-small", policy), ("rotate",), ("L1",), out=tmp_path / "out"))
+    assert str(refusal.value).isprintable() and not (tmp_path / "out").exists()
 
 
 def test_a_folder_without_weights_is_refused(tmp_path):

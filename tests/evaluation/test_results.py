@@ -1,6 +1,7 @@
 """Counting outcomes, and writing and reading them."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -115,4 +116,16 @@ def test_equal_causes_of_different_objects_count_as_one(reason, kind):
 def test_a_file_that_is_no_text_is_damaged(tmp_path):
     (tmp_path / "results.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DatasetError, match="damaged"):
+        Results.read(tmp_path)
+
+
+def test_a_number_that_is_not_finite_is_neither_written_nor_read(results, tmp_path):
+    hostile = replace(results, policies={"a": {"kind": "remote", "metadata": {"score": float("nan")}}})
+    with pytest.raises(ValueError, match="JSON compliant"):
+        hostile.write(tmp_path / "results.json")
+    assert list(tmp_path.iterdir()) == []
+    text = results.to_json().replace('"policies": {', '"policies": {"a": {"score": NaN}, ')
+    assert "NaN" in text
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(DatasetError, match="NaN is no JSON"):
         Results.read(tmp_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from served_policies import Telltale
+from served_policies import Telltale, scripted_server
 
 torch = pytest.importorskip("torch")
 
@@ -21,7 +21,7 @@ from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.presets import preset  # noqa: E402
-from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
+from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding")
 TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2)
@@ -154,3 +154,12 @@ def test_servers_are_named_after_their_address_or_as_asked() -> None:
     assert [source.name for source in sources] == ["127.0.0.1-8000", "mine", "1-8000"]
     assert [source.source for source in sources][1:] == ["wss://a.example/x?b=c", "ws://[::1]:8000/p?q=r"]
     assert {source.kind for source in sources} == {"remote"}
+
+
+def test_metadata_that_is_not_finite_never_reaches_results(tmp_path: Path) -> None:
+    with (
+        scripted_server(metadata={"protocol": PROTOCOL, "score": float("nan")}) as url,
+        pytest.raises(ServerError, match="plain, finite values"),
+    ):
+        evaluate(replace(TINY, policies=(f"hostile={url}",), out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

@@ -53,7 +53,9 @@ def main(
     from openvima.evaluation.config import Batch
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
+    from openvima.evaluation.sources import PolicySource
 
+    PolicySource(policy, policy).check()  # before a scene is built
     env_config = EnvConfig(assets, compat, difficulty)
     batch = Batch(
         policy,

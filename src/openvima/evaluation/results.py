@@ -185,7 +185,7 @@ class Results:
             "config": self.config,
             "versions": self.versions,
         }
-        return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+        return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
     def write(self, path: Path) -> Path:
         """Write `results.json`; an interrupted write leaves the old file or none."""
@@ -202,7 +202,7 @@ class Results:
         if not path.is_file():
             raise DatasetError(f"there is no {path}; `openvima evaluate --out {path.parent}` writes one.")
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
             if content.get("schema") != SCHEMA:
                 raise DatasetError(
                     f"{path} has schema {content.get('schema')!r}; this version reads schema {SCHEMA}. "
@@ -222,6 +222,11 @@ def failure_kind(reason: str) -> str:
         'object left the workspace'
     """
     return re.sub(r"\bobject \d+( \([^)]*\))?", "object", reason).strip().rstrip(".") or "unknown"
+
+
+def _refuse_constant(name: str) -> None:
+    """Refuse NaN and infinity, which Python's reader would take."""
+    raise json.JSONDecodeError(f"{name} is no JSON", name, 0)
 
 
 def _in_order(names: Iterable[str]) -> list[str]:

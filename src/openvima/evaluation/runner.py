@@ -50,10 +50,13 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         `results.json` in `config.out`. `openvima.report` adds videos and a page.
 
     Raises:
-        ConfigError: The settings cannot be, or `config.out` holds results of other settings.
+        UnknownPolicyError: There is no policy of a name; nothing was loaded, downloaded or played by then.
+        ConfigError: The settings or an address cannot be, or `config.out` holds results of other settings.
         MissingExtraError: An optional dependency (torch, Ray) is not installed.
         WorkerError: A worker process died; what was finished is kept.
     """
+    for source in config.sources:
+        source.check()
     if config.boxes is not None:
         extractor_maker(config.boxes)  # fails before any episode
     batches = plan(config)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError
+from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import open_regular
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.presets import PRESETS
 from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
 from openvima.serving.client import describe
-from openvima.serving.protocol import is_remote
+from openvima.serving.protocol import check_address, is_remote
 
 ORACLE = "oracle"
 RANDOM = "random"
@@ -44,15 +44,28 @@ class PolicySource:
             return "untrained"
         return self.source if self.source in NAMED_POLICIES else "run"
 
+    def check(self) -> None:
+        """Check the name before any work is done for it; nothing is loaded, hashed or connected to.
+
+        Raises:
+            ConfigError: It looks like the address of a server and cannot be one.
+            UnknownPolicyError: There is no such path, and it is not like an id on the Hub.
+        """
+        if self.kind == "remote":
+            check_address(self.source)
+        elif self.kind == "run" and not is_policy_source(self.source):
+            raise UnknownPolicyError(unknown_policy(self.source, NAMED_POLICIES))
+
     def record(self) -> dict[str, Any]:  # Any: plain values
         """What the policy is; for a trained one with a hash of its weights, for a remote one what it says.
 
         Raises:
-            UnknownPolicyError: There is no such run folder.
+            UnknownPolicyError: As for `check`.
             CheckpointError: The run folder, or the package, holds no weights.
             PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
             ServerError: No policy server answers at the address.
         """
+        self.check()
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
         if self.kind == "run":
@@ -76,8 +89,8 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     names = [source.name for source in sources]
     if any(re.fullmatch(r"\w[\w.+-]*", name) is None for name in names) or len(set(names)) < len(names):
         raise ConfigError(
-            f"policies need distinct names of letters, digits, dots and hyphens, got {', '.join(names)}; "
-            "name them as NAME=PATH."
+            "policies need distinct names of letters, digits, dots and hyphens, got "
+            f"{echo(', '.join(names))}; name them as NAME=PATH."
         )
     return tuple(sources)
 
@@ -86,11 +99,8 @@ def weights_hash(source: str | Path) -> str:
     """SHA-256 over the weights that a folder, file, name or id on the Hub stands for, as hexadecimal text.
 
     Raises:
-        UnknownPolicyError: There is no such folder or file, and it is not like an id on the Hub.
-        CheckpointError: It holds no weights, or the Hub does not give it.
+        CheckpointError: There is no such folder or file, it holds no weights, or the Hub does not give it.
     """
-    if not is_policy_source(str(source)):
-        raise UnknownPolicyError(unknown_policy(str(source), NAMED_POLICIES))
     found = find_checkpoint(source)
     files = [found] if found.is_file() else sorted(found.iterdir())
     files = [file for file in files if file.suffix in _WEIGHTS and file.stem != "optimizer"]
