@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 HEALTH_PATH = "/healthz"
+MAX_FRAGMENTS = 2**16  # of a message; empty ones count for no limit of websockets before 17.4
 CLOSE_S = 2.0  # for the other side to say goodbye
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
@@ -221,7 +222,7 @@ class _PolicyServer:
         while True:
             async with asyncio.timeout(self._config.idle_s):
                 await connection.send(reply)
-                data = await connection.recv()
+                data = await _whole_message(connection)
             request = await loop.run_in_executor(self._reading, session.read, data)
             del data  # it may be large, and the policy may be busy with others
             reply = request
@@ -230,6 +231,18 @@ class _PolicyServer:
             del request
             if isinstance(reply, str):
                 _LOG.warning("%s: refused: %s", _name(connection), reply)
+
+
+async def _whole_message(connection: "ServerConnection") -> bytes | str:
+    """Receive a message of limited size and number of fragments."""
+    from websockets.frames import CloseCode
+
+    parts: list[Any] = []  # Any: all bytes or all texts
+    async for part in connection.recv_streaming():
+        parts.append(part)
+        if len(parts) > MAX_FRAGMENTS:
+            await connection.close(CloseCode.POLICY_VIOLATION, f"more than {MAX_FRAGMENTS} fragments")
+    return type(parts[0])().join(parts)
 
 
 def _set_threads(num_threads: int) -> None:
