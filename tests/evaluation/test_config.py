@@ -141,6 +141,7 @@ def test_an_unknown_policy_is_refused_with_the_names_there_are():
     [
         ("mine=ws://host:port", ConfigError),
         ("mine=ws://", ConfigError),
+        ("ws://[", ConfigError),
         ("mine=ws://host:1/\x1b[2J", ConfigError),
         ("mine=http://host:1", UnknownPolicyError),
         ("nowhere/runs/first", UnknownPolicyError),

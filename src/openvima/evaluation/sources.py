@@ -78,7 +78,8 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
 
     Raises:
-        ConfigError: Two policies have the same name, or a name is not fit for file names.
+        ConfigError: Two policies have the same name, a name is not fit for file names, or an address without
+            a name cannot be one.
     """
     sources = []
     for given in policies:
@@ -115,5 +116,6 @@ def weights_hash(source: str | Path) -> str:
 
 def _default_name(source: str) -> str:
     if is_remote(source):
+        check_address(source)
         return re.sub(r"[^\w.-]+", "-", urlsplit(source).netloc).strip("-")
     return source if source in NAMED_POLICIES else Path(source).name
