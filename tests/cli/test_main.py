@@ -1,11 +1,27 @@
 """The program's frame: overview, unknown verbs, exit codes."""
 
+import errno
+import importlib
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from openvima import __version__
 from openvima.cli.main import VERBS, main
+from openvima.errors import ConfigError
+
+
+def fail_with(error: Exception) -> Callable[[Sequence[str]], int]:
+    """Return a verb that fails."""
+
+    def run(words: Sequence[str]) -> int:
+        raise error
+
+    return run
 
 
 def test_help_lists_every_verb_and_a_first_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,3 +104,74 @@ def test_wrong_input_is_refused_before_any_work(
     assert main(words) == 2
     assert "\n" not in capsys.readouterr().err.strip()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "cannot write here: No space left on device. F",
+        ),
+        (OSError(errno.EDQUOT, "Disk quota exceeded", "a/b"), "cannot write a/b: Disk quota exceeded. Free"),
+        (MemoryError("Unable to allocate 9 GiB"), "out of memory while working on here; lower --workers"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out of memory while working on here"),
+        (RuntimeError("CUDA out of memory."), "out of memory while working on here"),
+    ],
+    ids=["disk", "quota", "memory", "torch", "cuda"],
+)
+def test_a_full_disk_or_memory_is_one_line_with_path_and_remedy(
+    error: Exception, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb = SimpleNamespace(run=fail_with(error))
+    monkeypatch.setattr(importlib, "import_module", lambda name: verb)
+    assert main(["generate", "--out", "here"]) == 1
+    shown = capsys.readouterr().err.strip()
+    assert message in shown
+    assert "\n" not in shown
+
+
+def test_what_a_message_quotes_cannot_steer_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fail = fail_with(ConfigError("\x1b[2J\nname" + 10_000 * "x"))
+    verb = SimpleNamespace(run=fail)
+    monkeypatch.setattr(importlib, "import_module", lambda name: verb)
+    assert main(["generate"]) == 2
+    shown = capsys.readouterr().err.strip()
+    assert shown.isprintable()
+    assert len(shown) < 5000
+
+
+FULL_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
+from openvima.cli.main import main
+sys.exit(main(sys.argv[2:]))
+"""
+VERB_WORDS = {
+    "generate": "--tasks rotate --episodes 20 --out {out}",
+    "evaluate": "--policy oracle --tasks rotate --levels L1 --episodes 40 --out {out}",
+    "demo": "rotate --out {out}/video.mp4",
+    "train": "--data {data} --preset nano --schedule.steps 2 --pretraining.steps 0 --out {out}",
+    "quickstart": "--demonstrations 4 --episodes 2 --out {out}",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="the system does not limit the size of files")
+@pytest.mark.parametrize("verb", VERB_WORDS)
+def test_a_full_disk_ends_every_verb_with_one_line(verb: str, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    assert main(["generate", "--tasks", "rotate", "--episodes", "30", "--out", str(data)]) == 0
+    words = VERB_WORDS[verb].format(out=tmp_path / "out", data=data).split()
+    # Files end at 6 kB: enough for locks and configs, too little for data, weights, results and videos.
+    ended = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, "6000", verb, *words], capture_output=True, text=True, check=False
+    )
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("openvima: ")]
+    assert ended.returncode == 1, ended.stderr
+    assert len(lines) == 1
+    assert str(tmp_path / "out") in lines[0]
+    assert "ree space" in lines[0]
+    assert "Traceback" not in ended.stderr

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from lock_holders import holding
 from openvima.env import EnvConfig
-from openvima.errors import AssetError, ConfigError
+from openvima.errors import AssetError, CheckpointError, ConfigError, FolderLockedError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, runner
 
 ORACLE = EvaluationConfig(
@@ -110,4 +111,36 @@ def test_progress_counts_episodes_up_to_all_of_them(tmp_path):
 def test_an_unknown_asset_pack_is_named_before_anything_is_written(tmp_path):
     with pytest.raises(AssetError, match="nosuch"):
         evaluate(replace(ORACLE, out=tmp_path / "out", env_config=EnvConfig(assets="nosuch")))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_second_evaluation_in_a_folder_is_refused_at_once(tmp_path):
+    with (
+        holding(tmp_path) as process,
+        pytest.raises(FolderLockedError, match=rf"process {process.pid} on .* for 0 min"),
+    ):
+        evaluate(replace(ORACLE, out=tmp_path))
+
+
+def test_outcomes_of_another_evaluation_that_was_killed_go_with_the_next(first, tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "of_others.json").write_text("[]")
+    (tmp_path / "results.json").write_bytes(first.read_bytes())
+    evaluate(replace(ORACLE, out=tmp_path))
+    assert not (tmp_path / "parts").exists()
+
+
+def test_a_damaged_checkpoint_is_named_before_episodes_of_other_policies(tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    from openvima.policies import preset
+    from openvima.policies.build import build_network
+    from openvima.policies.checkpoint import save_checkpoint
+
+    save_checkpoint(build_network(preset("nano"), seed=0), tmp_path / "mine")
+    weights = tmp_path / "mine" / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4])
+    monkeypatch.setattr(runner, "_play_all", lambda *arguments: pytest.fail("episodes were played"))
+    policies = ("oracle", str(tmp_path / "mine"))
+    with pytest.raises(CheckpointError, match="is damaged"):
+        evaluate(replace(ORACLE, policies=policies, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -7,10 +7,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 import yaml  # noqa: E402
+from safetensors import SafetensorError  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
 
-from openvima.errors import CheckpointError  # noqa: E402
-from openvima.policies import checkpoint, preset  # noqa: E402
+from openvima.errors import CheckpointError, StorageError  # noqa: E402
+from openvima.policies import checkpoint, preset, tensor_files  # noqa: E402
 from openvima.policies.build import build_network, outline_network  # noqa: E402
 from openvima.policies.checkpoint import (  # noqa: E402
     CONFIG_FILE,
@@ -306,3 +307,29 @@ def test_a_run_without_a_checkpoint_yet_is_refused(tmp_path) -> None:
     (tmp_path / CHECKPOINTS_FOLDER).mkdir()
     with pytest.raises(CheckpointError, match="no checkpoint"):
         load_policy(str(tmp_path))
+
+
+def test_files_of_a_checkpoint_have_the_mode_of_the_umask(small_sizes, tmp_path) -> None:
+    plain = tmp_path / "plain"
+    plain.touch()
+    save_checkpoint(build_network(small_sizes, seed=3), tmp_path / "checkpoint")
+    modes = {file.name: file.stat().st_mode for file in (tmp_path / "checkpoint").iterdir()}
+    assert modes == dict.fromkeys((WEIGHTS_FILE, CONFIG_FILE), plain.stat().st_mode)
+
+
+def test_weights_that_were_changed_behind_the_config_are_refused(saved) -> None:
+    weights = load_file(saved / WEIGHTS_FILE)
+    weights["query"] = weights["query"] + 1
+    save_file(weights, saved / WEIGHTS_FILE)
+    with pytest.raises(CheckpointError, match="its digest is not the one in"):
+        load_checkpoint(saved)
+
+
+def test_a_full_disk_is_named_with_the_file(small_sizes, tmp_path, monkeypatch) -> None:
+    def fail(*arguments, **options):
+        raise SafetensorError("I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(tensor_files, "save_file", fail)
+    with pytest.raises(StorageError, match=r"model\.safetensors cannot be written .*No space left.*Free"):
+        save_checkpoint(build_network(small_sizes, seed=4), tmp_path / "checkpoint")
+    assert not list(tmp_path.iterdir())

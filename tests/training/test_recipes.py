@@ -189,3 +189,25 @@ def test_what_is_missing_or_unknown_is_wrong_usage(capsys) -> None:
     assert caught.value.code == 2
     assert "--data" in capsys.readouterr().err
     assert main(["train", "--recipe", "papper", "--data", "d", "--out", "r"]) == 2
+
+
+@pytest.mark.parametrize(
+    "text", ["preset: evil:make", "loader: {boxes: 'evil.py:make'}", "loader: {boxes: 'evil=x:make'}"]
+)
+def test_code_that_a_file_names_runs_only_with_trust_code(text: str, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("evil.py", "evil=x.py"):
+        (tmp_path / name).write_text("import pathlib\npathlib.Path('executed').touch()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tmp_path / "theirs.yaml"
+    file.write_text(text)
+    assert main(["train", "--config", str(file), "--data", "demos", "--out", "run"]) == 2
+    assert "names code to run" in capsys.readouterr().err
+    assert not (tmp_path / "executed").exists()
+    assert read_settings(file, trust_code=True)
+
+
+def test_a_detector_folder_in_a_file_is_no_code(tmp_path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("loader: {boxes: 'detector=runs/a:b'}")
+    assert read_settings(file) == {"loader.boxes": "detector=runs/a:b"}

@@ -1,12 +1,16 @@
 """The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
+import argparse
 import errno
 import importlib
+import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from openvima import __version__
-from openvima.errors import OpenVimaError, unknown_name
+from openvima.atomic_io import FREE_SPACE
+from openvima.errors import OpenVimaError, echo, unknown_name
 
 # Verb → summary. Each verb is a module of this package.
 VERBS = {
@@ -25,6 +29,18 @@ VERBS = {
 }
 
 _HELP = ("-h", "--help")
+_MAX_MESSAGE = 4000  # characters
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# How torch, MuJoCo and threads say that there is no memory.
+_NO_MEMORY = re.compile(r"can.?t allocate|could not allocate|out of memory|start new thread", re.IGNORECASE)
+_MEMORY_REMEDIES = {
+    "train": "lower --loader.batch-size or raise --optimizer.grad-accum-steps",
+    "detector": "lower --loader.batch-size",
+    "evaluate": "lower --batch or --workers",
+    "generate": "lower --workers",
+    "quickstart": "lower --workers",
+    "data": "lower --workers",
+}
 
 OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 
@@ -68,12 +84,15 @@ def _run(verb: str, rest: list[str]) -> int:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
             if names_none and hasattr(module, "DEFAULT"):
                 rest = [module.DEFAULT, *rest]
-            return tyro.extras.subcommand_cli_from_dict(
+            status = tyro.extras.subcommand_cli_from_dict(
                 commands, prog=f"openvima {verb}", description=module.__doc__, args=rest
             )
-        if hasattr(module, "run"):  # parses its own arguments
-            return module.run(rest)
-        return tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
+        elif hasattr(module, "run"):  # parses its own arguments
+            status = module.run(rest)
+        else:
+            status = tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
+        sys.stdout.flush()  # while a full disk can still be reported
+        return status
     except OpenVimaError as error:
         usage = isinstance(error, ValueError | KeyError | ImportError)
         return _fail(f"{type(error).__name__}: {error}", 2 if usage else 1)
@@ -83,15 +102,31 @@ def _run(verb: str, rest: list[str]) -> int:
         sys.stderr.close()
         return 1
     except OSError as error:  # an unusable path, or a full disk
+        reason = error.strerror or type(error).__name__
+        if error.errno in _NO_SPACE:
+            return _fail(f"cannot write {error.filename or _out(rest)}: {reason}. {FREE_SPACE}", 1)
         if error.filename is None:
             return _fail(f"{type(error).__name__}: {error}", 1)
-        reason = error.strerror or type(error).__name__
         message = f"cannot use {error.filename}: {reason}. Give a path that can be read and written."
-        return _fail(message, 1 if error.errno == errno.ENOSPC else 2)
+        return _fail(message, 2)
+
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
+            raise
+        remedy = _MEMORY_REMEDIES.get(verb, "close other programs")
+        return _fail(f"out of memory while working on {_out(rest)}; {remedy}. Complete files were kept.", 1)
+
+
+def _out(words: Sequence[str]) -> str:
+    """Return the path that the arguments of a verb name as --out, else the current folder."""
+    known = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    known.add_argument("--out", nargs="?")
+    return known.parse_known_args([*words])[0].out or str(Path.cwd())
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"openvima: {message}", file=sys.stderr)
+    """Print a message in one line; what it quotes of a file may hold anything."""
+    print(f"openvima: {echo(message, _MAX_MESSAGE)}", file=sys.stderr)
     return status
 
 

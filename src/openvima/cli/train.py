@@ -27,7 +27,8 @@ Example: openvima train --data demos --preset nano --out run
 presets and your own learners, else "paper". --init-from disables the pretraining of recipe and file; set
 --pretraining.steps to pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
-the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
+the file, and the file over the recipe. Code that the file names, as a learner or detector of your own, runs
+only with --trust-code. The defaults below are those of the selected recipe and file.
 
 Several GPUs or machines: torchrun --nproc-per-node 8 -m openvima train --data demos --out run ...
 """
@@ -50,12 +51,13 @@ def run(words: Sequence[str]) -> int:
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--recipe")
     first.add_argument("--config", type=Path)
+    first.add_argument("--trust-code", action="store_true")
     chosen, rest = first.parse_known_args(list(words))
     peek = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name, option in {"preset": "", "init_from": "", "steps": "schedule.", "epochs": "schedule."}.items():
         peek.add_argument(f"--{option}{name.replace('_', '-')}", f"--{option}{name}", dest=name)
     known, _ = peek.parse_known_args(rest)
-    file = read_settings(chosen.config) if chosen.config else {}
+    file = read_settings(chosen.config, trust_code=chosen.trust_code) if chosen.config else {}
     preset = known.preset or file.get("preset")
     settings = overridden(recipe_settings(chosen.recipe or default_recipe(preset or "nano")), file)
     if known.steps and not known.epochs:

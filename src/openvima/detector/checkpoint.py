@@ -5,10 +5,9 @@ from pathlib import Path
 
 import torch
 import yaml
-from safetensors.torch import save_file
 
 from openvima import __version__
-from openvima.atomic_io import atomic_folder, restore_folder
+from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.detector.config import DetectorConfig
 from openvima.detector.network import MaskRCNN
 from openvima.errors import CheckpointError, ConfigError, InputFileError
@@ -17,7 +16,7 @@ from openvima.policies.differences import described, listed
 from openvima.policies.file_names import CONFIG_FILE, WEIGHTS_FILE
 from openvima.policies.nn.meta_init import MetaInit
 from openvima.policies.sources import checkpoint_folder
-from openvima.policies.tensor_files import read_safetensors
+from openvima.policies.tensor_files import read_safetensors, write_safetensors
 
 _KIND = "detector"
 _MAX_LISTED = 5  # names per kind of problem in a message
@@ -56,9 +55,9 @@ def write_network(network: MaskRCNN, folder: Path, weights: Mapping[str, torch.T
         for name, tensor in weights.items()
         if not name.endswith(_COUNTER)
     }
-    save_file(tensors, folder / WEIGHTS_FILE)
+    write_safetensors(tensors, folder / WEIGHTS_FILE)
     values = {"policy": _KIND, "openvima": __version__, "config": network.config.to_dict()}
-    (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    atomic_write_file(folder / CONFIG_FILE, yaml.safe_dump(values, sort_keys=False))
 
 
 def load_network(path: str | Path) -> MaskRCNN:

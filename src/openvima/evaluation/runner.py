@@ -16,12 +16,30 @@ from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
 LOG_NAME = "evaluation_log.json"
 _PARTS = "parts"
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedEvaluation:
+    """An evaluation whose names are checked.
+
+    Args:
+        config: What to evaluate.
+        batches: The batches of episodes.
+        policies: What each policy is, by name.
+        versions: Versions of the packages that decide the results.
+    """
+
+    config: EvaluationConfig
+    batches: tuple[Batch, ...]
+    policies: dict[str, dict[str, Any]]  # Any: plain values
+    versions: dict[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,25 +72,53 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         ConfigError: The settings or an address cannot be, or `config.out` holds results of other settings.
         MissingExtraError: An optional dependency (torch, Ray) is not installed.
         WorkerError: A worker process died; what was finished is kept.
+        FolderLockedError: Another evaluation writes to `config.out`.
+    """
+    prepared = prepare(config)
+    with folder_lock(config.out):
+        return evaluate_prepared(prepared, report)
+
+
+def prepare(config: EvaluationConfig) -> PreparedEvaluation:
+    """Check the names of policies and detector, before any episode and any file.
+
+    Raises:
+        OpenVimaError: As for `evaluate`.
     """
     for source in config.sources:
         source.check()
     if config.boxes is not None:
-        extractor_maker(config.boxes)  # fails before any episode
+        extractor_maker(config.boxes)
     batches = plan(config)
     policies = {source.name: source.record() for source in config.sources}
     found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
+    return PreparedEvaluation(config, tuple(batches), policies, found)
+
+
+def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None) -> Path:
+    """Evaluate into a folder whose lock is held; see `evaluate`."""
+    config, policies, found = prepared.config, prepared.policies, prepared.versions
     path = config.out / FILE_NAME
     results = _earlier(path, config, policies, found)
     if results is None:
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
+        _check_weights(config)
         started = time.perf_counter()
-        outcomes = _play_all(config, batches, policies, found, report)
-        results = Results(rows_of(batches, outcomes), config.record(), found, policies)
+        outcomes = _play_all(config, prepared.batches, policies, found, report)
+        results = Results(rows_of(prepared.batches, outcomes), config.record(), found, policies)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)
-        shutil.rmtree(config.out / _PARTS, ignore_errors=True)
+    shutil.rmtree(config.out / _PARTS, ignore_errors=True)
     return path
+
+
+def _check_weights(config: EvaluationConfig) -> None:
+    """Load each network once, so that a damaged one is named before episodes of the others."""
+    for source in config.sources:
+        if source.kind == "run":
+            from openvima.policies.checkpoint import load_network
+
+            load_network(source.source)
 
 
 def _earlier(

@@ -12,10 +12,9 @@ from reprlib import repr as short
 
 import torch
 import yaml
-from safetensors.torch import save_file
 
 from openvima import __version__
-from openvima.atomic_io import atomic_folder, restore_folder
+from openvima.atomic_io import atomic_folder, atomic_write_file, restore_folder
 from openvima.errors import CheckpointError, ConfigError, InputFileError
 from openvima.input_files import read_yaml
 from openvima.policies.build import outline_network
@@ -26,7 +25,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.checkpoint import load_published
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import T5Tokenizer
-from openvima.policies.tensor_files import file_digest, read_safetensors
+from openvima.policies.tensor_files import file_digest, read_safetensors, write_safetensors
 from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
@@ -100,7 +99,7 @@ def write_checkpoint(
     weights = network.state_dict() if weights is None else weights
     tensors = {name: tensor.detach().to("cpu", dtype).contiguous() for name, tensor in weights.items()}
     _check_range(tensors, weights)
-    save_file(tensors, folder / WEIGHTS_FILE)
+    write_safetensors(tensors, folder / WEIGHTS_FILE)
     values = {
         "policy": _KIND,
         "openvima": __version__,
@@ -108,7 +107,7 @@ def write_checkpoint(
         "digest": file_digest(folder / WEIGHTS_FILE),
         "config": config_to_dict(network.config),
     }
-    (folder / CONFIG_FILE).write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    atomic_write_file(folder / CONFIG_FILE, yaml.safe_dump(values, sort_keys=False))
     if isinstance(tokenizer, T5Tokenizer):
         tokenizer.save(folder / TOKENIZER_FOLDER)
 

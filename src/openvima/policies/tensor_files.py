@@ -1,7 +1,9 @@
-"""Reading files of tensors that others wrote: bounded in time and memory, without executing anything."""
+"""Files of tensors. Reading those of others is bounded in time and memory, and executes nothing."""
 
 import hashlib
+import os
 import re
+import stat
 import struct
 import zipfile
 import zlib
@@ -11,9 +13,11 @@ from reprlib import repr as short
 from typing import Any, BinaryIO
 
 import torch
-from safetensors.torch import load_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 
-from openvima.errors import CheckpointError, InputFileError
+from openvima.atomic_io import FREE_SPACE
+from openvima.errors import CheckpointError, InputFileError, StorageError
 from openvima.input_files import open_regular
 from openvima.pickle_opcodes import OPCODES, check_opcodes
 from openvima.policies.differences import listed
@@ -84,6 +88,21 @@ def read_archive(file: Path, *, classes: Collection[type] = ()) -> Any:  # Any: 
             reason = f"{type(error).__name__}: {_reason(error)}"
             raise InputFileError(f"{file} is a zip archive, but no torch checkpoint ({reason}).") from error
     return values
+
+
+def write_safetensors(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
+    """Write a safetensors file, readable for whoever the umask allows; safetensors makes it private.
+
+    Raises:
+        StorageError: It cannot be written, for example because the disk is full.
+    """
+    try:
+        with file.open("wb") as stream:
+            mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
+        save_file(dict(tensors), file)
+        file.chmod(mode)
+    except (OSError, SafetensorError) as error:
+        raise StorageError(f"{file} cannot be written ({_reason(error)}). {FREE_SPACE}") from error
 
 
 def file_digest(file: Path) -> str:
@@ -166,6 +185,8 @@ def _check_pickle(content: bytes, classes: Container[str]) -> None:
         raise InputFileError(
             f"holds {len(content)} bytes besides its tensors; at most {_MAX_PICKLE_BYTES} are read."
         )
+    if not content.startswith(b"\x80\2"):
+        raise InputFileError("has a pickle of another protocol than 2, which torch writes.")
     try:
         names = check_opcodes(content, max_operations=_MAX_OPERATIONS, opcodes=_OPCODES)
     except InputFileError as error:

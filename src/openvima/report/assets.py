@@ -14,8 +14,9 @@ from openvima.evaluation.config import (
     cells,
 )
 from openvima.evaluation.results import Results, Row
-from openvima.evaluation.runner import evaluate
+from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.evaluation.sources import PolicySource
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import BUNDLED
 from openvima.report.page import default_command, write_report
@@ -98,17 +99,19 @@ def evaluate_and_report(
     """
     require_extra()
     requested_episodes(config, videos)
-    path = evaluate(config, progress)
-    results = Results.read(path)
-    episodes = sum(row.episodes for row in results.rows)
-    note = None if progress is None else lambda text: progress(episodes, episodes, text)
-    write_report(
-        results,
-        config.out / REPORT_NAME,
-        command=default_command(results, config.policies),
-        metrics=find_metrics(config.sources),
-        clips=_recorded(recording_jobs(config, videos, results), config, note),
-    )
+    prepared = prepare(config)
+    with folder_lock(config.out):
+        path = evaluate_prepared(prepared, progress)
+        results = Results.read(path)
+        episodes = sum(row.episodes for row in results.rows)
+        note = None if progress is None else lambda text: progress(episodes, episodes, text)
+        write_report(
+            results,
+            config.out / REPORT_NAME,
+            command=default_command(results, config.policies),
+            metrics=find_metrics(config.sources),
+            clips=_recorded(recording_jobs(config, videos, results), config, note),
+        )
     return path
 
 

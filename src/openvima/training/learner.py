@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import nn
 
 from openvima.errors import CheckpointError, ConfigError
@@ -19,7 +18,7 @@ from openvima.policies.config import config_to_dict
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
-from openvima.policies.tensor_files import read_safetensors
+from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example, stack_images
@@ -60,7 +59,7 @@ class Learner(nn.Module):
             weights: State dict of the learner, gathered if sharded.
         """
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in weights.items()}
-        save_file(tensors, folder / WEIGHTS_FILE)
+        write_safetensors(tensors, folder / WEIGHTS_FILE)
 
     def read(self, folder: Path) -> None:
         """Load the weights of a checkpoint.

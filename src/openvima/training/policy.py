@@ -18,6 +18,7 @@ from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer
 from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
+from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
 
@@ -43,6 +44,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
         PromptError: A prompt has a word that the policy's vocabulary lacks.
+        FolderLockedError: Another run writes to the folder.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
     config = resolved(config)
@@ -50,7 +52,11 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     dataset = Dataset(config.data)
     boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
     runtime = config.runtime
-    with torch_threads(runtime.threads), joined(runtime.device, runtime.sharding) as parallel:
+    with (
+        torch_threads(runtime.threads),
+        joined(runtime.device, runtime.sharding) as parallel,
+        run_lock(config.out, is_first=parallel.is_first),
+    ):
         learner = build_learner(config)
         if boxes and learner.input_kind == "frames":
             raise ConfigError(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from reprlib import repr as short
 from types import MappingProxyType
 from typing import Any
 
@@ -110,13 +111,20 @@ def recipe_settings(name: str) -> dict[str, Any]:
     return dict(RECIPES[name])
 
 
-def read_settings(file: Path) -> dict[str, Any]:
+_CODE = ("preset", "loader.boxes")  # settings that may name a function as module:function
+
+
+def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:
     """Read settings from a YAML file, by dotted name: nested fields of `TrainingConfig` and their values.
 
     The `config.yaml` of a run folder is such a file, too: its part "training" counts.
 
+    Args:
+        file: The file.
+        trust_code: Whether it may name code, as a learner or detector of your own.
+
     Raises:
-        ConfigError: It is missing, no YAML, or holds a name that is no setting.
+        ConfigError: It is missing, no YAML, holds a name that is no setting, or names code.
     """
     try:
         values = read_yaml(file)
@@ -131,7 +139,18 @@ def read_settings(file: Path) -> dict[str, Any]:
     values, known = flattened(values), setting_types(TrainingConfig)
     if problems := [unknown_name(f"setting in {file} called", n, known) for n in values if n not in known]:
         raise ConfigError(" ".join(problems))
+    code = [f"{name} {short(value)}" for name in _CODE if _is_code(value := values.get(name))]
+    if code and not trust_code:
+        raise ConfigError(
+            f"{file} names code to run: {', '.join(code)}. Nothing was executed. If you trust the file, add "
+            "--trust-code."
+        )
     return {name: converted(value, known[name]) for name, value in values.items()}
+
+
+def _is_code(value: object) -> bool:
+    """Whether a setting names a function; `detector=FOLDER` names a detector."""
+    return ":" in str(value) and not str(value).startswith("detector=")
 
 
 def overridden(settings: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:

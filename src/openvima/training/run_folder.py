@@ -14,19 +14,20 @@ Files and checkpoints are written under a temporary name and renamed when comple
 import json
 import shutil
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
-from safetensors.torch import save_file
 
-from openvima.atomic_io import atomic_write_file
+from openvima.atomic_io import atomic_write_file, naming, remove_stale
 from openvima.errors import CheckpointError, ConfigError, InputFileError
+from openvima.folder_lock import folder_lock, is_lock_file
 from openvima.input_files import read_json, read_yaml
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
-from openvima.policies.tensor_files import read_safetensors
+from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
 from openvima.training.tensorboard import BOARD_FOLDER
 from openvima.training.validation import flattened
@@ -38,6 +39,15 @@ SESSIONS_FILE = "sessions_log.jsonl"
 OPTIMIZER_FILE = "optimizer.safetensors"
 STATE_FILE = "state.json"
 _PARTIAL = ".partial"
+
+
+def run_lock(path: Path, *, is_first: bool) -> AbstractContextManager[None]:
+    """Return the lock of a run folder; of several processes of a run the first holds it.
+
+    Raises:
+        FolderLockedError: Another run writes to the folder.
+    """
+    return folder_lock(path) if is_first else nullcontext()
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +118,7 @@ class RunFolder:
         self.checkpoints.mkdir(parents=True, exist_ok=True)
         for leftover in self.checkpoints.glob(f"*{_PARTIAL}"):
             shutil.rmtree(leftover)
+        remove_stale(self.checkpoints)
         atomic_write_file(path / CONFIG_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def latest(self) -> Path | None:
@@ -133,9 +144,9 @@ class RunFolder:
             for parameter, values in state.optimizer.items()
             for name, tensor in values.items()
         }
-        save_file(tensors, partial / OPTIMIZER_FILE)
+        write_safetensors(tensors, partial / OPTIMIZER_FILE)
         progressed = {field: getattr(progress, field) for field in Progress.__slots__}
-        (partial / STATE_FILE).write_text(json.dumps(progressed), encoding="utf-8")
+        atomic_write_file(partial / STATE_FILE, json.dumps(progressed))
         final = self.checkpoints / name
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
@@ -177,7 +188,7 @@ class RunFolder:
 
     def append(self, file: str, values: dict[str, Any]) -> None:
         """Add one line to `METRICS_FILE` or `TIMINGS_FILE`."""
-        with (self.path / file).open("a", encoding="utf-8") as lines:
+        with naming(self.path / file), (self.path / file).open("a", encoding="utf-8") as lines:
             lines.write(json.dumps(values) + "\n")
 
     def rewind_to(self, progress: Progress) -> None:
@@ -203,7 +214,7 @@ class RunFolder:
     def _differences(self, settings: dict[str, Any]) -> list[str]:
         file = self.path / CONFIG_FILE
         if not file.is_file():
-            if self.path.is_dir() and any(self.path.iterdir()):
+            if self.path.is_dir() and not all(map(is_lock_file, self.path.iterdir())):
                 return [f"it is not empty and has no {CONFIG_FILE}"]
             return []
         try:

@@ -21,6 +21,7 @@ from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes
 from openvima.training.loop import Metrics, PlannedStage, Report, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.run_folder import run_lock
 from openvima.training.schedule import step_generator, step_seed
 
 VALIDATION_BATCH = 8  # frames
@@ -41,6 +42,7 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             processes.
         DatasetError: There are not enough demonstrations.
         CheckpointError: The last checkpoint, or the initial one, is damaged.
+        FolderLockedError: Another run writes to the folder.
     """
     dataset, loader = Dataset(config.data), config.loader
     training, held_out = split_episodes(dataset, loader.validation_fraction)
@@ -51,7 +53,11 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             "Generate more, lower loader.batch_size, or raise loader.validation_fraction."
         )
     runtime = config.runtime
-    with torch_threads(runtime.threads), joined(runtime.device, runtime.sharding) as parallel:
+    with (
+        torch_threads(runtime.threads),
+        joined(runtime.device, runtime.sharding) as parallel,
+        run_lock(config.out, is_first=parallel.is_first),
+    ):
         if parallel.num_ranks > 1:
             raise ConfigError("a detector trains in one process; start it without torchrun.")
         learner = DetectorLearner(_network(config), sampled=config.proposals_per_frame)
