@@ -1,16 +1,15 @@
 """Configs of all architectures, as validated frozen dataclasses."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, replace
 from reprlib import repr as short
-from types import NoneType, UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 from openvima.errors import ConfigError, unknown_name
+from openvima.policies.config_fields import build_config
 from openvima.policies.flamingo.config import FlamingoConfig
 from openvima.policies.gato.config import GatoConfig
 from openvima.policies.gpt.config import GptConfig
-from openvima.policies.limits import check_field
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.bins import BinsConfig
@@ -38,7 +37,7 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whateve
     if not isinstance(architecture, str) or architecture not in ARCHITECTURES:
         raise ConfigError(unknown_name("architecture", short(architecture).strip("'"), ARCHITECTURES))
     sizes = {name: value for name, value in values.items() if name != "architecture"}
-    return _build(ARCHITECTURES[architecture], sizes, "policy")
+    return build_config(ARCHITECTURES[architecture], sizes, "policy")
 
 
 def appearance_width(config: PolicyConfig) -> int:
@@ -68,39 +67,3 @@ def with_autoregression(config: PolicyConfig, wanted: bool = True) -> PolicyConf
 def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
     """Return the same network with or without the visual residual in its prompt encoder."""
     return replace(config, prompt=replace(config.prompt, visual_residual=wanted))
-
-
-def _build(kind: type, values: Any, where: str) -> Any:  # Any: dataclasses of several kinds
-    if not isinstance(values, Mapping):
-        raise ConfigError(
-            f"{where} is {short(values)}; it must be a mapping of the fields of {kind.__name__}."
-        )
-    hints = get_type_hints(kind)
-    names = [field.name for field in fields(kind)]
-    unknown = [str(name) for name in values if name not in names]
-    if unknown:
-        raise ConfigError(f"{where} has unknown fields {', '.join(unknown)}; allowed: {', '.join(names)}.")
-    for name, value in values.items():
-        check_field(hints[name], value, f"{where}.{name}")
-    arguments = {name: _value(hints[name], value, f"{where}.{name}") for name, value in values.items()}
-    try:
-        return kind(**arguments)
-    except (TypeError, ArithmeticError) as error:
-        raise ConfigError(f"{where}: {error}.") from error
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:  # Any: a type as written in the dataclass
-    if isinstance(hint, UnionType):
-        if value is None and NoneType in get_args(hint):
-            return None
-        options = [option for option in get_args(hint) if option is not NoneType]
-        hint = max(options, key=lambda option: _num_shared_fields(option, value))
-    return _build(hint, value, where) if is_dataclass(hint) and isinstance(hint, type) else value
-
-
-def _num_shared_fields(kind: Any, value: Any) -> int:  # Any: a type as written in the dataclass
-    """Score how well a mapping matches the fields of a dataclass, to resolve unions."""
-    if not is_dataclass(kind) or not isinstance(value, Mapping):
-        return 0
-    names = {field.name for field in fields(kind)}
-    return len(names & set(value)) - len(names ^ set(value))
