@@ -75,9 +75,8 @@ def bowl_collision() -> tuple[CollisionShape, ...]:
     # Chords of the inner circle cut corners: stretch the inner radius so that the flat faces touch it.
     reach = 1 / math.cos(math.pi / _BOWL_WALL_PARTS)
     low, high = 0.0, _BOWL_RIM_Z
-    floor = [
-        (0.074 * x, 0.074 * y, z) for x, y in around[:-1] for z in (low, _BOWL_FLOOR_Z - 0.001)
-    ]  # hulls touch 1 mm away
+    floor_heights = (low, _BOWL_FLOOR_Z - 0.001)  # hulls touch 1 mm away
+    floor = [(0.074 * x, 0.074 * y, z) for x, y in around[:-1] for z in floor_heights]
     section = (
         (0.0797, low),
         (0.0690 * reach, low),

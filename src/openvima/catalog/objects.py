@@ -182,13 +182,7 @@ _SPECS = (
         friction=0.5,
         inertia_diag=(4.5e-07, 4.5e-07, 4.5e-07),
     ),
-    _fixed_size(
-        "line",
-        "box",
-        (0.25, 0.04, 0.001),
-        rolling_friction=0.0,
-        inertia_diag=(2e-07, 2e-07, 2e-07),
-    ),
+    _fixed_size("line", "box", (0.25, 0.04, 0.001), rolling_friction=0.0, inertia_diag=(2e-07, 2e-07, 2e-07)),
     _fixed_size(
         "square",
         "compound",

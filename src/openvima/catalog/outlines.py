@@ -198,14 +198,6 @@ def _cross() -> list[Loop]:
     ]
 
 
-def _diamond() -> list[Loop]:
-    return [[(0.06, 0.0), (0.0, 0.048), (-0.06, 0.0), (0.0, -0.048)]]
-
-
-def _triangle() -> list[Loop]:
-    return [[(0.0, -0.048), (0.048, 0.048), (-0.048, 0.048)]]
-
-
 def _flower() -> list[Loop]:
     radius = 0.027
     petals = []
@@ -232,26 +224,10 @@ def _heart() -> list[Loop]:
     return [_mirrored([*flank, *lobe])]
 
 
-def _hexagon() -> list[Loop]:
-    return [regular_polygon(6, 0.054, first_rad=math.pi / 2)]
-
-
-def _pentagon() -> list[Loop]:
-    return [regular_polygon(5, 0.0541, first_rad=-math.pi / 2, centre=(0.0, 0.0052))]
-
-
 def _l_shaped_block() -> list[Loop]:
     half, width = 0.048, 0.0288
     inside = width - half
     return [[(-half, -half), (half, -half), (half, inside), (inside, inside), (inside, half), (-half, half)]]
-
-
-def _ring() -> list[Loop]:
-    return [regular_polygon(32, 0.048), regular_polygon(16, 0.0205)]
-
-
-def _round() -> list[Loop]:
-    return [regular_polygon(40, 0.048)]
 
 
 def _star() -> list[Loop]:
@@ -270,14 +246,14 @@ _OUTLINES: dict[str, Callable[[], list[Loop]]] = {
     "letter T": _letter_t,
     "letter V": _letter_v,
     "cross": _cross,
-    "diamond": _diamond,
-    "triangle": _triangle,
+    "diamond": lambda: [[(0.06, 0.0), (0.0, 0.048), (-0.06, 0.0), (0.0, -0.048)]],
+    "triangle": lambda: [[(0.0, -0.048), (0.048, 0.048), (-0.048, 0.048)]],
     "flower": _flower,
     "heart": _heart,
-    "hexagon": _hexagon,
-    "pentagon": _pentagon,
+    "hexagon": lambda: [regular_polygon(6, 0.054, first_rad=math.pi / 2)],
+    "pentagon": lambda: [regular_polygon(5, 0.0541, first_rad=-math.pi / 2, centre=(0.0, 0.0052))],
     "L-shaped block": _l_shaped_block,
-    "ring": _ring,
-    "round": _round,
+    "ring": lambda: [regular_polygon(32, 0.048), regular_polygon(16, 0.0205)],
+    "round": lambda: [regular_polygon(40, 0.048)],
     "star": _star,
 }

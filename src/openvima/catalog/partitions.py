@@ -23,32 +23,18 @@ LEVEL_TITLES: dict[str, str] = {
 }
 """Names of the test levels in publications."""
 
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(text.split(", "))
+
+
 _LETTERS = tuple(f"letter {letter}" for letter in "AEGMTV")
 _ALL_LETTERS = tuple(f"letter {letter}" for letter in "AEGMRTV")
-_ADJECTIVE_TRAIN = (
-    *_LETTERS,
-    "cross",
-    "triangle",
-    "flower",
-    "heart",
-    "ring",
-    "pentagon",
-    "L-shaped block",
-)
+_ADJECTIVE_TRAIN = (*_LETTERS, "cross", "triangle", "flower", "heart", "ring", "pentagon", "L-shaped block")
 _NOVEL = ("letter R", "diamond", "hexagon", "round", "star")
 _ALL_KIT = (
-    "L-shaped block",
-    *_ALL_LETTERS,
-    "cross",
-    "diamond",
-    "triangle",
-    "flower",
-    "heart",
-    "hexagon",
-    "pentagon",
-    "ring",
-    "round",
-    "star",
+    *("L-shaped block", *_ALL_LETTERS, "cross", "diamond", "triangle", "flower", "heart"),
+    *("hexagon", "pentagon", "ring", "round", "star"),
 )
 
 OBJECT_SETS: dict[str, tuple[str, ...]] = {
@@ -81,48 +67,17 @@ _WITH_DARK = tuple(
     for name in (*_LIGHT_PLAIN, *(name for name in _LIGHT if name not in _LIGHT_PLAIN))
     if TEXTURES[name].dark_variant
 )
-_C1 = (
-    "red",
-    "green",
-    "yellow",
-    "granite",
-    "polka dot",
-    "tiger",
-    "rainbow",
-    "red and yellow stripe",
-    "yellow and green stripe",
-    "red and yellow polka dot",
-    "red and green polka dot",
-    "red and blue polka dot",
-    "yellow and blue polka dot",
-    "green and blue polka dot",
-    "red swirl",
-    "green swirl",
-    "red paisley",
-    "yellow paisley",
-    "green paisley",
+_C1 = _names(
+    "red, green, yellow, granite, polka dot, tiger, rainbow, red and yellow stripe, yellow and green "
+    "stripe, red and yellow polka dot, red and green polka dot, red and blue polka dot, yellow and blue "
+    "polka dot, green and blue polka dot, red swirl, green swirl, red paisley, yellow paisley, green "
+    "paisley"
 )
-_C2 = (
-    "blue",
-    "purple",
-    "cyan",
-    "olive",
-    "tiles",
-    "wooden",
-    "plastic",
-    "checkerboard",
-    "red and blue stripe",
-    "yellow and blue stripe",
-    "red and purple stripe",
-    "yellow and purple stripe",
-    "green and purple stripe",
-    "blue and purple stripe",
-    "yellow and purple polka dot",
-    "green and purple polka dot",
-    "blue and purple polka dot",
-    "purple swirl",
-    "blue swirl",
-    "blue paisley",
+_C2 = _names(
+    "blue, purple, cyan, olive, tiles, wooden, plastic, checkerboard, red and blue stripe, yellow and "
+    "blue stripe, red and purple stripe, yellow and purple stripe, green and purple stripe, blue and "
+    "purple stripe, yellow and purple polka dot, green and purple polka dot, blue and purple polka dot, "
+    "purple swirl, blue swirl, blue paisley"
 )
 
 
@@ -218,23 +173,13 @@ _L4: dict[str, _SetNames] = {
 
 def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
     return {
-        task: Pool(
-            OBJECT_SETS[dragged],
-            OBJECT_SETS[base],
-            TEXTURE_SETS[dragged_textures],
-            TEXTURE_SETS[base_textures],
-        )
-        for task, (dragged, base, dragged_textures, base_textures) in table.items()
+        task: Pool(*(OBJECT_SETS[name] for name in names[:2]), *(TEXTURE_SETS[name] for name in names[2:]))
+        for task, names in table.items()
     }
 
 
-_POOLS: dict[str, dict[str, Pool]] = {
-    "train": _pools(_TRAIN),
-    "L1": _pools(_TRAIN),
-    "L2": _pools(_L2),
-    "L3": _pools(_L3),
-    "L4": _pools(_L4),
-}
+_TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4)
+_POOLS = {level: _pools(table) for level, table in zip(LEVELS, _TABLES, strict=True)}
 _ALL_TASKS = (*_TRAIN, *_L4)
 
 

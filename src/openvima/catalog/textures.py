@@ -6,6 +6,7 @@ lowered by 0.3.
 
 import colorsys
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 from openvima.errors import UnknownTextureError, unknown_name
@@ -31,29 +32,10 @@ BASE_COLOURS: dict[str, tuple[int, int, int]] = {
 
 NEUTRAL_COLOUR = (186, 176, 172)
 SPECIAL_NAMES = (
-    "brick",
-    "tiles",
-    "wooden",
-    "granite",
-    "plastic",
-    "polka dot",
-    "checkerboard",
-    "tiger",
-    "magma",
+    *("brick", "tiles", "wooden", "granite", "plastic", "polka dot", "checkerboard", "tiger", "magma"),
     "rainbow",
 )
-COLOUR_PAIRS = (
-    ("red", "yellow"),
-    ("red", "green"),
-    ("red", "blue"),
-    ("red", "purple"),
-    ("yellow", "green"),
-    ("yellow", "blue"),
-    ("yellow", "purple"),
-    ("green", "blue"),
-    ("green", "purple"),
-    ("blue", "purple"),
-)
+COLOUR_PAIRS = tuple(combinations(("red", "yellow", "green", "blue", "purple"), 2))
 PATTERN_COLOURS = ("red", "yellow", "green", "blue", "purple")
 _WITHOUT_DARK_VARIANT = ("olive",)
 
