@@ -89,12 +89,7 @@ class MaskRCNN(nn.Module):
         return found
 
     def losses(
-        self,
-        images: torch.Tensor,
-        targets: Sequence[Instances],
-        *,
-        sampled: int,
-        generator: torch.Generator,
+        self, images: torch.Tensor, targets: Sequence[Instances], *, sampled: int, generator: torch.Generator
     ) -> dict[str, torch.Tensor]:
         """Return the losses of a batch by name; training minimises their sum.
 

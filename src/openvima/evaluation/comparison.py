@@ -191,9 +191,8 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
     known = results.policy_names()
-    policy, _, ablation = (
-        (name, "", "") if name in known else name.rpartition(ABLATION_SEPARATOR)
-    )  # mine@10:30
+    is_plain = name in known  # the name may hold a separator, as in mine@10:30
+    policy, _, ablation = (name, "", "") if is_plain else name.rpartition(ABLATION_SEPARATOR)
     if policy not in known:
         raise UnknownPolicyError(unknown_name("policy", policy or name, known))
     of_policy = [row for row in results.rows if row.policy == policy]

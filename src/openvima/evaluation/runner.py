@@ -49,6 +49,11 @@ class Job:
     batch: Batch
     fingerprint: str
 
+    @property
+    def episode(self) -> tuple[str, str, str, int]:
+        """Policy, task, level and seed of the first episode."""
+        return self.batch.policy, self.batch.task, self.batch.level, self.batch.first_seed
+
     def part(self, folder: Path) -> Path:
         """Where the outcomes are kept until all are there."""
         return folder / _PARTS / f"{self.batch.key(self.fingerprint)}.json"

@@ -44,12 +44,7 @@ def score(
         2
     """
     config = EvaluationConfig(
-        tuple(policies),
-        tasks=tasks,
-        levels=levels,
-        episodes=episodes,
-        seed=seed,
-        ablations=ablations,
+        tuple(policies), tasks=tasks, levels=levels, episodes=episodes, seed=seed, ablations=ablations
     )
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}

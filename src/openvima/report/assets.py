@@ -8,22 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.errors import ConfigError, MissingExtraError
-from openvima.evaluation.config import (
-    Batch,
-    EvaluationConfig,
-    cells,
-)
+from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
-from openvima.evaluation.runner import evaluate_prepared, prepare
+from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import PolicySource
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import BUNDLED
+from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
 from openvima.video.clips import Clip, load_clips, png, save_clips
 
 REPORT_NAME = "report.html"
-_METRICS = "metrics.jsonl"  # in the folder of a training run
 _EPISODE = re.compile(r"(\w+)/(?:(\w+)/)?(\d+)")
 
 Progress = Callable[[int, int, str], None]
@@ -51,19 +47,6 @@ class VideoSelection:
 
 
 DEFAULT_VIDEOS = VideoSelection()
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingJob:
-    """One episode to record, as a batch of one."""
-
-    batch: Batch
-    fingerprint: str
-
-    @property
-    def episode(self) -> tuple[str, str, str, int]:
-        """Policy, task, level and seed."""
-        return self.batch.policy, self.batch.task, self.batch.level, self.batch.first_seed
 
 
 def require_extra() -> None:
@@ -116,7 +99,7 @@ def evaluate_and_report(
 
 
 def _recorded(
-    jobs: Sequence[RecordingJob], config: EvaluationConfig, note: Callable[[str], None] | None
+    jobs: Sequence[Job], config: EvaluationConfig, note: Callable[[str], None] | None
 ) -> list[Clip]:
     """Record the episodes that were not recorded before."""
     clips = {(clip.policy, clip.task, clip.level, clip.seed): clip for clip in load_clips(config.out)}
@@ -158,7 +141,7 @@ def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list
     return requested
 
 
-def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[RecordingJob]:
+def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[Job]:
     """Choose which episodes to record.
 
     Of each task at its first level: the first `videos.per_task` solved episodes of every trained policy and
@@ -185,7 +168,7 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
     return list(dict.fromkeys(jobs))
 
 
-def record_clip(job: RecordingJob, count: Callable[[int], None]) -> Clip:
+def record_clip(job: Job, count: Callable[[int], None]) -> Clip:
     """Record one episode; runs in a worker process."""
     from PIL import Image
 
@@ -225,15 +208,13 @@ def find_metrics(sources: Sequence[PolicySource]) -> Path | None:
         if source.source in BUNDLED:  # a name, not a path
             continue
         folder = Path(source.source)
-        for candidate in (folder / _METRICS, folder.parent / _METRICS, folder.parent.parent / _METRICS):
-            if source.kind == "run" and candidate.is_file():
-                return candidate
+        for place in (folder, folder.parent, folder.parent.parent):
+            if source.kind == "run" and (place / METRICS_FILE).is_file():
+                return place / METRICS_FILE
     return None
 
 
-def _job(
-    config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int
-) -> RecordingJob:
+def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: Row, seed: int) -> Job:
     batch = Batch(
         row.policy,
         source.source,
@@ -245,4 +226,4 @@ def _job(
         device=config.device,
         precision=config.precision or "",
     )
-    return RecordingJob(batch, str(results.policies.get(source.name)))
+    return Job(batch, str(results.policies.get(source.name)))

@@ -12,9 +12,7 @@ TOLERANCE = Tolerance(position_m=0.1)
 NUM_OBJECTS_WEIGHTS = (0.4, 0.4, 0.2)
 MAX_OBJECTS = len(NUM_OBJECTS_WEIGHTS)
 CONFLICT_RATE = 0.5  # probability that the distractor is on the target
-_APART_M = (
-    TOLERANCE.position_m + 0.01
-)  # of a distractor from starts; 10 mm margin for an object put down askew
+_APART_M = TOLERANCE.position_m + 0.01  # of a distractor from starts; margin for an object put down askew
 _TRIES = 20
 
 

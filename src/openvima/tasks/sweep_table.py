@@ -22,10 +22,7 @@ from openvima.tasks.table import TableSampler
 Corner = tuple[float, float]
 
 MAGNIFICATION = 7  # of the small block in the prompt
-CORNERS: tuple[Corner, Corner] = (
-    (0.57, -0.22),
-    (0.58, 0.03),
-)  # m, lower corners of the squares of blocks
+CORNERS: tuple[Corner, Corner] = ((0.57, -0.22), (0.58, 0.03))  # m, lower corners of the squares of blocks
 SWEPT_SPREAD_M = 0.18
 NUM_SWEPT_WEIGHTS = {"easy": (0.5, 0.25, 0.25), "medium": (0.25, 0.5, 0.25), "hard": (0.25, 0.25, 0.5)}
 NUMBER_WORDS = ("one", "two", "three")

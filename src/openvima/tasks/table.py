@@ -9,15 +9,7 @@ import numpy as np
 
 from openvima.catalog import Assets, Pool, Vector3, object_spec
 from openvima.errors import SamplingError
-from openvima.scene import (
-    FIRST_OBJECT_ID,
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
-    EndEffector,
-    Placement,
-    Pose,
-    Scene,
-)
+from openvima.scene import FIRST_OBJECT_ID, WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Placement, Pose, Scene
 from openvima.tasks.circles import smallest_circle_centre
 
 T = TypeVar("T")

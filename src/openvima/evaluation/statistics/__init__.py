@@ -5,12 +5,4 @@ from openvima.evaluation.statistics.paired import PairCounts, mcnemar, mean_diff
 from openvima.evaluation.statistics.proportions import mean_of_rates, wilson_interval
 from openvima.evaluation.statistics.score import Interval
 
-__all__ = [
-    "Interval",
-    "PairCounts",
-    "holm",
-    "mcnemar",
-    "mean_difference",
-    "mean_of_rates",
-    "wilson_interval",
-]
+__all__ = ["Interval", "PairCounts", "holm", "mcnemar", "mean_difference", "mean_of_rates", "wilson_interval"]

@@ -13,13 +13,7 @@ import torch
 from torch import nn
 
 from openvima.errors import ConfigError
-from openvima.policies.nn.actions import (
-    ACTION_WIDTH,
-    ActionTargets,
-    DecodingStrategy,
-    greedy,
-    to_unit_range,
-)
+from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.bins import NUM_BINS, actions_from_bins, bin_classifiers, bins_loss, encode_bins
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
 from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations

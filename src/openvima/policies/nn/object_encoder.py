@@ -17,12 +17,7 @@ from openvima.policies.nn.relative_rotation import RelativeRotation
 from openvima.policies.nn.vit import VisionTransformer, VitConfig
 
 NUM_VIEWS = 2
-_BOX_UNITS = (
-    256.0,
-    128.0,
-    128.0,
-    256.0,
-)  # box = centre x, centre y, height, width in pixels of a 128 × 256 image
+_BOX_UNITS = (256.0, 128.0, 128.0, 256.0)  # centre x, centre y, height, width; of a 128 × 256 image
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +74,9 @@ class ObjectEncoder(nn.Module):
         features = config.crop.output_width
         # A constant is created on the CPU, so that it exists under `MetaInit`, too.
         self.register_buffer("box_units", torch.tensor(_BOX_UNITS, device="cpu"), persistent=False)
-        self.crop_encoder = _crop_encoder(config.crop)
+        self.crop_encoder = (
+            VisionTransformer(config.crop) if isinstance(config.crop, VitConfig) else ConvEncoder(config.crop)
+        )
         box_widths = (4, config.box_width, config.box_width, config.box_width)
         self.box_encoders = nn.ModuleList(mlp(box_widths) for _ in range(NUM_VIEWS))
         per_view = features + config.box_width
@@ -137,11 +134,7 @@ class ObjectEncoder(nn.Module):
         return F.normalize(self.appearance(both), dim=-1)
 
     def rotation_between(
-        self,
-        features_a: torch.Tensor,
-        features_b: torch.Tensor,
-        masks_a: torch.Tensor,
-        masks_b: torch.Tensor,
+        self, features_a: torch.Tensor, features_b: torch.Tensor, masks_a: torch.Tensor, masks_b: torch.Tensor
     ) -> torch.Tensor:
         """Estimate the rotation of each object from one image to another.
 
@@ -156,10 +149,6 @@ class ObjectEncoder(nn.Module):
             from above. Symmetric shapes have several peaks.
         """
         return self.rotation(features_a, features_b, masks_a, masks_b).exp()
-
-
-def _crop_encoder(config: VitConfig | ConvConfig) -> VisionTransformer | ConvEncoder:
-    return VisionTransformer(config) if isinstance(config, VitConfig) else ConvEncoder(config)
 
 
 def check_widths(image_width: int, width: int) -> None:

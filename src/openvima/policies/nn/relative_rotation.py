@@ -53,11 +53,7 @@ class RelativeRotation(nn.Module):
             self.register_buffer(name, constant, persistent=False)
 
     def forward(
-        self,
-        features_a: torch.Tensor,
-        features_b: torch.Tensor,
-        masks_a: torch.Tensor,
-        masks_b: torch.Tensor,
+        self, features_a: torch.Tensor, features_b: torch.Tensor, masks_a: torch.Tensor, masks_b: torch.Tensor
     ) -> torch.Tensor:
         """Compare two images of each object.
 

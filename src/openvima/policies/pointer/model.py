@@ -15,12 +15,7 @@ from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, to_unit_range
 from openvima.policies.nn.decoder import Decoder, KVCache, TokenSegment
-from openvima.policies.nn.history import (
-    ObservationTokens,
-    action_segment,
-    decode_observations,
-    shift_actions,
-)
+from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations, shift_actions
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
@@ -147,11 +142,7 @@ class Pointer(PolicyNetwork):
         return DecodingState(self.decoder.init_cache(prompt.tokens_BLD, prompt.mask_BL))
 
     def loss(
-        self,
-        prompt: PointerPrompt,
-        history: HistoryBatch,
-        features_KF: torch.Tensor,
-        targets: ActionTargets,
+        self, prompt: PointerPrompt, history: HistoryBatch, features_KF: torch.Tensor, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Decode whole histories and compare with what was demonstrated."""
         previous = shift_actions(targets)
@@ -307,10 +298,7 @@ def _prompt_objects(
 
 
 def _objects_in_view(
-    history: HistoryBatch,
-    features_BTVNF: torch.Tensor,
-    appearance_BTNA: torch.Tensor,
-    prompt: ObjectFeatures,
+    history: HistoryBatch, features_BTVNF: torch.Tensor, appearance_BTNA: torch.Tensor, prompt: ObjectFeatures
 ) -> ObjectFeatures:
     """Gather the objects in view; their image index comes after the prompt's last."""
     exists_BTN = history.masks_BTVN.any(dim=2)
