@@ -23,7 +23,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +34,17 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from openvima.data.object_cache.episode import preprocess
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.policies import preset
 from openvima.policies.batch import HistoryBatch
 from openvima.policies.build import outline_network
 from openvima.policies.inference import NetworkPolicy
-from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets
+from openvima.policies.nn.actions import ACTION_WIDTH
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
-from openvima.training.dataset import stack_images
 from sim import circumstances
 
 HISTORY = 5
@@ -145,17 +145,8 @@ class Training:
     def __init__(self, network: PolicyNetwork, demos: Sequence[Demonstration], device: str) -> None:
         self._network, self._device = network.to(device).train(), device
         processor = Processor.of(network.config.inputs, tokenizer_of(network))
-        episodes = [preprocess(demo, processor.input_kind) for demo in demos]
-        examples, images = stack_images(episodes, processor)
-        batch = processor.collate(episodes, [example.base for example in examples])
-        used = torch.cat(
-            [batch.prompts.crop_index_VS.flatten(), batch.history.crop_index_BTVN.flatten()]
-        ).unique()
-        self._used, self._images = used.to(device), images[used].to(device)
-        self._num_images = len(images)
-        self._prompts, self._history = batch.prompts.to(device), batch.history.to(device)
-        targets = (getattr(batch.targets, field.name).to(device) for field in fields(ActionTargets))
-        self._targets = ActionTargets(*targets)
+        episodes = EpisodeBatch.of([preprocess(demo, processor.input_kind) for demo in demos])
+        self._batch = processor.collate(episodes).with_images(episodes.images).to(device)
         trained = [p for p in network.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(trained, lr=1e-6, fused=True)
         with FlopCounterMode(display=False) as counter:
@@ -167,11 +158,9 @@ class Training:
         network = self._network
         half = torch.autocast("cuda", torch.bfloat16) if self._device == "cuda" else nullcontext()
         with half:
-            encoded = network.encode_images(self._images)
-            shape = (self._num_images, *encoded.shape[1:])
-            features = encoded.new_zeros(shape).index_copy(0, self._used, encoded)
-            prompt = network.encode_prompt(self._prompts, features)
-            loss, _ = network.loss(prompt, self._history, features, self._targets)
+            features = network.encode_images(self._batch.images)
+            prompt = network.encode_prompt(self._batch.prompts, features)
+            loss, _ = network.loss(prompt, self._batch.history, features, self._batch.targets)
         loss.backward()
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)

@@ -4,19 +4,29 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
+import torch
 
 from openvima.data import Demonstration
-from openvima.data.object_cache.episode import preprocess
+from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
+from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
 from openvima.policies.batch import Batch
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
-from openvima.training.dataset import Example, stack_images
+from openvima.training.dataset import Example
 from openvima.training.source import ExampleSource
 
 
-def examples_of(demos: Iterable[Demonstration], processor: Processor):
+def stack_images(episodes: list[PreprocessedEpisode]) -> tuple[list[Example], torch.Tensor]:
     """Examples that share a stack of images, and the stack."""
-    return stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
+    images = [episode.images for episode in episodes]
+    bases = stacked_offsets(images).tolist()
+    stack = np.concatenate([np.zeros_like(images[0][:1]), *images])
+    return [Example(*pair) for pair in zip(episodes, bases, strict=True)], torch.from_numpy(stack)
+
+
+def examples_of(demos: Iterable[Demonstration], processor: Processor):
+    """The same of demonstrations."""
+    return stack_images([preprocess(demo, processor.input_kind) for demo in demos])
 
 
 def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSource:
@@ -30,7 +40,7 @@ def source_of(demos: Iterable[Demonstration], processor: Processor) -> ExampleSo
 def collate_examples(processor: Processor, examples: Iterable[Example]) -> Batch:
     """A batch whose images are numbered as in the examples' stack."""
     examples = list(examples)
-    return processor.collate([each.episode for each in examples], [each.base for each in examples])
+    return processor.collate(EpisodeBatch.of([e.episode for e in examples], [e.base for e in examples]))
 
 
 def rngs_of(examples: list[Example], seed: int = 0) -> list[np.random.Generator]:

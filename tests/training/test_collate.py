@@ -9,12 +9,12 @@ torch = pytest.importorskip("torch")
 
 from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.object_cache.episode_batch import EpisodeBatch  # noqa: E402
 from openvima.errors import DatasetError  # noqa: E402
 from openvima.perception.image_stack import ImageStack  # noqa: E402
 from openvima.perception.objects import GROUND_TRUTH, PUBLISHED_ORDER, ObjectViews, crop_box  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.training.dataset import stack_images  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
 SETTINGS = {
@@ -55,7 +55,7 @@ def acting(demos, processor: Processor):
 @pytest.mark.parametrize("layout", SETTINGS)
 def test_training_and_inference_have_equal_inputs(layout, demonstrations_of_several_steps):
     processor, demos = Processor(**SETTINGS[layout]), demonstrations_of_several_steps
-    examples, images = stack_images([preprocess(demo, processor.input_kind) for demo in demos], processor)
+    examples, images = examples_of(demos, processor)
     batch = collate_examples(processor, examples)
     naive = NaiveProcessor(
         **SETTINGS[layout], extractor=PUBLISHED_ORDER if layout == "views" else GROUND_TRUTH
@@ -96,7 +96,7 @@ def test_targets_are_the_actions_of_the_oracle(demonstrations_of_several_steps):
 
 def test_false_positives_are_crops_of_the_frame(demonstrations_of_several_steps):
     demos = demonstrations_of_several_steps
-    examples, images = stack_images([preprocess(demo, "objects") for demo in demos], OBJECTS)
+    examples, images = examples_of(demos, OBJECTS)
     spurious = collate_examples(OBJECTS, examples).false_positives
     for b, demo in enumerate(demos):
         for t in range(demo.num_steps):
@@ -123,4 +123,26 @@ def test_an_episode_without_visible_objects_is_named(demonstrations_of_several_s
     none = np.zeros_like(tokens.objects_per_step)
     blind = replace(tokens, objects=tokens.objects.select(slice(0)), objects_per_step=none)
     with pytest.raises(DatasetError, match=f"episode {tokens.seed} of {tokens.task} shows no object before"):
-        OBJECTS.collate([blind])
+        OBJECTS.collate(EpisodeBatch.of([blind]))
+
+
+def test_a_batch_holds_each_image_in_use_once(demonstrations_of_several_steps):
+    examples, stack = examples_of(demonstrations_of_several_steps, OBJECTS)
+    episodes = EpisodeBatch.of([example.episode for example in examples])
+    numbered = OBJECTS.collate(episodes)
+    left_out = numbered.history.crop_index_BTVN[1].unique()[-3]  # as if augmentation had hidden an object
+    history = replace(
+        numbered.history,
+        crop_index_BTVN=numbered.history.crop_index_BTVN.masked_fill(
+            numbered.history.crop_index_BTVN == left_out, 0
+        ),
+    )
+    for plain in (numbered, replace(numbered, history=history)):
+        batch = plain.with_images(episodes.images)
+        used = torch.cat([plain.prompts.crop_index_VS.flatten(), plain.history.crop_index_BTVN.flatten()])
+        assert len(batch.images) == len(used.unique())
+        for ours, theirs in (
+            (batch.prompts.crop_index_VS, plain.prompts.crop_index_VS),
+            (batch.history.crop_index_BTVN, plain.history.crop_index_BTVN),
+        ):
+            assert torch.equal(batch.images[ours], stack[theirs])

@@ -19,10 +19,10 @@ from openvima.training.augmentation.distractor_insertion import (  # noqa: E402
     allows_distractors,
     with_distractors,
 )
-from openvima.training.dataset import Example, stack_images  # noqa: E402
+from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import Parts  # noqa: E402
-from training_examples import rngs_of  # noqa: E402
+from training_examples import rngs_of, stack_images  # noqa: E402
 
 TASKS = ("rotate", "novel_adj", "novel_noun", "pick_in_order_then_restore", "same_shape", "rearrange")
 
@@ -37,7 +37,7 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def stacked(episodes):
-    return stack_images(episodes, Processor("objects"))
+    return stack_images(episodes)
 
 
 def _rows(table):

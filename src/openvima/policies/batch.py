@@ -7,7 +7,8 @@ Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, 
 observation.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -104,3 +105,33 @@ class Batch(TensorRecord):
     targets: ActionTargets
     false_positives: FalsePositiveBatch
     images: torch.Tensor | None = None
+
+    def with_images(self, images: Sequence[np.ndarray]) -> "Batch":
+        """Add the images in use, each once after a blank one, and renumber them.
+
+        Args:
+            images: Images of each demonstration, (K, 3, height, width), uint8, as they are numbered now.
+        """
+        prompt_index, history_index = self.prompts.crop_index_VS, self.history.crop_index_BTVN
+        counts = np.array([len(each) for each in images])
+        is_used = np.zeros(1 + counts.sum(), np.bool_)
+        is_used[0] = is_used[prompt_index.numpy()] = is_used[history_index.numpy()] = True
+        numbers = np.cumsum(is_used) - 1
+        ends = np.cumsum(counts)
+        before, after = numbers[ends - counts], numbers[ends]
+        num_used = after - before
+        # Those in use come first, unless augmentation left some out: then a copy of contiguous bytes will do.
+        is_prefix = numbers[ends - counts + num_used] - before == num_used
+        used = [
+            each[:count] if prefix else each[is_used[end - len(each) + 1 : end + 1]]
+            for each, count, prefix, end in zip(
+                images, num_used.tolist(), is_prefix.tolist(), ends.tolist(), strict=True
+            )
+        ]
+        blank = np.zeros((1, *images[0].shape[1:]), np.uint8)
+        return replace(
+            self,
+            prompts=replace(self.prompts, crop_index_VS=torch.from_numpy(numbers[prompt_index.numpy()])),
+            history=replace(self.history, crop_index_BTVN=torch.from_numpy(numbers[history_index.numpy()])),
+            images=torch.from_numpy(np.concatenate([blank, *used])),
+        )

@@ -9,6 +9,7 @@ Shape suffixes: see `openvima.policies.batch`.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,7 +22,7 @@ from openvima.perception.objects import FRONT, TOP, ObjectExtractor, ObjectViews
 from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
-    PreprocessedPrompt,
+    PreprocessedPrompts,
     extract_observation,
     offset_index,
     preprocess_prompt,
@@ -29,15 +30,17 @@ from openvima.perception.preprocessing import (
 )
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.input_layout import InputLayout
+from openvima.policies.kernels import find_slots, int64, pad_history, stack_prompt_objects, table_points
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
-from openvima.render.camera import CAMERAS, VIEWS, unproject
+from openvima.render.camera import CAMERAS, VIEWS
 from openvima.scene import RenderedPrompt
 
 if TYPE_CHECKING:  # inference needs no demonstrations
-    from openvima.data.object_cache.episode import PreprocessedEpisode
+    from openvima.data.object_cache.episode import FalsePositives
+    from openvima.data.object_cache.episode_batch import EpisodeBatch
 
 MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
 # A token takes a character at least, and 16 are more than any word of the vocabularies has on average.
@@ -110,7 +113,7 @@ class Processor:
             raise PromptError("the prompt is empty; it must hold at least one word or image.")
         stack = stack or ImageStack(self.image_size)
         preprocessed = [preprocess_prompt(each, self.input_kind, self.extractor, stack) for each in prompts]
-        return self.batch_prompts(preprocessed), stack
+        return self.batch_prompts(PreprocessedPrompts.of(preprocessed)), stack
 
     def encode_observations(
         self,
@@ -153,10 +156,11 @@ class Processor:
         counts = np.array([len(objects) for objects in found], np.int64)
         objects = ObjectTable.from_views(ObjectViews.concatenated(found), stack)
         slots_BT = self._num_slots(steps, counts, np.array(num_slots))
-        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors)), stack
+        offsets = np.zeros_like(counts)
+        return self._batch_history(objects, counts, steps, slots_BT, np.array(end_effectors), offsets), stack
 
     def batch_prompts(
-        self, prompts: Sequence[PreprocessedPrompt], image_offsets: Sequence[int] | None = None
+        self, prompts: PreprocessedPrompts, image_offsets: np.ndarray | None = None
     ) -> PromptBatch:
         """Pad prompts to equal length and number objects across the batch.
 
@@ -164,78 +168,83 @@ class Processor:
             prompts: The prompts.
             image_offsets: Images of the stack before those of each prompt; None where there is one stack.
         """
-        sequences = [self._token_sequence(prompt) for prompt in prompts]
-        counts = [len(sequence.objects) for sequence in sequences]
-        length = max(len(sequence.layout.words) for sequence in sequences)
-        word_ids_BL = np.full((len(prompts), length), PADDING_ID, np.int64)
-        object_index_BL = np.full((len(prompts), length), WORD, np.int64)
-        mask_BL = np.zeros((len(prompts), length), np.bool_)
-        first, total = 0, sum(counts)
-        for b, sequence in enumerate(sequences):
-            layout, size = sequence.layout, len(sequence.layout.words)
-            word_ids_BL[b, :size] = layout.words
-            numbered = layout.entries + (first + layout.parts * total)
-            object_index_BL[b, :size] = np.where(layout.is_word, WORD, numbered)
-            mask_BL[b, :size] = True if sequence.mask is None else sequence.mask
-            first += counts[b]
-        objects = ObjectTable.concatenate([sequence.objects for sequence in sequences])
-        offsets = np.repeat([0] * len(prompts) if image_offsets is None else image_offsets, counts)[:, None]
-        visible = objects.masks
+        sequences = self._token_sequences(prompts)
+        layouts = sequences.layouts
+        counts = np.array([len(layout.images) for layout in layouts])
+        tokens = _Steps.of([layout.tokens.shape[1] for layout in layouts])
+        words, entries, parts = np.concatenate([layout.tokens for layout in layouts], axis=1)
+        first = np.cumsum(counts) - counts
+        numbered = entries + parts * len(sequences.objects) + first[tokens.b]
+        is_valid = np.ones(len(words), np.bool_) if sequences.mask is None else sequences.mask
+        image_index = np.concatenate([layout.images for layout in layouts])
+        shown = np.concatenate([layout.sources for layout in layouts])
+        prompt = np.repeat(np.arange(len(layouts)), counts)
+        first_image = np.cumsum(prompts.num_images) - prompts.num_images
+        objects = sequences.objects
+        shape = (len(VIEWS), len(objects))
+        crop_index_VS, masks_VS = np.empty(shape, np.int64), np.empty(shape, np.bool_)
+        boxes_VS4, positions_S2 = np.empty((*shape, 4), np.int64), np.empty((len(objects), 2))
+        stack_prompt_objects(
+            _cameras(),
+            np.zeros(len(objects), np.int64) if image_offsets is None else image_offsets[prompt],
+            int64(objects.crop_index),
+            int64(objects.boxes),
+            crop_index_VS,
+            boxes_VS4,
+            masks_VS,
+            positions_S2,
+        )
         arrays = (
-            word_ids_BL,
-            object_index_BL,
-            mask_BL,
-            np.ascontiguousarray(offset_index(objects.crop_index, offsets).T),
-            np.ascontiguousarray(objects.boxes.swapaxes(0, 1).astype(np.int64)),
-            np.ascontiguousarray(visible.T),
-            _on_table(objects.boxes[..., :2], visible[:, TOP]),
-            np.concatenate([sequence.layout.images for sequence in sequences]),
-            np.concatenate([sequence.is_scene[sequence.layout.images] for sequence in sequences]),
+            tokens.pad(words, fill=PADDING_ID),
+            tokens.pad(np.where(entries == WORD, WORD, numbered), fill=WORD),
+            tokens.pad(is_valid),
+            crop_index_VS,
+            boxes_VS4,
+            masks_VS,
+            positions_S2,
+            image_index,
+            prompts.is_scene[first_image[prompt] + shown],
         )
         return PromptBatch(*(torch.from_numpy(array) for array in arrays))
 
-    def collate(
-        self, episodes: "Sequence[PreprocessedEpisode]", image_offsets: Sequence[int] | None = None
-    ) -> Batch:
+    def collate(self, episodes: "EpisodeBatch") -> Batch:
         """Pad demonstrations to equal lengths.
 
         Args:
             episodes: The demonstrations.
-            image_offsets: Images of the stack before those of each demonstration; None where there is one
-                stack.
 
         Raises:
             DatasetError: A demonstration has a step without visible objects.
             PromptError: A prompt has a word that the vocabulary lacks.
         """
-        offsets = np.array([0] * len(episodes) if image_offsets is None else image_offsets, np.int64)
-        steps = _Steps.of([episode.num_steps for episode in episodes])
-        counts = np.concatenate([episode.objects_per_step for episode in episodes]).astype(np.int64)
-        slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes), np.int64))
-        for b, t in np.argwhere(steps.exists & (slots_BT == 0))[:1]:
+        steps = _Steps.of(episodes.num_steps)
+        counts, objects = episodes.objects_per_step.astype(np.int64), episodes.objects
+        slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes.num_steps), np.int64))
+        for b, t in np.argwhere(steps.exist() & (slots_BT == 0))[:1]:
             raise DatasetError(
-                f"episode {episodes[b].seed} of {episodes[b].task} shows no object before action {t}, so "
+                f"episode {episodes.seeds[b]} of {episodes.tasks[b]} shows no object before action {t}, so "
                 "it cannot be trained on; exclude it."
             )
-        objects = ObjectTable.concatenate([episode.objects for episode in episodes])
-        step, slot = _steps_and_slots(counts)
         pick, place = np.full((2, len(counts)), -1)
         if self.layout == "objects":  # elsewhere slots of two views need not be one object
-            for slots, name in ((pick, "pick_ids"), (place, "place_ids")):
-                ids = np.concatenate([getattr(episode, name) for episode in episodes])
-                is_target = objects.ids == ids[step]
-                slots[step[is_target]] = slot[is_target]
-        objects = objects.with_image_offset(offsets[steps.b[step]][:, None])
-        end_effectors = np.array([episode.end_effector for episode in episodes], np.int64)[steps.b]
-        history = self._batch_history(objects, counts, steps, slots_BT, end_effectors)
+            ids = int64(objects.ids)
+            find_slots(counts, ids, int64(episodes.pick_ids), pick)
+            find_slots(counts, ids, int64(episodes.place_ids), place)
+        offsets = episodes.image_offsets[steps.b]
+        end_effectors = episodes.end_effectors[steps.b]
+        history = self._batch_history(objects, counts, steps, slots_BT, end_effectors, offsets)
         targets = ActionTargets(
-            torch.from_numpy(steps.pad(np.concatenate([episode.actions for episode in episodes]))),
+            torch.from_numpy(steps.pad(episodes.actions)),
             torch.from_numpy(steps.pad(pick, fill=-1)),
             torch.from_numpy(steps.pad(place, fill=-1)),
             history.steps_BT,
         )
-        prompts = self.batch_prompts([episode.prompt for episode in episodes], offsets.tolist())
-        return Batch(prompts, history, targets, self._batch_false_positives(episodes, steps, offsets))
+        return Batch(
+            self.batch_prompts(episodes.prompts, episodes.image_offsets),
+            history,
+            targets,
+            self._batch_false_positives(episodes.false_positives, steps, offsets[:, None]),
+        )
 
     def _batch_history(
         self,
@@ -244,26 +253,28 @@ class Processor:
         steps: "_Steps",
         slots_BT: np.ndarray,
         end_effectors: np.ndarray,
+        offsets: np.ndarray,
     ) -> HistoryBatch:
-        """Pad the objects of all steps to slots; counts and end effectors have one entry per step."""
-        step, slot = _steps_and_slots(counts)
+        """Pad the objects of all steps to slots; counts, end effectors, offsets are those of steps."""
         if self.layout == "views":
-            objects = _visible_first(objects, step)
-        visible = objects.masks
-        shape = (*steps.exists.shape, len(VIEWS), max(1, int(slots_BT.max(initial=0))))
-        b, t = steps.b[step], steps.t[step]
-        crop_index_BTVN = np.zeros(shape, np.int64)
+            objects = _visible_first(objects, _steps_and_slots(counts)[0])
+        (count, length), num_slots = steps.shape, max(1, int(slots_BT.max(initial=0)))
+        shape = (count, length, len(VIEWS), num_slots)
+        crop_index_BTVN, masks_BTVN = np.zeros(shape, np.int64), np.zeros(shape, np.bool_)
         boxes_BTVN4 = np.zeros((*shape, 4), np.int64)
-        masks_BTVN = np.zeros(shape, np.bool_)
-        crop_index_BTVN[b, t, :, slot] = objects.crop_index
-        boxes_BTVN4[b, t, :, slot] = objects.boxes
-        masks_BTVN[b, t, :, slot] = visible
-        is_slot = np.arange(shape[3]) < slots_BT[..., None]
-        # The box of a slot without an object is at the image's corner.
-        positions_BTN2 = np.where(is_slot[..., None], unproject(np.zeros(2), CAMERAS["front"]), 0.0)
-        grasps_BTN2 = positions_BTN2.copy()
-        positions_BTN2[b, t, slot] = _on_table(objects.boxes[..., :2], visible[:, TOP])
-        grasps_BTN2[b, t, slot] = _on_table(objects.grasps, visible[:, TOP])
+        positions_BTN2, grasps_BTN2 = np.zeros((2, count, length, num_slots, 2))
+        padded = (crop_index_BTVN, boxes_BTVN4, masks_BTVN, positions_BTN2, grasps_BTN2)
+        pad_history(
+            _cameras(),
+            steps.place,
+            counts,
+            slots_BT.reshape(-1)[steps.place],
+            offsets,
+            int64(objects.crop_index),
+            int64(objects.boxes),
+            int64(objects.grasps),
+            *(array.reshape(-1, *array.shape[2:]) for array in padded),
+        )
         arrays = (
             crop_index_BTVN,
             boxes_BTVN4,
@@ -272,7 +283,7 @@ class Processor:
             positions_BTN2,
             grasps_BTN2,
             steps.pad(end_effectors),
-            steps.exists,
+            steps.exist(),
         )
         return HistoryBatch(*(torch.from_numpy(array) for array in arrays))
 
@@ -282,7 +293,7 @@ class Processor:
         if self.layout != "views":
             return slots_BT
         slots_BT = np.maximum.accumulate(np.maximum(slots_BT, before_B[:, None]), axis=1)
-        return np.where(steps.exists, slots_BT, 0)
+        return np.where(steps.exist(), slots_BT, 0)
 
     def _check_count(self, count: int, num_slots: int) -> None:
         """Reject an observation without objects, or with more than the decoder has positions for."""
@@ -298,39 +309,55 @@ class Processor:
             )
 
     def _batch_false_positives(
-        self, episodes: "Sequence[PreprocessedEpisode]", steps: "_Steps", offsets: np.ndarray
+        self, found: "FalsePositives", steps: "_Steps", offsets: np.ndarray
     ) -> FalsePositiveBatch:
-        crop_index = np.concatenate([episode.false_positives.crop_index for episode in episodes])
-        boxes = np.concatenate([episode.false_positives.boxes for episode in episodes]).astype(np.int64)
-        if self.layout == "frames":
-            points = np.zeros((len(boxes), len(VIEWS), 2))
-        else:
-            points = np.stack([unproject(boxes[:, v, :2], CAMERAS[view]) for v, view in enumerate(VIEWS)], 1)
-        crop_index = offset_index(crop_index, offsets[steps.b][:, None])
+        boxes = found.boxes.astype(np.int64)
+        points = np.zeros((len(boxes), len(VIEWS), 2))
+        if self.layout != "frames":
+            table_points(_cameras(), np.ascontiguousarray(boxes[..., :2]), points)
+        crop_index = offset_index(found.crop_index, offsets)
         return FalsePositiveBatch(steps.pad(crop_index), steps.pad(boxes), steps.pad(points))
 
-    def _token_sequence(self, prompt: PreprocessedPrompt) -> "_TokenSequence":
-        """Build the token sequence of a prompt: words, and one or more tokens per object of an image.
+    def _token_sequences(self, prompts: PreprocessedPrompts) -> "_TokenSequences":
+        """Build the token sequences of prompts: words, and one or more tokens per object of an image.
 
         With layout "views" every image is padded to the slots of the prompt's largest one, as in the
         published evaluation, where this affects T5's relative positions.
         """
-        counts = tuple(prompt.objects_per_image.tolist())
-        in_text = [piece for piece in split_prompt(prompt.text) if isinstance(piece, int)]
-        is_scene = prompt.is_scene[in_text]
-        if self.layout != "views":
-            layout = self._layout_of(prompt.text, counts, ())
-            objects = prompt.objects if layout.order is None else prompt.objects.select(layout.order)
-            return _TokenSequence(layout, objects, is_scene, None)
-        ends = np.cumsum(prompt.objects_per_image)
-        rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
-        image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-        ordered = prompt.objects.select(np.concatenate([np.zeros(0, np.int64), *rows]))
-        objects, slots = _compact(ordered, image, len(rows))
-        layout = self._layout_of(prompt.text, counts, slots)
-        mask, is_image = layout.is_word.copy(), ~layout.is_word
-        mask[is_image] = objects.masks[layout.entries[is_image], layout.parts[is_image]]
-        return _TokenSequence(layout, objects, is_scene, mask)
+        counts, ends = prompts.objects_per_image.tolist(), np.cumsum(prompts.num_images).tolist()
+        starts = [0, *ends[:-1]]
+        images = [tuple(counts[start:end]) for start, end in zip(starts, ends, strict=True)]
+        if self.layout == "views":
+            return self._in_views(prompts, images)
+        layouts = [self._layout_of(text, each, ()) for text, each in zip(prompts.texts, images, strict=True)]
+        objects = prompts.objects
+        if any(layout.is_reordered for layout in layouts):
+            num_objects = [sum(each) for each in images]
+            first = np.cumsum(num_objects) - num_objects
+            objects = objects.select(
+                np.concatenate([row + layout.order for row, layout in zip(first, layouts, strict=True)])
+            )
+        return _TokenSequences(layouts, objects, None)
+
+    def _in_views(self, prompts: PreprocessedPrompts, images: Sequence[tuple[int, ...]]) -> "_TokenSequences":
+        """Move the visible objects of each view to the front; slots differ from prompt to prompt."""
+        layouts, tables, masks = [], [], []
+        tables_of = prompts.objects.split(np.array([sum(counts) for counts in images]))
+        for text, counts, table in zip(prompts.texts, images, tables_of, strict=True):
+            in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
+            ends = np.cumsum(counts)
+            rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
+            image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+            ordered = table.select(np.concatenate([np.zeros(0, np.int64), *rows]))
+            objects, slots = _compact(ordered, image, len(rows))
+            layout = self._layout_of(text, counts, slots)
+            _, entries, parts = layout.tokens
+            mask = entries == WORD
+            mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
+            layouts.append(layout)
+            tables.append(objects)
+            masks.append(mask)
+        return _TokenSequences(layouts, ObjectTable.concatenate(tables), np.concatenate(masks))
 
     def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
         """Return the cached layout of a text, given the number of objects per image."""
@@ -362,58 +389,67 @@ class Processor:
         check_length(
             len(tokens), MAX_PROMPT_POSITIONS, "the prompt"
         )  # before the encoder, whose cost is quadratic
-        words, entries, parts = np.array(tokens).T
-        is_word, images = entries == WORD, np.repeat(np.arange(len(sizes)), sizes)
-        in_other_order = None if order == list(range(starts[-1])) else np.array(order)
-        return _Layout(words, np.maximum(entries, 0), parts, is_word, images, in_other_order)
+        in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
+        return _Layout(
+            np.ascontiguousarray(np.array(tokens).T),
+            np.repeat(np.arange(len(sizes)), sizes),
+            np.repeat(np.array(in_text, np.int64), sizes),
+            np.array(order, np.int64),
+            order != list(range(starts[-1])),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """The tokens of a prompt: word, or row and part of its object.
+    """The tokens of a prompt, (3, L): word, row of its object or `WORD`, and part of that.
 
-    `images` is the image of each row, counted in reading order; `order` the rows in reading order, None for
-    the stored order.
+    `images` is the image of each row, counted in reading order, `sources` its number in the prompt; `order`
+    the rows in reading order, which may differ from the stored order.
     """
 
-    words: np.ndarray
-    entries: np.ndarray
-    parts: np.ndarray
-    is_word: np.ndarray
+    tokens: np.ndarray
     images: np.ndarray
-    order: np.ndarray | None
+    sources: np.ndarray
+    order: np.ndarray
+    is_reordered: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _TokenSequence:
-    """One prompt: layout, objects, which images are scenes, and the token mask (None: all valid)."""
+class _TokenSequences:
+    """Prompts: layout of each, objects of all, and the mask of all tokens (None: all valid)."""
 
-    layout: _Layout
+    layouts: list[_Layout]
     objects: ObjectTable
-    is_scene: np.ndarray
     mask: np.ndarray | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """Episode `b` and time `t` of each step, and the mask of a padded array, (B, T)."""
+    """Episode `b` and time `t` of each step, its place in a padded array, and the shape (B, T) of that."""
 
     b: np.ndarray
     t: np.ndarray
-    exists: np.ndarray
+    place: np.ndarray
+    shape: tuple[int, int]
 
     @staticmethod
-    def of(lengths: Sequence[int]) -> "_Steps":
+    def of(lengths: Sequence[int] | np.ndarray) -> "_Steps":
         """Number the steps of episodes of these lengths."""
-        exists = np.arange(max(lengths, default=0)) < np.array(lengths)[:, None]
-        b, t = np.nonzero(exists)
-        return _Steps(b, t, exists)
+        lengths = np.asarray(lengths, np.int64)
+        b, t = _steps_and_slots(lengths)
+        shape = (len(lengths), int(lengths.max(initial=0)))
+        return _Steps(b, t, b * shape[1] + t, shape)
+
+    def exist(self) -> np.ndarray:
+        """Where a padded array holds steps, shape (B, T), bool."""
+        return self.pad(np.ones(len(self.b), np.bool_))
 
     def pad(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
         """Scatter one row per step into a padded array of shape (B, T, …)."""
-        result = np.full((*self.exists.shape, *column.shape[1:]), fill, column.dtype)
-        result[self.b, self.t] = column
-        return result
+        count, length = self.shape
+        result = np.full((count * length, *column.shape[1:]), fill, column.dtype)
+        result[self.place] = column
+        return result.reshape(*self.shape, *column.shape[1:])
 
 
 def _steps_and_slots(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -460,7 +496,7 @@ def _reorder_views(objects: ObjectTable, order: np.ndarray) -> ObjectTable:
     )
 
 
-def _on_table(pixels: np.ndarray, from_top: np.ndarray) -> np.ndarray:
-    """Points under pixels of both views, shape (N, 2, 2): from the top view if it shows the object."""
-    front = unproject(pixels[:, FRONT], CAMERAS["front"])
-    return np.where(from_top[:, None], unproject(pixels[:, TOP], CAMERAS["top"]), front)
+@cache
+def _cameras() -> np.ndarray:
+    """The cameras of the views as matrices, shape (2, 4, 4)."""
+    return np.stack([CAMERAS[view].matrix() for view in VIEWS])

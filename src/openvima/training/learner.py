@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.batch import Batch
@@ -21,7 +22,7 @@ from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
-from openvima.training.dataset import Example, stack_images
+from openvima.training.dataset import Example
 
 # From examples and, in training, one generator for each, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -166,15 +167,16 @@ class PolicyCollate:
         self, examples: Sequence[Example], rngs: Sequence[np.random.Generator] | None = None
     ) -> Batch:
         """Make a batch; see `Learner.collator`."""
-        processor, stack = self._processor, None
+        images: list[np.ndarray] = []
         if self._with_images:
-            examples, stack = _stacked(examples, processor)
+            examples, images = _stacked(examples)
         drawn = [None] * len(examples) if rngs is None else rngs
         examples = [self._augmentation(example, rng) for example, rng in zip(examples, drawn, strict=True)]
-        batch = processor.collate([e.episode for e in examples], [e.base for e in examples])
+        episodes = EpisodeBatch.of([e.episode for e in examples], [e.base for e in examples])
+        batch = self._processor.collate(episodes)
         if rngs is not None:
-            batch = augmented(batch, processor.layout, probability=self._probability, rngs=rngs)
-        return batch if stack is None else _with_used_images(batch, stack)
+            batch = augmented(batch, self._processor.layout, probability=self._probability, rngs=rngs)
+        return batch.with_images(images) if self._with_images else batch
 
 
 def make_learner(name: str) -> Learner:
@@ -201,29 +203,13 @@ def make_learner(name: str) -> Learner:
     return learner
 
 
-def _stacked(examples: Sequence[Example], processor: Processor) -> tuple[list[Example], torch.Tensor]:
-    """Stack the images of demonstrations, and of the sources of their distractors."""
+def _stacked(examples: Sequence[Example]) -> tuple[list[Example], list[np.ndarray]]:
+    """Number the images of demonstrations, and of the sources of their distractors, in one stack."""
     others = [example.other for example in examples if example.other is not None]
-    stacked, stack = stack_images([example.episode for example in (*examples, *others)], processor)
-    own, behind = stacked[: len(examples)], iter(stacked[len(examples) :])
+    images = [example.episode.images for example in (*examples, *others)]
+    bases = stacked_offsets(images).tolist()
+    behind = (replace(other, base=base) for other, base in zip(others, bases[len(examples) :], strict=True))
     return [
-        replace(ours, other=None if example.other is None else next(behind))
-        for example, ours in zip(examples, own, strict=True)
-    ], stack
-
-
-def _with_used_images(batch: Batch, stack: torch.Tensor) -> Batch:
-    """Keep the blank image and those in use, and renumber them."""
-    prompts, history = batch.prompts, batch.history
-    blank = torch.zeros(1, dtype=torch.int64)
-    index = torch.cat([blank, prompts.crop_index_VS.flatten(), history.crop_index_BTVN.flatten()])
-    used, positions = index.unique(return_inverse=True)
-    _, prompt_index, history_index = positions.split(
-        [1, prompts.crop_index_VS.numel(), history.crop_index_BTVN.numel()]
-    )
-    return replace(
-        batch,
-        prompts=replace(prompts, crop_index_VS=prompt_index.view_as(prompts.crop_index_VS)),
-        history=replace(history, crop_index_BTVN=history_index.view_as(history.crop_index_BTVN)),
-        images=stack[used],
-    )
+        replace(example, base=base, other=None if example.other is None else next(behind))
+        for example, base in zip(examples, bases[: len(examples)], strict=True)
+    ], images

@@ -17,6 +17,7 @@ from openvima.data.object_cache import cache_file
 from openvima.data.object_cache.cache import ObjectCache, open_object_cache
 from openvima.data.object_cache.cache_file import INDEX, OBJECT, PREAMBLE, CacheFile
 from openvima.data.object_cache.episode import preprocess
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.errors import DatasetError, ShardError
 from openvima.perception.preprocessing import KINDS, image_names, split_prompt
 
@@ -31,11 +32,13 @@ def assert_equal(a: object, b: object) -> None:
         elif isinstance(ours, np.ndarray):
             assert ours.dtype == theirs.dtype, field.name
             assert np.array_equal(ours, theirs), field.name
+        elif field.name == "images":  # of a batch
+            assert all(np.array_equal(*pair) for pair in zip(ours, theirs, strict=True))
         else:
             assert ours == theirs, field.name
 
 
-@pytest.mark.parametrize("kind", ["objects", "frames"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_cache_holds_what_cutting_anew_would_give(copy: Path, kind) -> None:
     dataset = Dataset(copy)
     cache = open_object_cache(dataset, kind)
@@ -44,6 +47,16 @@ def test_the_cache_holds_what_cutting_anew_would_give(copy: Path, kind) -> None:
         assert_equal(episode, preprocess(demo, kind))
         assert episode.num_steps == demo.num_steps
     assert np.array_equal(cache.lengths(), [[episode.num_steps, len(episode.objects)] for episode in cache])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_episodes_read_together_equal_those_read_one_by_one(demos: Path, kind) -> None:
+    cache = open_object_cache(Dataset(demos), kind)
+    rows = [7, 2, 2, 9]
+    together = cache.batch(rows)
+    assert_equal(together, EpisodeBatch.of([cache[row] for row in rows]))
+    counts = [len(cache[row].images) for row in rows]
+    assert together.image_offsets.tolist() == [0, *np.cumsum(counts)[:-1]]
 
 
 def test_several_workers_make_the_same_files(copy: Path, tmp_path: Path) -> None:

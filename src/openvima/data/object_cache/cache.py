@@ -1,7 +1,7 @@
 """The object cache of a data set: a derived folder, written when first needed and safe to delete."""
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,8 +13,15 @@ import pyarrow as pa
 from openvima.atomic_io import remove_stale
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
-from openvima.data.object_cache.cache_file import CACHE_VERSION, CacheFile, file_name, write_cache_file
+from openvima.data.object_cache.cache_file import (
+    CACHE_VERSION,
+    CacheFile,
+    file_name,
+    join_records,
+    write_cache_file,
+)
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -89,6 +96,19 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
 
     def __iter__(self) -> Iterator[PreprocessedEpisode]:
         return (self[index] for index in range(len(self)))
+
+    def batch(self, indices: Iterable[int]) -> EpisodeBatch:
+        """Read several episodes together, which is several times as fast as one after the other.
+
+        Raises:
+            ShardError: One is damaged.
+
+        Example:
+            >>> episodes = cache.batch(order.rows(0))
+            >>> Processor("objects").collate(episodes).with_images(episodes.images)
+        """
+        places = [self.dataset.locate(index) for index in indices]
+        return join_records([self._files[name].read(row) for name, row in places])
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)

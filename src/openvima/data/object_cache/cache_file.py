@@ -9,6 +9,7 @@ every read. Nothing is compressed, so that a batch is made of copies of contiguo
 """
 
 import json
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from openvima.atomic_io import atomic_write
 from openvima.data.checksums import mapped
 from openvima.data.object_cache.episode import ACTION_PARTS, FalsePositives, PreprocessedEpisode
+from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
 from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
 from openvima.perception.preprocessing import (
@@ -27,6 +29,7 @@ from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
     PreprocessedPrompt,
+    PreprocessedPrompts,
 )
 from openvima.scene import ACTION_SHAPES
 
@@ -98,9 +101,9 @@ class Entry(NamedTuple):
 
 
 _WIDE = ("start", "images_start", "seed", "text_start")
-INDEX = np.dtype(
-    [(name, "<u8" if name == "checksum" else "<i8" if name in _WIDE else "<i4") for name in Entry._fields]
-)
+_CODES = ["Q" if name == "checksum" else "q" if name in _WIDE else "i" for name in Entry._fields]
+_ENTRY = struct.Struct("<" + "".join(_CODES))
+INDEX = np.dtype([(name, f"<{code}") for name, code in zip(Entry._fields, _CODES, strict=True)])
 
 
 class Record(NamedTuple):
@@ -200,8 +203,9 @@ class CacheFile:
         self.boxes: str = about["boxes"]
         self._tasks: list[str] = about["tasks"]
         height, width = IMAGE_SIZES[self.kind]
-        self._image_shape, self._image_bytes = (-1, 3, height, width), 3 * height * width
-        num_bytes = _aligned(self._end_of(Entry(*self.index[-1].item()))) if len(self) else len(self._content)
+        self._image_shape, self._image_bytes = (3, height, width), 3 * height * width
+        ends = self.index["images_start"] + self.index["num_images"] * self._image_bytes
+        num_bytes = _aligned(int(ends.max(initial=len(self._content) if not len(self) else 0)))
         if len(self._content) != num_bytes:
             raise ShardError(_unfit(path, f"it has {len(self._content):,} of {num_bytes:,} bytes"))
 
@@ -238,13 +242,12 @@ class CacheFile:
         Raises:
             ShardError: It is damaged.
         """
-        entry = Entry(*self.index[row].item())
-        content, images_start = self._content, entry.images_start
-        end = self._end_of(entry)
-        if xxh3_64_intdigest(content[entry.start : end]) != entry.checksum:
+        entry, content = Entry(*_ENTRY.unpack_from(self._index_bytes, row * _ENTRY.size)), self._content
+        prompt_objects, images_start = entry.start, entry.images_start
+        end = images_start + entry.num_images * self._image_bytes
+        if xxh3_64_intdigest(content[prompt_objects:end]) != entry.checksum:
             reason = f"the checksum of record {row} of {len(self)} is wrong"
             raise ShardError(_unfit(self.path, reason))
-        prompt_objects = entry.start
         objects = prompt_objects + entry.num_prompt_objects * _OBJECT_BYTES
         final_objects = objects + entry.num_objects * _OBJECT_BYTES
         steps = final_objects + entry.num_final_objects * _OBJECT_BYTES
@@ -259,16 +262,13 @@ class CacheFile:
             content[final_objects:steps],
             content[steps:prompt_images],
             content[prompt_images : prompt_images + entry.num_prompt_images * _PROMPT_IMAGE_BYTES],
-            np.frombuffer(content[images_start:end], np.uint8).reshape(self._image_shape),
+            np.ndarray((entry.num_images, *self._image_shape), np.uint8, content, images_start),
         )
 
     def texts(self) -> set[str]:
         """Return the different prompts."""
         places = np.unique(self.index[["text_start", "text_bytes"]])
         return {self._text(start, length) for start, length in places.tolist()}
-
-    def _end_of(self, entry: Entry) -> int:
-        return entry.images_start + entry.num_images * self._image_bytes
 
     def _text(self, start: int, num_bytes: int) -> str:
         return str(self._content[start : start + num_bytes], "utf-8")
@@ -285,14 +285,43 @@ class CacheFile:
         about = json.loads(bytes(content[size : size + json_bytes]))
         if about["version"] != CACHE_VERSION or about["kind"] not in KINDS:
             raise ValueError(f"it is of version {about['version']}, not {CACHE_VERSION}")
-        index = content[size + json_bytes :][: about["rows"] * INDEX.itemsize]
-        self.index = np.frombuffer(index, INDEX)
+        self._index_bytes = content[size + json_bytes :][: about["rows"] * INDEX.itemsize]
+        self.index = np.frombuffer(self._index_bytes, INDEX)
         return about
 
 
 def file_name(shard: str) -> str:
     """Return the name of the cache file of a shard."""
     return str(Path(shard).with_suffix(SUFFIX))
+
+
+def join_records(records: Sequence[Record]) -> EpisodeBatch:
+    """Join the episodes of some records, table by table."""
+    steps = np.frombuffer(b"".join([record.steps for record in records]), STEP)
+    prompt_images = np.frombuffer(b"".join([record.prompt_images for record in records]), PROMPT_IMAGE)
+    num_images = np.array([len(record.prompt_images) for record in records]) // _PROMPT_IMAGE_BYTES
+    images = [record.images for record in records]
+    return EpisodeBatch(
+        [record.task for record in records],
+        [record.seed for record in records],
+        np.array([record.end_effector for record in records], np.int64),
+        np.array([len(record.steps) for record in records]) // _STEP_BYTES,
+        PreprocessedPrompts(
+            [record.text for record in records],
+            num_images,
+            object_table(b"".join([record.prompt_objects for record in records])),
+            prompt_images["num_objects"],
+            prompt_images["is_scene"],
+        ),
+        object_table(b"".join([record.objects for record in records])),
+        steps["objects_per_step"],
+        steps["pick_ids"],
+        steps["place_ids"],
+        FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
+        steps["actions"],
+        images,
+        stacked_offsets(images),
+    )
 
 
 def object_table(content: memoryview | bytes) -> ObjectTable:
