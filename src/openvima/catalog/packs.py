@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openvima.catalog.geometry import Assets
-from openvima.catalog.procedural import ProceduralAssets
+from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, unknown_name
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
     if not isinstance(assets, str | Path):
         return assets
     if assets == "procedural":
-        return _procedural()
+        return procedural_assets()
     if assets == "original":
         from openvima.catalog.pack_files import ImportedFiles
 
@@ -42,11 +42,6 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         hint = "Allowed: 'procedural', 'original', or the folder of a checkout of the original benchmark."
         raise AssetError(unknown_name("asset pack or folder", str(assets), ASSET_PACKS, hint))
     return _original(folder.resolve())
-
-
-@lru_cache(maxsize=1)
-def _procedural() -> Assets:
-    return ProceduralAssets()
 
 
 @lru_cache(maxsize=4)

@@ -1,6 +1,7 @@
 """The default asset pack: every shape and texture made by code."""
 
 import hashlib
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,13 +18,16 @@ _GEOMETRIES_KEPT = 256  # containers come in any size, so the memory of shapes n
 
 
 class ProceduralAssets:
-    """Shapes and textures made by code; needs no files. Build one per process: it remembers what it made."""
+    """Shapes and textures made by code; needs no files. Use `procedural_assets`, which is one per process."""
 
     name = "procedural"
 
     def __init__(self) -> None:
         self._textures: dict[str, np.ndarray] = {}
         self._build = lru_cache(maxsize=_GEOMETRIES_KEPT)(_built)
+
+    def __reduce__(self) -> tuple[Callable[[], "ProceduralAssets"], tuple[()]]:
+        return procedural_assets, ()
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return the shape of a catalogue object; see `Assets.geometry`."""
@@ -38,6 +42,12 @@ class ProceduralAssets:
             texture.setflags(write=False)
             self._textures[texture_name] = texture
         return self._textures[texture_name]
+
+
+@lru_cache(maxsize=1)
+def procedural_assets() -> ProceduralAssets:
+    """Return the pack of this process, which remembers what it made."""
+    return ProceduralAssets()
 
 
 def _built(object_name: str, size: Vector3, scale: Vector3) -> Geometry:

@@ -84,6 +84,9 @@ class Rasteriser:
         self._buffers = KernelBuffers()
         self._depth: dict[tuple[int, int], np.ndarray] = {}
 
+    def __reduce__(self) -> tuple[type["Rasteriser"], tuple[Assets]]:
+        return Rasteriser, (self.assets,)  # without the working memory
+
     def scene(
         self,
         scene: Scene,

@@ -4,6 +4,7 @@
 # (MuJoCo's names come from a compiled module without type stubs.)
 
 from collections.abc import Iterable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ from openvima.scene.pose import Quaternion, normalised
 from openvima.sim.model import PARKED_M, PROBE_HALF_LENGTH_M, TICK_S, body_shape, build_model
 
 _FASTEST = np.array([1.0, 1.0, 1.0, 1 / 0.015, 1 / 0.015, 1 / 0.015])  # rad/s per m/s: half a small block
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that later ticks depend on
 _SLOWEST = -_FASTEST - np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0])  # falling is free
 
 
@@ -33,8 +35,7 @@ class Bodies:
             for p in scene.placements
         )
         with_spatula = scene.end_effector == "spatula"
-        self.model = build_model(self.shapes, with_spatula=with_spatula)
-        self.data = mujoco.MjData(self.model)
+        self._load_model(with_spatula)
         rigid = [index for index, shape in enumerate(self.shapes) if not shape.fixed]
         fixed = [index for index, shape in enumerate(self.shapes) if shape.fixed]
         self.rigid = tuple(rigid)
@@ -47,11 +48,28 @@ class Bodies:
         self._probe_mocap = len(fixed)
         self.probe_geom = int(first[len(self.shapes) + 1])
         self.spatula_geom = int(first[len(self.shapes) + 2]) if with_spatula else -1
-        self._positions = self.data.qpos.reshape(-1, 7)  # views: writing to them moves the bodies
-        self._velocities = self.data.qvel.reshape(-1, 6)
         for index, placement in enumerate(scene.placements):
             self.place(index, placement.pose)
         self.park_spatula()
+        self.refresh()
+
+    def _load_model(self, with_spatula: bool) -> None:
+        self.model = build_model(self.shapes, with_spatula=with_spatula)
+        self.data = mujoco.MjData(self.model)
+        self._positions = self.data.qpos.reshape(-1, 7)  # views: writing to them moves the bodies
+        self._velocities = self.data.qvel.reshape(-1, 6)
+
+    def __getstate__(self) -> dict[str, Any]:  # Any: attributes of all kinds
+        state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, state, _STATE)
+        rebuilt = ("model", "data", "_positions", "_velocities")
+        return {key: value for key, value in vars(self).items() if key not in rebuilt} | {"state": state}
+
+    def __setstate__(self, attributes: dict[str, Any]) -> None:
+        state = attributes.pop("state")
+        vars(self).update(attributes)
+        self._load_model(with_spatula=self.spatula_geom >= 0)
+        mujoco.mj_setState(self.model, self.data, state, _STATE)
         self.refresh()
 
     def geoms(self, index: int) -> range:
