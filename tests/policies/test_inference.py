@@ -352,11 +352,32 @@ def test_a_prompt_of_hundreds_of_kilobytes_is_refused_before_it_is_split(policy,
         policy.reset([RenderedPrompt("{a}" * 1300, {})])
 
 
+def test_a_batch_too_large_for_its_longest_prompt_is_refused_before_it_is_encoded(
+    policy, prompts, monkeypatch
+) -> None:
+    monkeypatch.setattr(policy.network, "encode_images", lambda images: pytest.fail("encoded"))
+    long = replace(prompts[0], text="put the " * 100 + prompts[0].text)
+    with pytest.raises(
+        PolicyError, match=r"40 prompts of up to 2\d\d tokens .* takes (1|2)\d of that length"
+    ):
+        policy.reset([long] + [prompts[1]] * 39)
+
+
 def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, pool) -> None:
     policy.reset([prompts[0]])
     with pytest.raises(PolicyError, match=rf"history has 5\d\d tokens; this policy takes {MAX_POSITIONS}"):
         for _ in range(MAX_POSITIONS):
             policy.act([pool[-1]])
+
+
+def test_histories_that_take_too_much_together_are_refused(policy, prompts, pool, monkeypatch) -> None:
+    monkeypatch.setattr("openvima.policies.inference.MAX_CACHED_TOKENS", 60)
+    policy.reset([prompts[0], prompts[1]])
+    with pytest.raises(
+        PolicyError, match=r"the histories of 2 episodes have \d+ tokens each.* takes 60 in all"
+    ):
+        for _ in range(40):
+            policy.act([pool[-1]] * 2)
 
 
 class Doubled(GroundTruth):

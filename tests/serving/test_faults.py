@@ -8,15 +8,14 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
-from typing import Any
 from urllib.parse import urlsplit
 
-import msgpack
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect
 
+from fuzz_server import Fuzzer
 from openvima.errors import ServerError
 from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread
 from openvima.serving.packing import pack, unpack
@@ -49,75 +48,6 @@ def good_messages() -> list[bytes]:
     ]
 
 
-def hostile_array(random: Random) -> dict:
-    dtype = random.choice(
-        ["|O", "O", "<U9", "|V8", "<c16", "<M8[s]", "|S4", "u1,f8", "<f8", "|u1", "x" * 999, 7, None]
-    )
-    lengths = [0, 1, -1, 3, 2**31, 2**62, -(2**40), 1.5, "3", True, None]
-    shape = [random.choice(lengths) for _ in range(random.randrange(12))]
-    return {
-        b"__ndarray__": True,
-        b"data": random.randbytes(random.randrange(9)),
-        b"dtype": dtype,
-        b"shape": shape,
-    }
-
-
-def junk(random: Random, depth: int = 3) -> Any:  # Any: whatever can be packed
-    plain = [None, True, -1, 2**64 - 1, 1e300, float("nan"), "text", b"bytes", "", [], {}]
-    kind = random.randrange(4) if depth else 0
-    if kind == 1:
-        return [junk(random, depth - 1) for _ in range(random.randrange(4))]
-    if kind == 2:
-        keys = (
-            "type",
-            "prompts",
-            "observations",
-            "text",
-            "images",
-            "rgb",
-            "ee",
-            "top",
-            b"data",
-            "prompt",
-            "protocol",
-        )
-        return {random.choice(keys): junk(random, depth - 1) for _ in range(random.randrange(4))}
-    return hostile_array(random) if kind == 3 else random.choice(plain)
-
-
-def cut(random: Random) -> bytes:
-    good = random.choice(good_messages())
-    return good[: random.randrange(len(good))]
-
-
-def garbled(random: Random) -> bytes:
-    bad = bytearray(random.choice(good_messages()))
-    for _ in range(random.randrange(1, 9)):
-        bad[random.randrange(min(200, len(bad)))] = random.randrange(256)
-    return bytes(bad) + b"!"
-
-
-def malformed(random: Random) -> bytes | str:
-    """One of the ways in which a message can be wrong."""
-    ways = (
-        lambda: random.randbytes(random.randrange(300)),
-        lambda: cut(random),
-        lambda: garbled(random),
-        lambda: msgpack.packb(["type", junk(random)]),
-        lambda: msgpack.packb(
-            {"type": random.choice(["reset", "act", "", None, 3, "x" * 9999]), "rows": junk(random)}
-        ),
-        lambda: msgpack.packb({"type": "reset", "prompts": [junk(random)]}),
-        lambda: msgpack.packb({"type": "act", "observations": [junk(random)] * 3}),  # and out of order
-        lambda: msgpack.packb({"prompt": junk(random), "rgb": hostile_array(random), "ee": junk(random, 1)}),
-        lambda: bytes([random.choice(b"\x91\x81\xdc\xdd")]) * random.randrange(1, 5000),
-        lambda: random.choice([b"\xdd", b"\xdf", b"\xc6", b"\xdb", b"\xc9"]) + b"\xff" * random.randrange(9),
-        lambda: "text " * random.randrange(9),
-    )
-    return random.choice(ways)()
-
-
 def counts() -> dict[str, int]:
     """Open files, threads, tasks and sessions of this process, which is the server's, too."""
     gc.collect()
@@ -128,12 +58,12 @@ def counts() -> dict[str, int]:
 
 
 def test_a_thousand_malformed_messages_are_refused_one_by_one(url: str) -> None:
-    random = Random(7)
+    fuzzer = Fuzzer(good_messages(), Random(7))
     refusals: Counter[str] = Counter()
     with connect(url, compression=None, proxy=None) as connection:
         connection.recv()
         for number in range(NUM_MALFORMED):
-            message = malformed(random)
+            message = fuzzer.message()
             connection.send(message)
             answer = connection.recv()
             assert isinstance(answer, str), (number, message)
@@ -149,6 +79,7 @@ def test_a_thousand_malformed_messages_are_refused_one_by_one(url: str) -> None:
 @pytest.mark.slow
 def test_nothing_is_left_of_clients_of_any_kind(url: str) -> None:
     random = Random(8)
+    fuzzer = Fuzzer(good_messages(), random)
 
     def crowd() -> None:
         for _ in range(15):
@@ -157,7 +88,7 @@ def test_nothing_is_left_of_clients_of_any_kind(url: str) -> None:
             knock(url, random.randbytes(50) + b"\r\n\r\n")
             with connect(url, compression=None, proxy=None) as connection:
                 connection.recv()
-                connection.send(malformed(random))
+                connection.send(fuzzer.message())
                 connection.recv()
 
     crowd()
@@ -218,12 +149,12 @@ def test_a_slow_client_is_dropped_with_a_reason_and_holds_up_nobody(url: str) ->
 
 
 def test_a_message_of_endless_empty_fragments_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("openvima.serving.server.MAX_FRAGMENTS", 100)
-    frames = [Frame(Opcode.BINARY, b"x", fin=False)] + [Frame(Opcode.CONT, b"", fin=False)] * 200
+    monkeypatch.setattr("openvima.serving.server.CLOSE_S", 0.1)
+    frames = [Frame(Opcode.BINARY, b"x", fin=False)] + [Frame(Opcode.CONT, b"", fin=False)] * 1500
     with serve_in_thread(ForMany()) as url, connect(url, compression=None, proxy=None) as endless:
         endless.recv()
         endless.socket.sendall(b"".join(frame.serialize(mask=True) for frame in frames))
-        with pytest.raises(ConnectionClosed, match="more than 100 fragments"):
+        with pytest.raises(ConnectionClosed, match="1,025 fragments of a short message"):
             endless.recv()
         assert plays(url, 6)
 
@@ -251,11 +182,11 @@ def test_clients_at_once_get_their_own_answers_while_others_send_nonsense(url: s
                         failures.append(actions)
 
     def disturb(number: int) -> None:
-        random = Random(number)
+        fuzzer = Fuzzer(good_messages(), Random(number))
         with connect(url, compression=None, proxy=None) as connection:
             connection.recv()
             for _ in range(60):
-                connection.send(malformed(random))
+                connection.send(fuzzer.message())
                 if not isinstance(connection.recv(), str):
                     failures.append("nonsense was answered")
 

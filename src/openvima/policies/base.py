@@ -12,7 +12,11 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
 
 class Policy(Protocol):
-    """Anything that maps prompt and history to actions, for several episodes at once."""
+    """Anything that maps prompt and history to actions, for several episodes at once.
+
+    Optional attributes, read by policy servers: `new_session()` returns a policy with episodes of its own,
+    and `prompt_limits` is the `PromptLimits` of the policy.
+    """
 
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
         """Start a batch of episodes, one prompt each."""

@@ -22,6 +22,10 @@ from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
 
+# Pairs of tokens within a prompt, over a padded batch: 16 prompts of 256 tokens, 64 of 128. Attention scores
+# take memory for each.
+MAX_PROMPT_PAIRS = 2**20
+MAX_CACHED_TOKENS = 2**15  # of the histories of a padded batch: 64 of 512, as long as any may be
 MAX_CROPS = 1024  # images that are encoded at once, which bounds the memory of a large batch
 NEAR_TIE = 1e-4  # difference of two logits below which float32 rounding may swap their order
 
@@ -129,13 +133,19 @@ class NetworkPolicy(Policy):
         """Start a batch of episodes.
 
         Raises:
-            PolicyError: The batch is empty, or a prompt is too long.
+            PolicyError: The batch is empty or too large for its longest prompt, or a prompt is too long.
             PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
         if not prompts:
             raise PolicyError("reset got no prompts; give one for each episode.")
         batch, stack = self.processor.encode_prompts(prompts)
+        count, length = batch.word_ids_BL.shape
+        if count * length**2 > MAX_PROMPT_PAIRS:
+            raise PolicyError(
+                f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
+                f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
+            )
         features_KF, features = self._encode(stack, {})
         prompt = self.network.encode_prompt(batch.to(self.device), features_KF)
         seeds = [(self._seed ^ prompt_hash(prompt)) & (2**63 - 1) for prompt in prompts]
@@ -243,6 +253,12 @@ class NetworkPolicy(Policy):
 
     def _step(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
         """Decode one action for every running episode."""
+        cached = getattr(episodes.state, "cache", episodes.state).mask_BS
+        if cached.numel() > MAX_CACHED_TOKENS:
+            raise PolicyError(
+                f"the histories of {len(cached)} episodes have {cached.shape[1]} tokens each, padded; this "
+                f"policy takes {MAX_CACHED_TOKENS:,} in all. Act in fewer episodes (--batch) or steps."
+            )
         batch, stack = self.processor.encode_observations(
             [[observation] for observation in observations], episodes.num_slots
         )

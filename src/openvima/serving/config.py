@@ -17,8 +17,8 @@ class ServerConfig:
         port: TCP port; 0 takes a free one.
         token: Clients must know it. None lets in everyone who reaches the port.
         max_message_bytes: Size of the largest message. A prompt image takes 0.26 MB, and so does an
-            observation; 128 MiB are enough for batches of 64 episodes.
-        max_episodes: Episodes of the largest batch.
+            observation.
+        max_episodes: Episodes of the largest batch, for which 128 MiB are enough.
         max_connections: Clients at the same time.
         idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
             answer.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 HEALTH_PATH = "/healthz"
-MAX_FRAGMENTS = 2**16  # of a message; empty ones count for no limit of websockets before 17.4
+MAX_FRAGMENTS = 1024  # of a message, besides one for each KiB: each costs time, and empty ones have no size
 CLOSE_S = 2.0  # for the other side to say goodbye
 _LOG = logging.getLogger(__name__)
 _TRANSPORT_LOG = logging.getLogger(f"{__name__}.transport")
@@ -238,10 +238,12 @@ async def _whole_message(connection: "ServerConnection") -> bytes | str:
     from websockets.frames import CloseCode
 
     parts: list[Any] = []  # Any: all bytes or all texts
+    allowed = float(MAX_FRAGMENTS)
     async for part in connection.recv_streaming():
         parts.append(part)
-        if len(parts) > MAX_FRAGMENTS:
-            await connection.close(CloseCode.POLICY_VIOLATION, f"more than {MAX_FRAGMENTS} fragments")
+        allowed += len(part) / 1024
+        if len(parts) > allowed:
+            await connection.close(CloseCode.POLICY_VIOLATION, f"{len(parts):,} fragments of a short message")
     return type(parts[0])().join(parts)
 
 

@@ -162,10 +162,8 @@ class CausalDecoder(nn.Module):
             PolicyError: The history is longer than the position table.
         """
         length_B = cache.length_B + mask_BL.sum(dim=1)
-        padded = cache.mask_BS.shape[1] + tokens_BLD.shape[1]
-        if padded > MAX_POSITIONS:  # only then synchronise with the device
+        if cache.mask_BS.shape[1] + tokens_BLD.shape[1] > MAX_POSITIONS:  # only then synchronise
             check_length(int(length_B.max()), MAX_POSITIONS, self.sequence_name)
-            check_length(padded, 2 * MAX_POSITIONS, f"{self.sequence_name}, padded to the batch,")
         positions_BL = (cache.length_B[:, None] + mask_BL.cumsum(dim=1) - 1).clamp(min=0)
         unpadder = Unpadder(torch.ones_like(mask_BL) if valid_BL is None else valid_BL)
         x_ND = self.dropout(unpadder.unpad(tokens_BLD + self.positions(positions_BL)))

@@ -1,0 +1,27 @@
+"""A little of `benchmarks/fuzz_server.py`: the server refuses, and others are answered meanwhile."""
+
+import os
+
+import pytest
+
+from fuzz_server import attack
+from openvima.policies import RandomPolicy
+from openvima.serving import serve_in_thread
+
+LARGE = (
+    "text of 277 kB",
+    "text of 374 kB",
+    "unknown word of 1 MB",
+    "1,365 placeholders",
+    "4,000 records of one object",
+)
+
+
+def test_a_server_withstands_fuzzed_messages_and_large_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("openvima.serving.server.CLOSE_S", 0.1)
+    with serve_in_thread(RandomPolicy()) as url:
+        found = attack(url, os.getpid(), rounds=200, seed=3, large=LARGE, fragments=5_000)
+    assert found["crashes"] == 0 and found["failures_of_others"] == []
+    refused = [list(each["answers"]) for each in found["attacks"][1:]]
+    assert all("PromptError: the prompt has" in kind[0] for kind in refused[:4])
+    assert refused[4] == ["MessageError"] and "fragments" in refused[5][0]
