@@ -225,8 +225,9 @@ class _PolicyServer:
                 data = await _whole_message(connection)
             request = await loop.run_in_executor(self._reading, session.read, data)
             del data  # it may be large, and the policy may be busy with others
-            reply = request
-            if not isinstance(request, str):
+            if isinstance(request, str):
+                reply = request
+            else:
                 reply = await loop.run_in_executor(self._computing, session.answer, request)
             del request
             if isinstance(reply, str):
