@@ -2,8 +2,8 @@
 
     python benchmarks/object_cache.py [--data DIR] [--episodes N] [--batch B] [--rounds N] [--json FILE]
 
-Training steps a second of CPU time, best of alternating rounds; files lie in the system's cache. Every way
-compares the checksums of all that it reads.
+Training steps a second of CPU time, best of alternating rounds; files lie in the system's cache. Checksums of
+all that is read are compared, at every read.
 `episodes`: one after the other, in random order.
 `batches`: padded tensors of prompts, observations, targets and the images in use, as `openvima train` makes
 them without augmentation; batches are drawn as in training, of episodes of similar length.
@@ -48,7 +48,9 @@ def ways_of(cache: ObjectCache, batch: int) -> dict[str, Callable[[], object]]:
     def read_batch(rows: np.ndarray, *, images: bool) -> int:
         episodes = cache.batch(rows)
         made = processor.collate(episodes)
-        return len((made.with_images(episodes.images) if images else made).targets.steps_BT)
+        return len(
+            (made.with_images(episodes.images, episodes.num_images) if images else made).targets.steps_BT
+        )
 
     used = []  # images in use come first in an episode
     for rows in batches:

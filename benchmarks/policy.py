@@ -146,7 +146,7 @@ class Training:
         self._network, self._device = network.to(device).train(), device
         processor = Processor.of(network.config.inputs, tokenizer_of(network))
         episodes = EpisodeBatch.of([preprocess(demo, processor.input_kind) for demo in demos])
-        self._batch = processor.collate(episodes).with_images(episodes.images).to(device)
+        self._batch = processor.collate(episodes).with_images(episodes.images, episodes.num_images).to(device)
         trained = [p for p in network.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(trained, lr=1e-6, fused=True)
         with FlopCounterMode(display=False) as counter:

@@ -8,7 +8,7 @@ import torch
 
 from openvima.data import Demonstration
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
-from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.policies.batch import Batch
 from openvima.policies.processor import Processor
 from openvima.training import TrainingConfig, train
@@ -19,7 +19,7 @@ from openvima.training.source import ExampleSource
 def stack_images(episodes: list[PreprocessedEpisode]) -> tuple[list[Example], torch.Tensor]:
     """Examples that share a stack of images, and the stack."""
     images = [episode.images for episode in episodes]
-    bases = stacked_offsets(images).tolist()
+    bases = np.cumsum([0, *map(len, images)])[:-1].tolist()
     stack = np.concatenate([np.zeros_like(images[0][:1]), *images])
     return [Example(*pair) for pair in zip(episodes, bases, strict=True)], torch.from_numpy(stack)
 

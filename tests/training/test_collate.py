@@ -138,7 +138,7 @@ def test_a_batch_holds_each_image_in_use_once(demonstrations_of_several_steps):
         ),
     )
     for plain in (numbered, replace(numbered, history=history)):
-        batch = plain.with_images(episodes.images)
+        batch = plain.with_images(episodes.images, episodes.num_images)
         used = torch.cat([plain.prompts.crop_index_VS.flatten(), plain.history.crop_index_BTVN.flatten()])
         assert len(batch.images) == len(used.unique())
         for ours, theirs in (

@@ -7,7 +7,7 @@ Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, 
 observation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,32 +106,44 @@ class Batch(TensorRecord):
     false_positives: FalsePositiveBatch
     images: torch.Tensor | None = None
 
-    def with_images(self, images: Sequence[np.ndarray]) -> "Batch":
+    def with_images(self, images: Iterable[np.ndarray], counts: np.ndarray) -> "Batch":
         """Add the images in use, each once after a blank one, and renumber them.
 
         Args:
             images: Images of each demonstration, (K, 3, height, width), uint8, as they are numbered now.
+            counts: Number of them, shape (B,), integers.
         """
         prompt_index, history_index = self.prompts.crop_index_VS, self.history.crop_index_BTVN
-        counts = np.array([len(each) for each in images])
         is_used = np.zeros(1 + counts.sum(), np.bool_)
         is_used[0] = is_used[prompt_index.numpy()] = is_used[history_index.numpy()] = True
         numbers = np.cumsum(is_used) - 1
         ends = np.cumsum(counts)
-        before, after = numbers[ends - counts], numbers[ends]
-        num_used = after - before
+        starts = ends - counts
+        first, last = numbers[starts], numbers[ends]  # of the new numbers, the first excluded
         # Those in use come first, unless augmentation left some out: then a copy of contiguous bytes will do.
-        is_prefix = numbers[ends - counts + num_used] - before == num_used
-        used = [
-            each[:count] if prefix else each[is_used[end - len(each) + 1 : end + 1]]
-            for each, count, prefix, end in zip(
-                images, num_used.tolist(), is_prefix.tolist(), ends.tolist(), strict=True
-            )
-        ]
-        blank = np.zeros((1, *images[0].shape[1:]), np.uint8)
+        is_prefix = numbers[starts + last - first] == last
+        columns = (starts, ends, first, last, is_prefix)
+        stack = np.zeros((0, 0, 0, 0), np.uint8)
+        for each, (start, end, before, after, prefix) in zip(
+            images, zip(*(column.tolist() for column in columns), strict=True), strict=True
+        ):
+            if not stack.size:
+                stack = _empty_stack(numbers[-1] + 1, each.shape[1:])
+                stack[0] = 0
+            used = each[: after - before] if prefix else each[is_used[start + 1 : end + 1]]
+            stack[before + 1 : after + 1] = used
         return replace(
             self,
             prompts=replace(self.prompts, crop_index_VS=torch.from_numpy(numbers[prompt_index.numpy()])),
             history=replace(self.history, crop_index_BTVN=torch.from_numpy(numbers[history_index.numpy()])),
-            images=torch.from_numpy(np.concatenate([blank, *used])),
+            images=torch.from_numpy(stack),
         )
+
+
+def _empty_stack(count: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Return memory for images, out of one of few sizes: what one batch frees the next one then takes.
+
+    Fresh pages would cost twice as much time as the copy of the images.
+    """
+    step = 1 << max(0, int(count).bit_length() - 3)
+    return np.empty((-(-count // step) * step, *shape), np.uint8)[:count]

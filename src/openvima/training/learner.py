@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
 from openvima.policies.batch import Batch
@@ -176,7 +176,7 @@ class PolicyCollate:
         batch = self._processor.collate(episodes)
         if rngs is not None:
             batch = augmented(batch, self._processor.layout, probability=self._probability, rngs=rngs)
-        return batch.with_images(images) if self._with_images else batch
+        return batch.with_images(images, np.array(list(map(len, images)))) if self._with_images else batch
 
 
 def make_learner(name: str) -> Learner:
@@ -207,7 +207,7 @@ def _stacked(examples: Sequence[Example]) -> tuple[list[Example], list[np.ndarra
     """Number the images of demonstrations, and of the sources of their distractors, in one stack."""
     others = [example.other for example in examples if example.other is not None]
     images = [example.episode.images for example in (*examples, *others)]
-    bases = stacked_offsets(images).tolist()
+    bases = np.cumsum([0, *map(len, images)])[:-1].tolist()
     behind = (replace(other, base=base) for other, base in zip(others, bases[len(examples) :], strict=True))
     return [
         replace(example, base=base, other=None if example.other is None else next(behind))

@@ -27,13 +27,13 @@ TASKS = ("rotate", "rearrange_then_restore")
 def assert_equal(a: object, b: object) -> None:
     for field in fields(a):
         ours, theirs = getattr(a, field.name), getattr(b, field.name)
-        if is_dataclass(ours):
+        if isinstance(theirs, list) and isinstance(theirs[0], np.ndarray):  # the images of a batch
+            assert all(np.array_equal(*pair) for pair in zip(ours, theirs, strict=True))
+        elif is_dataclass(ours):
             assert_equal(ours, theirs)
         elif isinstance(ours, np.ndarray):
             assert ours.dtype == theirs.dtype, field.name
             assert np.array_equal(ours, theirs), field.name
-        elif field.name == "images":  # of a batch
-            assert all(np.array_equal(*pair) for pair in zip(ours, theirs, strict=True))
         else:
             assert ours == theirs, field.name
 
@@ -157,6 +157,9 @@ def test_a_damaged_record_is_named_where_others_are_read(copy: Path) -> None:
     assert_equal(damaged[0], cache[0])
     with pytest.raises(ShardError, match=r"00000\.cache .* record 1 of 2 is wrong.*`openvima data"):
         damaged[1]
+    episodes = damaged.batch([0, 1])  # its tables are whole
+    with pytest.raises(ShardError, match="record 1 of 2 is wrong"):
+        list(episodes.images)
 
 
 def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatch) -> None:
@@ -184,7 +187,8 @@ def test_a_file_is_read_as_documented(demos: Path) -> None:
     end = entry["images_start"] + entry["num_images"] * 3 * 32 * 32
     images = np.frombuffer(content[entry["images_start"] : end], np.uint8).reshape(-1, 3, 32, 32)
     assert np.array_equal(images, cache[1].images)
-    assert xxh3_64_intdigest(content[entry["start"] : end]) == entry["checksum"]
+    assert xxh3_64_intdigest(content[entry["start"] : entry["images_start"]]) == entry["tables_checksum"]
+    assert xxh3_64_intdigest(content[entry["images_start"] : end]) == entry["images_checksum"]
 
 
 def test_a_prompt_is_split_into_texts_and_images() -> None:

@@ -98,17 +98,17 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         return (self[index] for index in range(len(self)))
 
     def batch(self, indices: Iterable[int]) -> EpisodeBatch:
-        """Read several episodes together, which is several times as fast as one after the other.
+        """Read several episodes together, their images when these are iterated over.
 
         Raises:
-            ShardError: One is damaged.
+            ShardError: One is damaged; raised when its tables or its images are read.
 
         Example:
             >>> episodes = cache.batch(order.rows(0))
-            >>> Processor("objects").collate(episodes).with_images(episodes.images)
+            >>> Processor("objects").collate(episodes).with_images(episodes.images, episodes.num_images)
         """
-        places = [self.dataset.locate(index) for index in indices]
-        return join_records([self._files[name].read(row) for name, row in places])
+        places = [(self._files[name], row) for name, row in map(self.dataset.locate, indices)]
+        return join_records([file.read(row) for file, row in places], _Images(places))
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
@@ -137,6 +137,16 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         }
         places = [self.dataset.locate(index) for index in range(len(self))]
         return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, len(names))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images(Iterable[np.ndarray]):
+    """The images of some episodes, read when they are asked for."""
+
+    places: Sequence[tuple[CacheFile, int]]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (file.images(row) for file, row in self.places)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,23 +4,24 @@
     head       JSON; the index, an `Entry` per episode; the different prompt texts
     records    tables of `OBJECT`, `STEP` and `PROMPT_IMAGE`, then the images; each at a multiple of 64 bytes
 
-The head has a checksum, compared when the file is opened; the index holds one of each record, compared at
-every read. Nothing is compressed, so that a batch is made of copies of contiguous bytes.
+The head has a checksum, compared when the file is opened; the index holds those of the tables and of the
+images of each record, compared at every read. Nothing is compressed: a batch consists of copies of contiguous
+bytes.
 """
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from xxhash import xxh3_64, xxh3_64_intdigest
+from xxhash import xxh3_64_intdigest
 
 from openvima.atomic_io import atomic_write
 from openvima.data.checksums import mapped
 from openvima.data.object_cache.episode import ACTION_PARTS, FalsePositives, PreprocessedEpisode
-from openvima.data.object_cache.episode_batch import EpisodeBatch, stacked_offsets
+from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
 from openvima.perception.preprocessing import (
@@ -66,7 +67,8 @@ class Entry(NamedTuple):
     Args:
         start: First byte of the record in the file.
         images_start: First byte of its images.
-        checksum: xxh3 of its bytes, 64 bits.
+        tables_checksum: xxh3 of the bytes up to there, 64 bits.
+        images_checksum: The same of its images.
         seed: Number of the episode.
         text_start: First byte of the prompt's text in the file, UTF-8.
         text_bytes: Length of that.
@@ -84,7 +86,8 @@ class Entry(NamedTuple):
 
     start: int
     images_start: int
-    checksum: int
+    tables_checksum: int
+    images_checksum: int
     seed: int
     text_start: int
     text_bytes: int
@@ -101,13 +104,13 @@ class Entry(NamedTuple):
 
 
 _WIDE = ("start", "images_start", "seed", "text_start")
-_CODES = ["Q" if name == "checksum" else "q" if name in _WIDE else "i" for name in Entry._fields]
+_CODES = ["Q" if name.endswith("checksum") else "q" if name in _WIDE else "i" for name in Entry._fields]
 _ENTRY = struct.Struct("<" + "".join(_CODES))
 INDEX = np.dtype([(name, f"<{code}") for name, code in zip(Entry._fields, _CODES, strict=True)])
 
 
 class Record(NamedTuple):
-    """One episode as it is stored: bytes of tables, and its images, (K, 3, height, width), uint8."""
+    """The tables of one episode as they are stored."""
 
     task: str
     seed: int
@@ -118,7 +121,7 @@ class Record(NamedTuple):
     final_objects: memoryview
     steps: memoryview
     prompt_images: memoryview
-    images: np.ndarray
+    num_images: int
 
 
 def write_cache_file(
@@ -146,13 +149,12 @@ def write_cache_file(
     for episode, content in zip(episodes, tables, strict=True):
         prompt, images = episode.prompt, np.ascontiguousarray(episode.images)
         text_start, text_bytes = places[prompt.text]
-        checksum = xxh3_64(content)
-        checksum.update(images.data)
         entries.append(
             Entry(
                 start=start,
                 images_start=start + len(content),
-                checksum=checksum.intdigest(),
+                tables_checksum=xxh3_64_intdigest(content),
+                images_checksum=xxh3_64_intdigest(images.data),
                 seed=episode.seed,
                 text_start=texts_start + text_start,
                 text_bytes=text_bytes,
@@ -233,21 +235,19 @@ class CacheFile:
             false_positives=FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
             final=object_table(record.final_objects),
             actions=steps["actions"],
-            images=record.images,
+            images=self.images(row),
         )
 
     def read(self, row: int) -> Record:
-        """Read one episode as it is stored, after comparing its checksum.
+        """Read the tables of one episode as they are stored.
 
         Raises:
-            ShardError: It is damaged.
+            ShardError: They are damaged.
         """
         entry, content = Entry(*_ENTRY.unpack_from(self._index_bytes, row * _ENTRY.size)), self._content
-        prompt_objects, images_start = entry.start, entry.images_start
-        end = images_start + entry.num_images * self._image_bytes
-        if xxh3_64_intdigest(content[prompt_objects:end]) != entry.checksum:
-            reason = f"the checksum of record {row} of {len(self)} is wrong"
-            raise ShardError(_unfit(self.path, reason))
+        prompt_objects = entry.start
+        if xxh3_64_intdigest(content[prompt_objects : entry.images_start]) != entry.tables_checksum:
+            raise self._damaged(row)
         objects = prompt_objects + entry.num_prompt_objects * _OBJECT_BYTES
         final_objects = objects + entry.num_objects * _OBJECT_BYTES
         steps = final_objects + entry.num_final_objects * _OBJECT_BYTES
@@ -256,22 +256,34 @@ class CacheFile:
             self._tasks[entry.task],
             entry.seed,
             entry.end_effector,
-            self._text(entry.text_start, entry.text_bytes),
+            str(content[entry.text_start : entry.text_start + entry.text_bytes], "utf-8"),
             content[prompt_objects:objects],
             content[objects:final_objects],
             content[final_objects:steps],
             content[steps:prompt_images],
             content[prompt_images : prompt_images + entry.num_prompt_images * _PROMPT_IMAGE_BYTES],
-            np.ndarray((entry.num_images, *self._image_shape), np.uint8, content, images_start),
+            entry.num_images,
         )
+
+    def images(self, row: int) -> np.ndarray:
+        """Return the images of one episode, shape (K, 3, height, width), uint8.
+
+        Raises:
+            ShardError: They are damaged.
+        """
+        entry = Entry(*_ENTRY.unpack_from(self._index_bytes, row * _ENTRY.size))
+        start, end = entry.images_start, entry.images_start + entry.num_images * self._image_bytes
+        if xxh3_64_intdigest(self._content[start:end]) != entry.images_checksum:
+            raise self._damaged(row)
+        return np.ndarray((entry.num_images, *self._image_shape), np.uint8, self._content, start)
+
+    def _damaged(self, row: int) -> ShardError:
+        return ShardError(_unfit(self.path, f"the checksum of record {row} of {len(self)} is wrong"))
 
     def texts(self) -> set[str]:
         """Return the different prompts."""
         places = np.unique(self.index[["text_start", "text_bytes"]])
-        return {self._text(start, length) for start, length in places.tolist()}
-
-    def _text(self, start: int, num_bytes: int) -> str:
-        return str(self._content[start : start + num_bytes], "utf-8")
+        return {str(self._content[start : start + size], "utf-8") for start, size in places.tolist()}
 
     def _read_head(self) -> dict:
         """Map the index, and return what the JSON says."""
@@ -295,12 +307,17 @@ def file_name(shard: str) -> str:
     return str(Path(shard).with_suffix(SUFFIX))
 
 
-def join_records(records: Sequence[Record]) -> EpisodeBatch:
-    """Join the episodes of some records, table by table."""
+def join_records(records: Sequence[Record], images: Iterable[np.ndarray]) -> EpisodeBatch:
+    """Join the episodes of some records, table by table.
+
+    Args:
+        records: Their tables.
+        images: Their images.
+    """
     steps = np.frombuffer(b"".join([record.steps for record in records]), STEP)
     prompt_images = np.frombuffer(b"".join([record.prompt_images for record in records]), PROMPT_IMAGE)
     num_images = np.array([len(record.prompt_images) for record in records]) // _PROMPT_IMAGE_BYTES
-    images = [record.images for record in records]
+    counts = np.array([record.num_images for record in records])
     return EpisodeBatch(
         [record.task for record in records],
         [record.seed for record in records],
@@ -320,7 +337,8 @@ def join_records(records: Sequence[Record]) -> EpisodeBatch:
         FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
         steps["actions"],
         images,
-        stacked_offsets(images),
+        counts,
+        np.cumsum(counts) - counts,
     )
 
 

@@ -1,6 +1,6 @@
 """Several preprocessed demonstrations, their tables joined: what a batch is made of."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ class EpisodeBatch:
         false_positives: Of all steps.
         actions: Shape (T, 12), float32.
         images: Images of each demonstration, (K, 3, height, width), uint8.
+        num_images: Number of them, shape (B,), int64.
         image_offsets: Images before those of each demonstration, in one stack of all after a blank image,
             shape (B,), int64.
     """
@@ -41,7 +42,8 @@ class EpisodeBatch:
     place_ids: np.ndarray
     false_positives: FalsePositives
     actions: np.ndarray
-    images: Sequence[np.ndarray]
+    images: Iterable[np.ndarray]
+    num_images: np.ndarray
     image_offsets: np.ndarray
 
     @staticmethod
@@ -54,7 +56,7 @@ class EpisodeBatch:
             episodes: The demonstrations.
             image_offsets: As above, where a larger stack holds their images; None stacks theirs alone.
         """
-        images = [episode.images for episode in episodes]
+        counts = np.array([len(episode.images) for episode in episodes], np.int64)
         false_positives = [episode.false_positives for episode in episodes]
         return EpisodeBatch(
             [episode.task for episode in episodes],
@@ -71,12 +73,7 @@ class EpisodeBatch:
                 np.concatenate([each.boxes for each in false_positives]),
             ),
             np.concatenate([episode.actions for episode in episodes]),
-            images,
-            stacked_offsets(images) if image_offsets is None else np.array(image_offsets, np.int64),
+            [episode.images for episode in episodes],
+            counts,
+            np.cumsum(counts) - counts if image_offsets is None else np.array(image_offsets, np.int64),
         )
-
-
-def stacked_offsets(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the number of images before each of some arrays, shape (B,), int64."""
-    counts = np.array([len(each) for each in images], np.int64)
-    return np.cumsum(counts) - counts
