@@ -45,6 +45,7 @@ class Bodies:
         self._geoms = tuple(
             range(int(first[i + 1]), int(first[i + 1] + count[i + 1])) for i in range(len(self.shapes))
         )
+        self._has_walls = any(self._geoms[index] for index in fixed)
         self._probe_mocap = len(fixed)
         self.probe_geom = int(first[len(self.shapes) + 1])
         self.spatula_geom = int(first[len(self.shapes) + 2]) if with_spatula else -1
@@ -123,23 +124,30 @@ class Bodies:
         """Advance the physics."""
         mujoco.mj_step(self.model, self.data, num_ticks)
 
-    def tick_with_spatula(self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float) -> None:
+    def tick_with_spatula(
+        self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float, bystanders: Iterable[int]
+    ) -> None:
         """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
 
         Args:
             pose: The spatula's centre at the start.
             velocity: Velocity of the spatula, m/s.
             num_ticks: Number of ticks.
-            max_speed: See `limit_speed`; applied after every tick: a body squeezed between spatula and fixed
-                body accelerates too fast for a later limit.
+            max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body squeezed
+                between one and the spatula accelerates too fast for a later limit.
+            bystanders: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
         """
-        place = np.array(_numbers(pose))
-        speed = np.array((*velocity, 0.0, 0.0, 0.0))
-        for _ in range(num_ticks):
+        rows = [self._joint[index] for index in bystanders]
+        bystanding = self._positions[rows]
+        self._positions[rows, 2] += PARKED_M
+        place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, 0.0))
+        stride = 1 if self._has_walls else num_ticks
+        for _ in range(0, num_ticks, stride):
             self._positions[-1], self._velocities[-1] = place, speed
-            mujoco.mj_step(self.model, self.data)
+            self.tick(stride)
             self.limit_speed(max_speed)
-            place[:3] += speed[:3] * TICK_S
+            place[:3] += speed[:3] * (stride * TICK_S)
+        self._positions[rows], self._velocities[rows] = bystanding, 0.0
 
     def stop(self) -> None:
         """Set all velocities to zero."""
