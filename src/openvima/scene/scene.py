@@ -1,7 +1,7 @@
 """Scenes: catalogue objects with texture, size and pose."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from openvima.catalog.geometry import Vector3
@@ -43,7 +43,7 @@ class Placement:
 
     def at(self, pose: Pose) -> "Placement":
         """Return the same object at another pose."""
-        return replace(self, pose=pose)
+        return Placement(self.id, self.object, self.texture, self.size, pose, self.fixed, self.scale)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Scene:
     def with_poses(self, poses: Mapping[int, Pose]) -> "Scene":
         """Return the scene with some objects moved; `poses` maps object ids to new link-frame poses."""
         moved = tuple(p.at(poses[p.id]) if p.id in poses else p for p in self.placements)
-        return replace(self, placements=moved)
+        return Scene(moved, self.end_effector)
 
 
 def in_workspace(pose: Pose) -> bool:

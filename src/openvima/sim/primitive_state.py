@@ -1,7 +1,7 @@
 """State of one primitive: bodies, arm and monitor."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from openvima.scene import Placement, Pose, Scene
 from openvima.sim import settling
@@ -63,7 +63,13 @@ class PrimitiveState:
             self._unmonitored_ticks = 0
             self._monitor(self.scene())
 
-    def settle(self, held: tuple[int, Pose] | None = None, *, max_speed: float | None = None) -> None:
+    def settle(
+        self,
+        held: tuple[int, Pose] | None = None,
+        *,
+        max_speed: float | None = None,
+        bystanders: Collection[int] = (),
+    ) -> None:
         """Run physics until everything is at rest; the arm's next move happens meanwhile."""
 
         def each(num_ticks: int) -> None:
@@ -71,7 +77,9 @@ class PrimitiveState:
             self.path.store(num_ticks, scene=lambda: self.scene(held))
 
         held_index = held[0] if held else None
-        _, completed = settling.settle(self.bodies, apart_from=held_index, max_speed=max_speed, each=each)
+        _, completed = settling.settle(
+            self.bodies, apart_from=held_index, max_speed=max_speed, bystanders=bystanders, each=each
+        )
         self.completed = self.completed and completed
 
     def finish(self) -> Scene:

@@ -56,7 +56,8 @@ def pick_place(state: PrimitiveState, action: Action) -> int | None:
 def body_under_probe(bodies: Bodies, x: float, y: float) -> tuple[int | None, float]:
     """Find the body that a probe lowered at (x, y), in metres, hits, and at what height.
 
-    Of the bodies that the probe hits, the highest; if it hits none, the nearest within the capture radius.
+    Of the bodies that the probe hits, the highest; if it hits none, the nearest within the capture radius. On its
+    way down to a fixed body, such as the floor of a container, it grasps a free body close beside it.
     Distances include contact margins, so hulls are grasped up to 4 mm beside their edge.
 
     Returns:
@@ -70,6 +71,12 @@ def body_under_probe(bodies: Bodies, x: float, y: float) -> tuple[int | None, fl
         index: _surface_z(bodies, index, x, y) for index in gaps if gaps[index] <= tools.CONTACT_RADIUS_M
     } or {nearest: _surface_z(bodies, nearest, x, y)}
     highest = max(tops, key=tops.__getitem__)
+    if highest not in bodies.rigid:
+        beside = {index: gaps[index] for index in gaps if index in bodies.rigid}
+        flank = min(beside, key=beside.__getitem__, default=highest)
+        top = bodies.highest_z(flank)
+        if gaps[flank] <= tools.FLANK_RADIUS_M and top > tops[highest]:
+            return flank, top
     return highest, tops[highest]
 
 

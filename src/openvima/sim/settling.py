@@ -1,6 +1,6 @@
 """Running the physics until everything is at rest."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from openvima.sim.bodies import Bodies
 from openvima.sim.model import TICK_S
@@ -18,6 +18,7 @@ def settle(
     *,
     apart_from: int | None = None,
     max_speed: float | None = None,
+    bystanders: Collection[int] = (),
     each: Callable[[int], None] | None = None,
 ) -> tuple[int, bool]:
     """Run until every free body has been slow for 10 ticks, or the limit is reached; then stop all bodies.
@@ -26,6 +27,7 @@ def settle(
         bodies: The bodies; their velocities are zero afterwards.
         apart_from: Index of a body to ignore, such as a parked one.
         max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
+        bystanders: See `Bodies.tick`.
         each: Called after every 5 ticks with the number of ticks.
 
     Returns:
@@ -34,7 +36,7 @@ def settle(
     num_ticks = quiet = 0
     while quiet < _QUIET_STRIDES and num_ticks < SETTLE_LIMIT_TICKS:
         before = bodies.coordinates()
-        bodies.tick(STRIDE_TICKS)
+        bodies.tick(STRIDE_TICKS, bystanders=bystanders)
         if max_speed is not None:
             bodies.limit_speed(max_speed)
         num_ticks += STRIDE_TICKS

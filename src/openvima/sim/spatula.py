@@ -27,7 +27,8 @@ CARRIED_ROTATION_RAD = 0.02  # … this …
 _CARRIED_STRIDES = 4  # … in so many strides of physics are carried
 _MAX_CARRY_M = 0.2  # then physics runs again, to catch slow slipping
 _MIN_CARRY_M = 0.003  # the contact query costs as much as a few ticks
-_WAKE_M = MAX_SPEED * settling.STRIDE_TICKS * TICK_S  # no body moves farther in a stride
+_STRIDE_M = MAX_SPEED * settling.STRIDE_TICKS * TICK_S  # no body moves farther in a stride …
+_SLIDE_M = 0.045  # … or slides farther at friction 0.3
 _LOW_TIP_Z_M = 0.035  # the spatula's edge is then just above the blocks
 _PATH_STEP_M = 0.004  # length of the straight segments of a joint-space path
 _NUM_PATH_POINTS = 400  # samples of a joint-space path
@@ -90,7 +91,8 @@ class Spatula:
             self._push_to(point)
         self._bodies.park_spatula()
         if state.num_ticks:
-            state.settle(max_speed=MAX_SPEED)
+            self._wake(_SLIDE_M)
+            state.settle(max_speed=MAX_SPEED, bystanders=self._bystanders)
         after = state.scene() if state.path.is_recording else state.start
         state.path.move(hover, scene=lambda _: after)
 
@@ -203,24 +205,29 @@ class Spatula:
         self._tip = _moved(self._tip, direction, length)
 
     def _run(self, num_ticks: int, velocity: Vector3) -> None:
-        self._wake()
+        self._wake(_STRIDE_M)
         self._bodies.tick_with_spatula(
             self._pose(), velocity, num_ticks=num_ticks, max_speed=MAX_SPEED, bystanders=self._bystanders
         )
         self._state.count_ticks(num_ticks)
         self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
 
-    def _wake(self) -> None:
+    def _wake(self, near_m: float) -> None:
         """Wake the bystanders near the spatula, those near a woken body, and so on."""
+        if not self._bystanders:
+            return
         bodies = self._bodies
-        circles = {index: (bodies.pose(index), bodies.shapes[index].radius_m) for index in bodies.rigid}
-        awake = [circle for index, circle in circles.items() if index not in self._bystanders]
-        awake.append((self._pose(), tools.SPATULA_HALF_SIZE_M[1]))
+        circles = {
+            index: (x, y, bodies.shapes[index].radius_m)
+            for index, (x, y) in zip(bodies.rigid, bodies.coordinates()[:, :2].tolist(), strict=True)
+        }
+        awake = [circles[index] for index in bodies.rigid if index not in self._bystanders]
+        awake.append((*self._tip[:2], tools.SPATULA_HALF_SIZE_M[1]))
         while awake:
-            pose, reach = awake.pop()
+            x, y, reach = awake.pop()
             for index in tuple(self._bystanders):
-                place, radius = circles[index]
-                if place.planar_distance(pose) < reach + radius + _WAKE_M:
+                other_x, other_y, radius = circles[index]
+                if math.hypot(other_x - x, other_y - y) < reach + radius + near_m:
                     self._bystanders.remove(index)
                     awake.append(circles[index])
 
