@@ -48,7 +48,7 @@ class Zone:
         return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
 
     def is_near(self, pose: Pose) -> bool:
-        """Whether a small block at `pose` can have a point in the zone: a quick check before `block_points`."""
+        """Whether a small block at `pose` can have a point in the zone; cheaper than its points."""
         reach_x, reach_y = self.size_x / 2 + _BLOCK_REACH_M, self.size_y / 2 + _BLOCK_REACH_M
         return abs(pose.x - self.x) < reach_x and abs(pose.y - self.y) < reach_y
 

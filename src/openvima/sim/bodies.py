@@ -142,8 +142,8 @@ class Bodies:
             pose: The spatula's centre at the start.
             velocity: Velocity of the spatula, m/s.
             num_ticks: Number of ticks.
-            max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body squeezed
-                between one and the spatula accelerates too fast for a later limit.
+            max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body
+                squeezed between one and the spatula accelerates too fast for a later limit.
             bystanders: See `tick`.
         """
         place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, 0.0))

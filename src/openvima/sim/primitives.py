@@ -56,8 +56,8 @@ def pick_place(state: PrimitiveState, action: Action) -> int | None:
 def body_under_probe(bodies: Bodies, x: float, y: float) -> tuple[int | None, float]:
     """Find the body that a probe lowered at (x, y), in metres, hits, and at what height.
 
-    Of the bodies that the probe hits, the highest; if it hits none, the nearest within the capture radius. On its
-    way down to a fixed body, such as the floor of a container, it grasps a free body close beside it.
+    Of the bodies that the probe hits, the highest; if it hits none, the nearest within the capture radius. On
+    its way down to a fixed body, such as the floor of a container, it grasps a free one close beside it.
     Distances include contact margins, so hulls are grasped up to 4 mm beside their edge.
 
     Returns:

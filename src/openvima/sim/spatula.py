@@ -20,10 +20,10 @@ from openvima.sim.primitive_state import PrimitiveState
 
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
 MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
-# Pushed bodies jitter, but hardly shift against the spatula. Carrying them without physics saves three of four
-# ticks and changes final positions as much as a 0.1 % faster spatula (1.4 mm in the median, 12 mm at most).
-CARRIED_SHIFT_M = 6e-4  # bodies that shift against the spatula by less than this, and rotate by less than …
-CARRIED_ROTATION_RAD = 0.02  # … this …
+# Pushed bodies jitter, but hardly shift against the spatula. Carrying them without physics saves three of
+# four ticks and changes final positions as much as a 0.1 % faster spatula (1.4 mm in the median, at most 12).
+CARRIED_SHIFT_M = 6e-4  # bodies that shift against the spatula by less than this, and rotate by less …
+CARRIED_ROTATION_RAD = 0.02  # … than this …
 _CARRIED_STRIDES = 4  # … in so many strides of physics are carried
 _MAX_CARRY_M = 0.2  # then physics runs again, to catch slow slipping
 _MIN_CARRY_M = 0.003  # the contact query costs as much as a few ticks
