@@ -47,7 +47,7 @@ def rotate() -> TabletopEnv:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_finds_nothing_to_complain_about(task: str) -> None:
-    env = gymnasium.make(f"openvima/{task}-v0", level=task_spec(task).levels[-1]).unwrapped
+    env = gymnasium.make(f"openvima/{task}-v1", level=task_spec(task).levels[-1]).unwrapped
     with warnings.catch_warnings():
         # Positions are in metres, as published actions are, and so lie in 0.25 … 0.75 rather than -1 … 1.
         warnings.filterwarnings("ignore", message=".*we recommend using a symmetric and normalized space")
@@ -110,7 +110,7 @@ def test_an_environment_that_was_used_gives_the_same_bytes_as_a_fresh_one(task: 
 
 
 def test_it_can_be_made_by_name_in_two_ways() -> None:
-    wrapped = gymnasium.make("openvima/rotate-v0", level="L1")
+    wrapped = gymnasium.make("openvima/rotate-v1", level="L1")
     bare = openvima.make("rotate", level="L1")
     assert isinstance(wrapped.unwrapped, TabletopEnv)
     assert frozen(wrapped.reset(seed=2)) == frozen(bare.reset(seed=2))
@@ -137,7 +137,7 @@ def test_names_and_levels_are_checked_when_it_is_made() -> None:
     ],
 )
 def test_options_of_the_task_are_checked_when_it_is_made(options: dict, message: str) -> None:
-    for make in (openvima.make, lambda task, **given: gymnasium.make(f"openvima/{task}-v0", **given)):
+    for make in (openvima.make, lambda task, **given: gymnasium.make(f"openvima/{task}-v1", **given)):
         with pytest.raises(ConfigError, match=message):
             make("rotate", **options)
 
@@ -301,7 +301,7 @@ def test_the_object_that_was_lifted_is_reported(rotate: TabletopEnv) -> None:
 
 
 def test_vector_environments_take_infos_of_hits_and_misses() -> None:
-    envs = gymnasium.make_vec("openvima/rotate-v0", num_envs=2, vectorization_mode="sync")
+    envs = gymnasium.make_vec("openvima/rotate-v1", num_envs=2, vectorization_mode="sync")
     envs.reset(seed=[5, 5])
     hit = TabletopEnv("rotate")
     hit.reset(seed=5)

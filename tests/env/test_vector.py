@@ -265,7 +265,7 @@ def test_an_episode_does_not_depend_on_how_many_are_played_at_once() -> None:
 @pytest.mark.slow
 def test_gymnasiums_own_function_gives_the_same_bytes(kind: str, settings: dict) -> None:
     envs = gymnasium.make_vec(
-        "openvima/rotate-v0", num_envs=2, vectorization_mode=kind, vector_kwargs=settings, level="L1"
+        "openvima/rotate-v1", num_envs=2, vectorization_mode=kind, vector_kwargs=settings, level="L1"
     )
     observations, _ = envs.reset(seed=[4, 9])
     prompts = envs.get_attr("prompt")

@@ -1,4 +1,4 @@
-"""Gymnasium ids of the environments, one per task: `openvima/rotate-v0` and so on."""
+"""Gymnasium ids of the environments, one per task: `openvima/rotate-v1` and so on."""
 
 import importlib.util
 import sys
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
 
-ENVIRONMENT_VERSION = 0  # bumped when the bytes for a seed change; see the history of `TabletopEnv`
+ENVIRONMENT_VERSION = 1  # bumped when the bytes for a seed change; see the history of `TabletopEnv`
 
 
 def environment_id(task: str) -> str:
-    """Return the Gymnasium id of a task, such as "openvima/rotate-v0"."""
+    """Return the Gymnasium id of a task, such as "openvima/rotate-v1"."""
     return f"openvima/{task}-v{ENVIRONMENT_VERSION}"
 
 
@@ -23,7 +23,7 @@ def make(task: str, **options: object) -> "TabletopEnv":
     """Build the environment of one task, without Gymnasium's wrappers.
 
     Args:
-        task: Name of the task, such as "rotate", or its Gymnasium id, such as "openvima/rotate-v0".
+        task: Name of the task, such as "rotate", or its Gymnasium id, such as "openvima/rotate-v1".
         **options: Keyword arguments of `TabletopEnv`, such as `level="L1"`.
 
     Returns:
