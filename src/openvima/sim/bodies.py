@@ -120,21 +120,21 @@ class Bodies:
         """Update the geometry to the poses that were set."""
         mujoco.mj_kinematics(self.model, self.data)
 
-    def tick(self, num_ticks: int = 1, *, bystanders: Iterable[int] = ()) -> None:
+    def tick(self, num_ticks: int = 1, *, sleeping: Iterable[int] = ()) -> None:
         """Advance the physics.
 
         Args:
             num_ticks: Number of ticks.
-            bystanders: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
+            sleeping: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
         """
-        rows = [self._joint[index] for index in bystanders]
+        rows = [self._joint[index] for index in sleeping]
         before = self._positions[rows]
         self._positions[rows, 2] += PARKED_M
         mujoco.mj_step(self.model, self.data, num_ticks)
         self._positions[rows], self._velocities[rows] = before, 0.0
 
     def tick_with_spatula(
-        self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float, bystanders: Iterable[int]
+        self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float, sleeping: Iterable[int]
     ) -> None:
         """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
 
@@ -144,13 +144,13 @@ class Bodies:
             num_ticks: Number of ticks.
             max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body
                 squeezed between one and the spatula accelerates too fast for a later limit.
-            bystanders: See `tick`.
+            sleeping: See `tick`.
         """
         place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, 0.0))
         stride = 1 if self._has_walls else num_ticks
         for _ in range(0, num_ticks, stride):
             self._positions[-1], self._velocities[-1] = place, speed
-            self.tick(stride, bystanders=bystanders)
+            self.tick(stride, sleeping=sleeping)
             self.limit_speed(max_speed)
             place[:3] += speed[:3] * (stride * TICK_S)
 

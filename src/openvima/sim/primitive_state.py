@@ -68,7 +68,7 @@ class PrimitiveState:
         held: tuple[int, Pose] | None = None,
         *,
         max_speed: float | None = None,
-        bystanders: Collection[int] = (),
+        sleeping: Collection[int] = (),
     ) -> None:
         """Run physics until everything is at rest; the arm's next move happens meanwhile."""
 
@@ -78,7 +78,7 @@ class PrimitiveState:
 
         held_index = held[0] if held else None
         _, completed = settling.settle(
-            self.bodies, apart_from=held_index, max_speed=max_speed, bystanders=bystanders, each=each
+            self.bodies, apart_from=held_index, max_speed=max_speed, sleeping=sleeping, each=each
         )
         self.completed = self.completed and completed
 

@@ -18,7 +18,7 @@ def settle(
     *,
     apart_from: int | None = None,
     max_speed: float | None = None,
-    bystanders: Collection[int] = (),
+    sleeping: Collection[int] = (),
     each: Callable[[int], None] | None = None,
 ) -> tuple[int, bool]:
     """Run until every free body has been slow for 10 ticks, or the limit is reached; then stop all bodies.
@@ -27,7 +27,7 @@ def settle(
         bodies: The bodies; their velocities are zero afterwards.
         apart_from: Index of a body to ignore, such as a parked one.
         max_speed: Bound of the horizontal speed in m/s, for bodies that overlap at the start.
-        bystanders: See `Bodies.tick`.
+        sleeping: See `Bodies.tick`.
         each: Called after every 5 ticks with the number of ticks.
 
     Returns:
@@ -36,7 +36,7 @@ def settle(
     num_ticks = quiet = 0
     while quiet < _QUIET_STRIDES and num_ticks < SETTLE_LIMIT_TICKS:
         before = bodies.coordinates()
-        bodies.tick(STRIDE_TICKS, bystanders=bystanders)
+        bodies.tick(STRIDE_TICKS, sleeping=sleeping)
         if max_speed is not None:
             bodies.limit_speed(max_speed)
         num_ticks += STRIDE_TICKS

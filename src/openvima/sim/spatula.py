@@ -51,7 +51,7 @@ class Spatula:
         self._in_joint_space = in_joint_space
         self._tip: Vector3 = (0.0, 0.0, tools.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
-        self._bystanders = set(state.bodies.rigid)  # at rest, and far from all that moves
+        self._sleeping = set(state.bodies.rigid)  # at rest, and far from all that moves
         self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms(index))
 
     def lower(self, x: float, y: float) -> None:
@@ -92,7 +92,7 @@ class Spatula:
         self._bodies.park_spatula()
         if state.num_ticks:
             self._wake(_SLIDE_M)
-            state.settle(max_speed=MAX_SPEED, bystanders=self._bystanders)
+            state.settle(max_speed=MAX_SPEED, sleeping=self._sleeping)
         after = state.scene() if state.path.is_recording else state.start
         state.path.move(hover, scene=lambda _: after)
 
@@ -207,28 +207,28 @@ class Spatula:
     def _run(self, num_ticks: int, velocity: Vector3) -> None:
         self._wake(_STRIDE_M)
         self._bodies.tick_with_spatula(
-            self._pose(), velocity, num_ticks=num_ticks, max_speed=MAX_SPEED, bystanders=self._bystanders
+            self._pose(), velocity, num_ticks=num_ticks, max_speed=MAX_SPEED, sleeping=self._sleeping
         )
         self._state.count_ticks(num_ticks)
         self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)
 
     def _wake(self, near_m: float) -> None:
-        """Wake the bystanders near the spatula, those near a woken body, and so on."""
-        if not self._bystanders:
+        """Wake the sleeping bodies near the spatula, those near a woken body, and so on."""
+        if not self._sleeping:
             return
         bodies = self._bodies
         circles = {
             index: (x, y, bodies.shapes[index].radius_m)
             for index, (x, y) in zip(bodies.rigid, bodies.coordinates()[:, :2].tolist(), strict=True)
         }
-        awake = [circles[index] for index in bodies.rigid if index not in self._bystanders]
+        awake = [circles[index] for index in bodies.rigid if index not in self._sleeping]
         awake.append((*self._tip[:2], tools.SPATULA_HALF_SIZE_M[1]))
         while awake:
             x, y, reach = awake.pop()
-            for index in tuple(self._bystanders):
+            for index in tuple(self._sleeping):
                 other_x, other_y, radius = circles[index]
                 if math.hypot(other_x - x, other_y - y) < reach + radius + near_m:
-                    self._bystanders.remove(index)
+                    self._sleeping.remove(index)
                     awake.append(circles[index])
 
     def _record_frames(self, direction: Vector3, length: float) -> None:
