@@ -41,7 +41,7 @@ def build_geometry(object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 
         return scaled_geometry(_kit(spec), scale)
     if object_name in _FIXED_SIZE:
         return scaled_geometry(_FIXED_SIZE[object_name](), scale)
-    build, needed_lengths = _BOXES[object_name]
+    build, needed_lengths = BOX_SHAPES[object_name]
     product = (size[0] * scale[0], size[1] * scale[1], size[2] * scale[2])
     if not all(length > 0 for length in product[:needed_lengths]):
         raise AssetError(
@@ -107,7 +107,7 @@ _FIXED_SIZE: dict[str, Callable[[], Geometry]] = {
     "stand": hanoi_stand,
     "disk": hanoi_disk,
 }
-_BOXES: dict[str, tuple[Callable[[Vector3], Geometry], int]] = {
+BOX_SHAPES: dict[str, tuple[Callable[[Vector3], Geometry], int]] = {
     "block": (boxes.block, 3),
     "shorter block": (boxes.block, 3),
     "small block": (boxes.block, 3),

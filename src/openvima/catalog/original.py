@@ -1,13 +1,12 @@
 """The original asset pack: meshes, textures and collision shapes of VIMA-Bench."""
 
 import io
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from openvima.catalog import boxes
+from openvima.catalog.bodies import BOX_SHAPES
 from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3, protect
 from openvima.catalog.hanoi import LONG_RODS_Z, hanoi_stand
@@ -18,26 +17,6 @@ from openvima.catalog.pack_files import CheckoutFiles, PackFiles, known_hashes
 from openvima.catalog.textures import TextureSpec, texture_spec
 from openvima.errors import AssetError
 
-_KIT_FILES = {
-    "letter A": "capital_letter_a",
-    "letter E": "capital_letter_e",
-    "letter G": "capital_letter_g",
-    "letter M": "capital_letter_m",
-    "letter R": "capital_letter_r",
-    "letter T": "capital_letter_t",
-    "letter V": "capital_letter_v",
-    "cross": "cross",
-    "diamond": "diamond",
-    "triangle": "triangle",
-    "flower": "flower",
-    "heart": "heart",
-    "hexagon": "hexagon",
-    "pentagon": "pentagon",
-    "L-shaped block": "right_angle",
-    "ring": "ring",
-    "round": "round",
-    "star": "star",
-}
 # Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
 _FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
     "bowl": ("bowl/textured-0008192.obj", (2.2, 2.2, 0.5), 0.0),
@@ -47,15 +26,6 @@ _FIXED_MESHES: dict[str, tuple[str, Vector3, float]] = {
     "disk": ("hanoi/disk0.obj", (0.0015, 0.0015, 0.003), 0.015),
 }
 _BOWL_PARTS = ("bowl/cup.obj", (2.2, 2.2, 0.4))  # 14 convex parts, a fifth flatter than what is drawn
-_BOX_SHAPES: dict[str, Callable[[Vector3], Geometry]] = {
-    "block": boxes.block,
-    "shorter block": boxes.block,
-    "small block": boxes.block,
-    "line": boxes.line,
-    "container": boxes.container,
-    "square": boxes.square,
-    "three-sided rectangle": boxes.three_sided_rectangle,
-}
 _SPECIAL_IMAGES = {
     "brick": "brick.jpg",
     "tiles": "tiles.jpg",
@@ -155,9 +125,9 @@ def _protected_geometry(files: PackFiles, object_name: str, size: Vector3, scale
 
 
 def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3) -> Geometry:
-    if spec.name in _BOX_SHAPES:
-        return _BOX_SHAPES[spec.name](_product(size, scale))
-    if spec.name in _KIT_FILES:
+    if spec.name in BOX_SHAPES:
+        return BOX_SHAPES[spec.name][0](_product(size, scale))
+    if spec.kind == "kit":
         return _kit(files, spec, scale)
     if spec.name == "stand":  # which has no mesh file
         return scaled_geometry(hanoi_stand(LONG_RODS_Z), scale)
@@ -167,7 +137,8 @@ def _geometry(files: PackFiles, spec: ObjectSpec, size: Vector3, scale: Vector3)
 def _kit(files: PackFiles, spec: ObjectSpec, scale: Vector3) -> Geometry:
     kit_scale = spec.kit_scale or 1.0
     metres = _product((0.003 * kit_scale, 0.003 * kit_scale, 0.001 * kit_scale / 1.1), scale)
-    visual = _scaled(_mesh(files, f"kitting/{_KIT_FILES[spec.name]}.obj"), metres)
+    name = spec.name.replace("letter", "capital letter").replace("L-shaped block", "right angle")
+    visual = _scaled(_mesh(files, f"kitting/{name.lower().replace(' ', '_')}.obj"), metres)
     return Geometry(visual, (_hull(visual.vertices),), 0.0)
 
 

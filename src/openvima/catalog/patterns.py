@@ -4,6 +4,8 @@ Layouts follow those of the original images at a fraction of their size. Whereve
 whole numbers, and else from comparisons far from a tie, so that images are bit-identical on every machine.
 """
 
+import math
+
 import numpy as np
 
 from openvima.catalog.noise import hashed, layered_noise
@@ -107,25 +109,7 @@ def paisley(ground: Colour) -> np.ndarray:
 
 # Sixteen headings as whole thousandths, so that drops stand on the same pixels everywhere.
 _HEADINGS = tuple(
-    (x, y)
-    for x, y in (
-        (1000, 0),
-        (924, 383),
-        (707, 707),
-        (383, 924),
-        (0, 1000),
-        (-383, 924),
-        (-707, 707),
-        (-924, 383),
-        (-1000, 0),
-        (-924, -383),
-        (-707, -707),
-        (-383, -924),
-        (0, -1000),
-        (383, -924),
-        (707, -707),
-        (924, -383),
-    )
+    (round(1000 * math.cos(k * math.pi / 8)), round(1000 * math.sin(k * math.pi / 8))) for k in range(16)
 )
 
 

@@ -1,6 +1,5 @@
 """Random shapes: flat prisms with irregular outlines, and containers, independent of the catalogue."""
 
-from collections.abc import Callable
 from typing import cast
 
 import numpy as np
@@ -244,13 +243,5 @@ def _bowl(rng: np.random.Generator) -> Geometry:
     return Geometry(revolved(profile, sides, texture_radii=radii), (), 0.0)
 
 
-_OUTLINES: tuple[Callable[[np.random.Generator], list[np.ndarray]], ...] = (
-    _star,
-    _polygon,
-    _blob,
-    _ring,
-    _strokes,
-    _strokes,
-    _strokes,
-)
-_CONTAINERS: tuple[Callable[[np.random.Generator], Geometry], ...] = (_open_box, _flat_square, _frame, _bowl)
+_OUTLINES = (_star, _polygon, _blob, _ring, _strokes, _strokes, _strokes)
+_CONTAINERS = (_open_box, _flat_square, _frame, _bowl)

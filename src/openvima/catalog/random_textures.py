@@ -5,7 +5,6 @@ catalogue, so that what is learnt from them is what textures are like, and not w
 """
 
 import colorsys
-from collections.abc import Callable
 
 import numpy as np
 
@@ -144,13 +143,4 @@ def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1 << 31))
 
 
-_FAMILIES: tuple[Callable[[np.random.Generator], _Field], ...] = (
-    _stripes,
-    _waves,
-    _checks,
-    _dots,
-    _bricks,
-    _patches,
-    _veins,
-    _swirl,
-)
+_FAMILIES = (_stripes, _waves, _checks, _dots, _bricks, _patches, _veins, _swirl)

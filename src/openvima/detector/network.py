@@ -16,13 +16,14 @@ from openvima.detector.masks import paste_masks
 from openvima.detector.matching import match, subsample
 from openvima.detector.roi_align import pyramid_align
 from openvima.detector.rpn import AnchorPredictions, RegionProposalNetwork
+from openvima.policies.nn.tensor_record import TensorRecord
 
 FOREGROUND_IOU = 0.5  # proposals from it on are foreground
 POSITIVE_FRACTION = 0.25  # of the proposals in the losses of the heads
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Instances:
+class Instances(TensorRecord):
     """The object instances of one image of H × W pixels, predicted or ground truth.
 
     Args:
@@ -34,10 +35,6 @@ class Instances:
     boxes: torch.Tensor
     masks: torch.Tensor
     scores: torch.Tensor
-
-    def to(self, device: torch.device) -> "Instances":
-        """Return the instances on another device."""
-        return Instances(self.boxes.to(device), self.masks.to(device), self.scores.to(device))
 
 
 class MaskRCNN(nn.Module):
