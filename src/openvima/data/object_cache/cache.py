@@ -16,6 +16,7 @@ from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import (
     CACHE_VERSION,
     CacheFile,
+    Record,
     file_name,
     join_records,
     write_cache_file,
@@ -108,7 +109,8 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
             >>> Processor("objects").collate(episodes).with_images(episodes.images, episodes.num_images)
         """
         places = [(self._files[name], row) for name, row in map(self.dataset.locate, indices)]
-        return join_records([file.read(row) for file, row in places], _Images(places))
+        records = [file.read(row) for file, row in places]
+        return join_records(records, _Images(places, records))
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
@@ -144,9 +146,11 @@ class _Images(Iterable[np.ndarray]):
     """The images of some episodes, read when they are asked for."""
 
     places: Sequence[tuple[CacheFile, int]]
+    records: Sequence[Record]
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        return (file.images(row) for file, row in self.places)
+        for (file, row), record in zip(self.places, self.records, strict=True):
+            yield file.images(row, record.entry)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

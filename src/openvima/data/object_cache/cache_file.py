@@ -110,18 +110,16 @@ INDEX = np.dtype([(name, f"<{code}") for name, code in zip(Entry._fields, _CODES
 
 
 class Record(NamedTuple):
-    """The tables of one episode as they are stored."""
+    """The tables of one episode as they are stored, and its entry in the index."""
 
+    entry: Entry
     task: str
-    seed: int
-    end_effector: int
     text: str
     prompt_objects: memoryview
     objects: memoryview
     final_objects: memoryview
     steps: memoryview
     prompt_images: memoryview
-    num_images: int
 
 
 def write_cache_file(
@@ -220,8 +218,8 @@ class CacheFile:
         prompt_images = np.frombuffer(record.prompt_images, PROMPT_IMAGE)
         return PreprocessedEpisode(
             task=record.task,
-            seed=record.seed,
-            end_effector=record.end_effector,
+            seed=record.entry.seed,
+            end_effector=record.entry.end_effector,
             prompt=PreprocessedPrompt(
                 record.text,
                 object_table(record.prompt_objects),
@@ -235,7 +233,7 @@ class CacheFile:
             false_positives=FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
             final=object_table(record.final_objects),
             actions=steps["actions"],
-            images=self.images(row),
+            images=self.images(row, record.entry),
         )
 
     def read(self, row: int) -> Record:
@@ -253,25 +251,26 @@ class CacheFile:
         steps = final_objects + entry.num_final_objects * _OBJECT_BYTES
         prompt_images = steps + entry.num_steps * _STEP_BYTES
         return Record(
+            entry,
             self._tasks[entry.task],
-            entry.seed,
-            entry.end_effector,
             str(content[entry.text_start : entry.text_start + entry.text_bytes], "utf-8"),
             content[prompt_objects:objects],
             content[objects:final_objects],
             content[final_objects:steps],
             content[steps:prompt_images],
             content[prompt_images : prompt_images + entry.num_prompt_images * _PROMPT_IMAGE_BYTES],
-            entry.num_images,
         )
 
-    def images(self, row: int) -> np.ndarray:
+    def images(self, row: int, entry: Entry) -> np.ndarray:
         """Return the images of one episode, shape (K, 3, height, width), uint8.
+
+        Args:
+            row: The episode.
+            entry: That of its record.
 
         Raises:
             ShardError: They are damaged.
         """
-        entry = Entry(*_ENTRY.unpack_from(self._index_bytes, row * _ENTRY.size))
         start, end = entry.images_start, entry.images_start + entry.num_images * self._image_bytes
         if xxh3_64_intdigest(self._content[start:end]) != entry.images_checksum:
             raise self._damaged(row)
@@ -316,16 +315,16 @@ def join_records(records: Sequence[Record], images: Iterable[np.ndarray]) -> Epi
     """
     steps = np.frombuffer(b"".join([record.steps for record in records]), STEP)
     prompt_images = np.frombuffer(b"".join([record.prompt_images for record in records]), PROMPT_IMAGE)
-    num_images = np.array([len(record.prompt_images) for record in records]) // _PROMPT_IMAGE_BYTES
-    counts = np.array([record.num_images for record in records])
+    entries = [record.entry for record in records]
+    counts = np.array([entry.num_images for entry in entries])
     return EpisodeBatch(
         [record.task for record in records],
-        [record.seed for record in records],
-        np.array([record.end_effector for record in records], np.int64),
-        np.array([len(record.steps) for record in records]) // _STEP_BYTES,
+        [entry.seed for entry in entries],
+        np.array([entry.end_effector for entry in entries], np.int64),
+        np.array([entry.num_steps for entry in entries]),
         PreprocessedPrompts(
             [record.text for record in records],
-            num_images,
+            np.array([entry.num_prompt_images for entry in entries]),
             object_table(b"".join([record.prompt_objects for record in records])),
             prompt_images["num_objects"],
             prompt_images["is_scene"],
