@@ -235,7 +235,8 @@ LARGE: dict[str, Callable[[], list[bytes]]] = {
     "64 episodes of 300 words": lambda: largest_batch(64, 300),
     "64 prompts of 250 words": lambda: largest_batch(64, 250),
     "allowed: 64 prompts of 120 words": lambda: largest_batch(64, 120),
-    "allowed: 60 objects in view, 64 episodes": lambda: objects_in_view(60, 64),
+    "60 objects in view, 64 episodes": lambda: objects_in_view(60, 64),
+    "allowed: 24 objects in view, 64 episodes": lambda: objects_in_view(24, 64),
     "allowed: 64 episodes, objects in turns": lambda: long_history(64, 16),
     "allowed: 500 distinct prompts": lambda: distinct_prompts(500),
 }

@@ -13,7 +13,7 @@ from openvima.scene import RenderedPrompt
 from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import MAX_PIXELS, encode_prompt
-from openvima.serving.session import MAX_OBJECTS, Session
+from openvima.serving.session import Session
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
 
@@ -67,9 +67,16 @@ def test_every_count_of_a_prompt_is_bounded_before_the_policy_sees_it() -> None:
         assert reason in refusal({**made_up_observation(1), "prompt": sent})
 
 
-def test_objects_are_bounded_over_all_prompts_of_a_request() -> None:
+def test_objects_are_bounded_over_all_images_of_a_request() -> None:
     prompts = [prompt_with(objects=records(*range(200)))] * 21
-    assert f"4,200 objects; at most {MAX_OBJECTS:,}" in refusal({"type": "reset", "prompts": prompts})
+    reason = "4,200 objects in all; at most 4,096 are allowed"
+    assert reason in refusal({"type": "reset", "prompts": prompts})
+    many = {"top": np.arange(25, dtype=np.uint8)[None]}
+    seen = {"rgb": {"top": np.zeros((3, 1, 25), np.uint8)}, "segm": many, "ee": 0}
+    reason = "1,600 objects in all; at most 1,536 are allowed"
+    assert reason in refusal({"type": "act", "observations": [seen] * 64})
+    session = Session(Untouched(), 64)
+    assert not isinstance(session.read(pack({"type": "act", "observations": [seen] * 61})), str)
 
 
 def test_images_are_bounded_in_size_and_views() -> None:

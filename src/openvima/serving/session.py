@@ -2,9 +2,11 @@
 
 import logging
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
+
+import numpy as np
 
 from openvima.errors import MessageError, OpenVimaError, echo
 from openvima.policies.base import Policy
@@ -21,7 +23,9 @@ from openvima.serving.protocol import (
     type_of,
 )
 
-MAX_OBJECTS = 4096  # in the images of all prompts of a request, 64 for each of 64 episodes
+# Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
+# 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
+MAX_IN_PROMPTS, MAX_IN_VIEW = 64, 24
 _MAX_REFUSAL = 500  # characters of a refusal, of which what was sent takes 200 at most
 _LOG = logging.getLogger(__name__)
 
@@ -77,9 +81,10 @@ class Session:
             return partial(self._begin, self._decoded(prompts))
         if kind == "act":
             seen = read_list(message, "act", "observations", self._max_episodes)
-            return partial(
-                self._act, [decode_observation(one, f"observation {n}") for n, one in enumerate(seen)]
-            )
+            observations = [decode_observation(one, f"observation {n}") for n, one in enumerate(seen)]
+            num_ids = sum(_num_ids(one["segm"]) for one in observations if one and "segm" in one)
+            self._check_objects(num_ids, MAX_IN_VIEW)
+            return partial(self._act, observations)
         if isinstance(message, dict) and "type" not in message:
             prompt = message.pop("prompt", None)
             sent = [] if prompt is None else [{"text": prompt} if isinstance(prompt, str) else prompt]
@@ -92,10 +97,17 @@ class Session:
         prompts = [decode_prompt(prompt, f"prompt {n}") for n, prompt in enumerate(sent)]
         for prompt in prompts:
             self._limits.check(prompt)
-        total = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
-        if total > MAX_OBJECTS:
-            raise MessageError(f"the prompts have {total:,} objects; at most {MAX_OBJECTS:,} are allowed.")
+        num_objects = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
+        self._check_objects(num_objects, MAX_IN_PROMPTS)
         return prompts
+
+    def _check_objects(self, count: int, per_episode: int) -> None:
+        allowed = max(256, per_episode * self._max_episodes)  # of a single one as many as an image may have
+        if count > allowed:
+            raise MessageError(
+                f"the images have {count:,} objects in all; at most {allowed:,} are allowed. "
+                "Send fewer episodes."
+            )
 
     def _begin(self, prompts: Sequence[RenderedPrompt]) -> dict[str, Any]:  # Any: plain values
         self._reset(prompts)
@@ -137,6 +149,13 @@ class Session:
         if prompts:
             self._reset(prompts)
         return self._actions([observation])[0]
+
+
+def _num_ids(segm: Mapping[str, np.ndarray]) -> int:
+    """Count the values of a segmentation, in the view with most of them."""
+    return max(
+        (int(np.count_nonzero(np.bincount(ids.ravel(), minlength=256))) for ids in segm.values()), default=0
+    )
 
 
 def _refusal(error: OpenVimaError) -> str:
