@@ -12,14 +12,15 @@ FREE_SPACE = "Free space, or give another folder; the same command then continue
 
 
 @contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Add a path to errors of the system that name none, such as a full disk."""
+def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Let errors of the system name a path that name none, such as a full disk, or the temporary one."""
     try:
         yield
     except OSError as error:
-        if error.filename is None:
-            error.filename = str(path)
-        raise
+        is_temporary = temporary is not None and str(error.filename).startswith(str(temporary))
+        if not error.errno or (error.filename is not None and not is_temporary):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 @contextlib.contextmanager
@@ -36,15 +37,13 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with naming(path), open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        _name(error, path, temporary)
-        raise
+        with naming(path, temporary):
+            with open(temporary, "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -86,18 +85,16 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     try:
-        yield temporary
-        _sync_files(temporary)
-        backup = _backup_path(path)
-        if path.exists():
+        with naming(path, temporary):
+            yield temporary
+            _sync_files(temporary)
+            backup = _backup_path(path)
+            if path.exists():
+                shutil.rmtree(backup, ignore_errors=True)
+                os.replace(path, backup)
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
             shutil.rmtree(backup, ignore_errors=True)
-            os.replace(path, backup)
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-        shutil.rmtree(backup, ignore_errors=True)
-    except OSError as error:
-        _name(error, path, temporary)
-        raise
     finally:
         restore_folder(path)
         shutil.rmtree(temporary, ignore_errors=True)
@@ -139,12 +136,6 @@ def process_runs(process_id: int) -> bool:
     except PermissionError:  # another user's process
         pass
     return True
-
-
-def _name(error: OSError, path: Path, temporary: Path) -> None:
-    """Let an error that names no file, such as that of a full disk, or a temporary one name the final one."""
-    if error.errno and (error.filename is None or str(error.filename).startswith(str(temporary))):
-        error.filename = str(path)
 
 
 def _backup_path(path: Path) -> Path:

@@ -154,6 +154,7 @@ VERB_WORDS = {
     "evaluate": "--policy oracle --tasks rotate --levels L1 --episodes 40 --out {out}",
     "demo": "rotate --out {out}/video.mp4",
     "train": "--data {data} --preset nano --schedule.steps 2 --pretraining.steps 0 --out {out}",
+    "data": "export-lerobot {data} {out}",
     "quickstart": "--demonstrations 4 --episodes 2 --out {out}",
 }
 
@@ -172,6 +173,6 @@ def test_a_full_disk_ends_every_verb_with_one_line(verb: str, tmp_path: Path) ->
     lines = [line for line in ended.stderr.splitlines() if line.startswith("openvima: ")]
     assert ended.returncode == 1, ended.stderr
     assert len(lines) == 1
-    assert str(tmp_path / "out") in lines[0]
-    assert "ree space" in lines[0]
+    assert str(tmp_path) in lines[0]
+    assert "Free space" in lines[0] or "Make room" in lines[0]
     assert "Traceback" not in ended.stderr
