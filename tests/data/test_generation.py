@@ -13,13 +13,15 @@ from openvima.data import (
     GenerateConfig,
     GenerationProgress,
     generate,
+    generation,
     oracle_rollouts,
 )
+from openvima.data import manifest as manifests
 from openvima.data.encoding import Skipped
 from openvima.data.planning import SEEDS_PER_EPISODE, SPARE_SEEDS
 from openvima.data.subsets import SubsetConfig, sample
 from openvima.env import TabletopEnv
-from openvima.errors import DatasetError, OracleError, SamplingError
+from openvima.errors import DatasetError, OracleError, SamplingError, ShardError
 from openvima.scene import Outcome
 from small_data_sets import contents
 from small_generations import TASKS, config
@@ -290,3 +292,62 @@ def test_nothing_is_generated_into_the_folder_of_failed_episodes(tmp_path: Path)
     generate(config(tmp_path, tasks=("rotate",), keep_failed=True))
     with pytest.raises(DatasetError, match="belongs to another data set"):
         generate(config(tmp_path / "failed", tasks=("rotate",)))
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_extending_copies_what_is_there_and_gives_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: bool
+) -> None:
+    settings = {"tasks": ("rotate",), "shard_size": 4, "images": images}
+    whole = contents(generate(config(tmp_path / "whole", episodes=6, **settings)))
+    played, read = [], []
+    attempt, summarise = oracle_rollouts.attempt, manifests.summarise
+
+    def counting_attempt(env, seed):
+        played.append(seed)
+        return attempt(env, seed)
+
+    def counting_summarise(path, known=None):
+        read.append(path.name)
+        return summarise(path, known)
+
+    generate(config(tmp_path / "out", episodes=5, **settings))
+    monkeypatch.setattr(oracle_rollouts, "attempt", counting_attempt)
+    monkeypatch.setattr(manifests, "summarise", counting_summarise)
+    generate(config(tmp_path / "out", episodes=6, **settings))
+    assert contents(tmp_path / "out") == whole
+    assert len(played) == 1
+    assert read == ["rotate-train-00001.arrow"]
+
+
+def test_a_damaged_record_is_not_copied_into_a_larger_shard(tmp_path: Path) -> None:
+    settings = {"tasks": ("rotate",), "shard_size": 4}
+    generate(config(tmp_path, episodes=3, **settings))
+    content = bytearray((tmp_path / "rotate-train-00000.arrow").read_bytes())
+    content[Dataset(tmp_path).index.column("offset")[1].as_py() + 5000] ^= 1
+    (tmp_path / "rotate-train-00000.arrow").write_bytes(content)
+    with pytest.raises(ShardError, match=r"record 1 of 3 .*checksum is wrong"):
+        generate(config(tmp_path, episodes=4, **settings))
+    assert (tmp_path / "rotate-train-00000.arrow").read_bytes() == content
+
+
+def test_an_extension_that_was_interrupted_reads_no_more_than_needed(tmp_path: Path, monkeypatch) -> None:
+    settings = {"tasks": ("rotate",), "shard_size": 2}
+    generate(config(tmp_path / "out", episodes=4, **settings))
+
+    def stop(block, count):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(generation, "write_block", stop)
+        generate(config(tmp_path / "out", episodes=5, **settings))
+    with pytest.raises(DatasetError, match="not finished"):
+        Dataset(tmp_path / "out")
+    read = []
+    summarise = manifests.summarise
+    monkeypatch.setattr(manifests, "summarise", lambda *a: read.append(a[0].name) or summarise(*a))
+    generate(config(tmp_path / "out", episodes=5, **settings))
+    assert read == ["rotate-train-00002.arrow"]
+    assert contents(tmp_path / "out") == contents(
+        generate(config(tmp_path / "whole", episodes=5, **settings))
+    )

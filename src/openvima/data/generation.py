@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from openvima.data.manifest import FAILED_FOLDER, MANIFEST_NAME, finish_folder
+from openvima.data.checksums import spans_of
+from openvima.data.manifest import FAILED_FOLDER, ShardSummary, finish_folder, previous_summaries, set_aside
 from openvima.data.oracle_rollouts import write_block
 from openvima.data.planning import COMMAND, Block, GenerateConfig, plan
 from openvima.data.progress import NUM_COUNTS, Report, reporter
@@ -90,12 +91,14 @@ def _write_missing(config: GenerateConfig, own: Sequence[Block], report: Report 
     """
     _remove_leftovers(config, own)
     missing = [block for block in own if not is_done(block)]
+    previous = previous_summaries(config.out) if missing and not config.keep_failed else {}
+    missing = [_with_kept(block, previous.get(block.path.name)) for block in missing]
     missing.sort(key=lambda block: -block.episodes)  # small ones then fill the gaps at the end
     watch = reporter(report, own, missing)
     if not missing:
         return
     for folder in (config.out, config.out / FAILED_FOLDER):
-        (folder / MANIFEST_NAME).unlink(missing_ok=True)  # it speaks of whole data sets
+        set_aside(folder)  # a manifest speaks of whole data sets
     try:
         for _ in _engine(config, missing, watch):
             pass  # a block's result is its file
@@ -136,12 +139,18 @@ def _finish_with_others(config: GenerateConfig, blocks: Sequence[Block]) -> None
             finish(config, blocks)
 
 
-def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
+def _with_kept(block: Block, summary: ShardSummary | None) -> Block:
+    """Add the records that a smaller shard has already."""
+    return block if summary is None else replace(block, kept=tuple(spans_of(summary.index)))
+
+
+def finish(config: GenerateConfig, blocks: Sequence[Block], *, reuse: bool = True) -> None:
     """Write index and manifest of a folder whose shards are all there, and those of its failed episodes.
 
     Args:
         config: What was generated.
         blocks: Its division into shards.
+        reuse: Trust what the previous manifest says of shards that it fits, instead of reading them.
 
     Raises:
         ShardError: A shard is damaged.
@@ -152,4 +161,5 @@ def finish(config: GenerateConfig, blocks: Sequence[Block]) -> None:
         settings = {**record, "kept": FAILED_FOLDER}
         finish_folder(config.out / FAILED_FOLDER, failed, command=COMMAND, config=settings, versions=versions)
     paths = [block.path for block in blocks]
-    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions)
+    known = previous_summaries(config.out) if reuse else {}
+    finish_folder(config.out, paths, command=COMMAND, config=record, versions=versions, known=known)

@@ -1,13 +1,16 @@
 """What lies beside the shards: the index of episodes, and the manifest with counts, checksums and origin."""
 
+import contextlib
 import hashlib
 import json
+import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,13 +18,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima.atomic_io import atomic_write_file
-from openvima.data.checksums import Span, measure
+from openvima.data.checksums import Envelope, Span, measure
 from openvima.data.schema import SCHEMA_VERSION
 from openvima.data.shard import Shard
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, ShardError
 
 INDEX_NAME = "index.parquet"
 MANIFEST_NAME = "dataset.json"
+PREVIOUS_NAME = ".dataset.json.old"  # while a data set is being extended
 BROKEN_NAME = "broken.json"  # episodes that an import left out
 FAILED_FOLDER = "failed"  # episodes that the oracle did not solve; a data set of the same form
 CACHE_FOLDER = "object_cache"  # derived from the shards, safe to delete
@@ -98,13 +102,11 @@ class ShardSummary:
         name: Of the file.
         entry: Its entry in the manifest: counts, size and checksums.
         index: Its part of the index.
-        tasks: Name to counts of each task that has episodes in it.
     """
 
     name: str
     entry: dict[str, Any]  # Any: JSON
     index: pa.Table
-    tasks: dict[str, TaskCounts]
 
 
 def finish_folder(
@@ -115,7 +117,7 @@ def finish_folder(
     config: Mapping[str, Any],  # Any: JSON
     versions: Mapping[str, str],
     licence: str = LICENCE,
-    report: Callable[[int, int], None] | None = None,
+    known: Mapping[str, ShardSummary] = MappingProxyType({}),
 ) -> None:
     """Write the index and the manifest of a folder whose shards are all there.
 
@@ -126,16 +128,12 @@ def finish_folder(
         config: The settings that decide the content; nothing that depends on time or machine.
         versions: Package name to version.
         licence: Of the demonstrations.
-        report: Called with shards done and shards in all.
+        known: Name to summary of the shards that need not be read.
 
     Raises:
         ShardError: A shard is damaged.
     """
-    summaries = []
-    for number, path in enumerate(shards):
-        summaries.append(summarise(path))
-        if report is not None:
-            report(number + 1, len(shards))
+    summaries = [known.get(path.name) or summarise(path) for path in shards]
     origin = {"command": command, "config": dict(config), "versions": dict(versions), "licence": licence}
     index, manifest = compose(summaries, origin)
     sink = BytesIO()
@@ -145,6 +143,46 @@ def finish_folder(
     atomic_write_file(folder / INDEX_NAME, sink.getvalue())
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False)
     atomic_write_file(folder / MANIFEST_NAME, text + "\n")
+    (folder / PREVIOUS_NAME).unlink(missing_ok=True)
+
+
+def set_aside(folder: Path) -> None:
+    """Take away the manifest of a folder that is about to change; `previous_summaries` still finds it."""
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(folder / MANIFEST_NAME, folder / PREVIOUS_NAME)
+
+
+def previous_summaries(folder: Path) -> dict[str, ShardSummary]:
+    """Return summaries of the shards that are as the folder's manifest says, without reading their records.
+
+    The manifest may have been set aside. Size, schema and footer of each shard are compared.
+    """
+    path = folder / MANIFEST_NAME
+    try:
+        manifest = parse_manifest(read_inside(path if path.exists() else folder / PREVIOUS_NAME))
+        index = parse_index(read_inside(folder / INDEX_NAME), manifest)
+    except (OSError, DatasetError):
+        return {}
+    found = {}
+    for name, part in index_parts(index).items():
+        entry = manifest["shards"][name]
+        with contextlib.suppress(ShardError):
+            if "skipped" in entry and is_inside(folder / name):
+                Shard(folder / name, Envelope.from_entry(entry))
+                found[name] = ShardSummary(name, entry, part)
+    return found
+
+
+def index_parts(index: pa.Table) -> dict[str, pa.Table]:
+    """Return the rows of an index by shard."""
+    if index.num_rows == 0:
+        return {}
+    shards = index.column("shard").combine_chunks().dictionary_encode()
+    codes = shards.indices.to_numpy()
+    order = np.argsort(codes, kind="stable")
+    starts = np.searchsorted(codes[order], np.arange(1, len(shards.dictionary)))
+    names = shards.dictionary.to_pylist()
+    return {name: index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)}
 
 
 def summarise(
@@ -162,9 +200,15 @@ def summarise(
     """
     table = Shard(path).table(_COLUMNS)
     envelope, spans = measure(path)
-    counts = {"episodes": table.num_rows, "steps": _sum(table, "steps")}
+    skipped = Counter(entry["kind"] for row in table.column("skipped").to_pylist() for entry in row)
+    counts = {
+        "episodes": table.num_rows,
+        "steps": _sum(table, "steps"),
+        "redraws": _sum(table, "redraws"),
+        "skipped": dict(sorted(skipped.items())),
+    }
     entry = {**counts, **(known or fingerprint(path)), **envelope.to_entry()}
-    return ShardSummary(path.name, entry, _index_part(table, path.name, spans), _counts(table))
+    return ShardSummary(path.name, entry, _index_part(table, path.name, spans))
 
 
 def compose(
@@ -182,7 +226,9 @@ def compose(
     index = pa.concat_tables([INDEX_SCHEMA.empty_table(), *(summary.index for summary in summaries)])
     tasks: dict[str, TaskCounts] = {}
     for summary in summaries:
-        for task, counts in summary.tasks.items():
+        names = ("episodes", "steps", "redraws")
+        counts = TaskCounts(*(summary.entry[name] for name in names), Counter(summary.entry["skipped"]))
+        for task in summary.index.column("task").unique().to_pylist():  # a shard has one
             tasks.setdefault(task, TaskCounts()).add(counts)
     manifest = {
         "schema": SCHEMA_VERSION,
@@ -329,15 +375,6 @@ def _index_part(table: pa.Table, name: str, spans: Sequence[Span]) -> pa.Table:
         "crc32": pa.array([span.crc32 for span in spans], pa.uint32()),
     }
     return pa.table([columns[column] for column in INDEX_SCHEMA.names], schema=INDEX_SCHEMA)
-
-
-def _counts(table: pa.Table) -> dict[str, TaskCounts]:
-    tasks, names = {}, np.array(table.column("task").to_pylist())
-    for task in sorted(set(names.tolist())):
-        rows = table.filter(names == task)
-        skipped = Counter(entry["kind"] for row in rows.column("skipped").to_pylist() for entry in row)
-        tasks[task] = TaskCounts(rows.num_rows, _sum(rows, "steps"), _sum(rows, "redraws"), skipped)
-    return tasks
 
 
 def _sum(table: pa.Table, column: str) -> int:

@@ -2,11 +2,13 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 from openvima.data.encoding import SkipKind, Skipped
 from openvima.data.planning import DOMAIN, Block
 from openvima.data.records import Demonstration, rollout_oracle
+from openvima.data.shard import Shard
 from openvima.data.writer import ShardWriter
 from openvima.env import TabletopEnv
 from openvima.env.config import EnvConfig
@@ -22,11 +24,16 @@ def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
 
     Raises:
         OracleError: The oracle solved too few of the block's episodes.
+        ShardError: A record that is to be copied is damaged.
     """
     num_kept, num_redraws, skipped = 0, 0, []
     with contextlib.ExitStack() as files:  # closed in reverse: where a shard is, its failed episodes are too
         kept = files.enter_context(ShardWriter(block.path, block.info))
         failed: ShardWriter | None = None
+        if block.kept:
+            num_kept, next_seed = len(block.kept), _copy_kept(block, kept)
+            rest = range(next_seed, block.seeds.stop)
+            block = replace(block, episodes=block.episodes - num_kept, seeds=rest)
         for num_tried, rollout in enumerate(rollouts(block), start=1):
             if isinstance(rollout, Skipped):
                 skipped.append(rollout)
@@ -42,6 +49,19 @@ def write_block(block: Block, count: Callable[[int, int, int], None]) -> None:
                     failed.write(rollout)
             num_redraws += 0 if isinstance(rollout, Skipped) else rollout.num_redraws
             count(num_kept, num_tried, num_redraws)
+
+
+def _copy_kept(block: Block, writer: ShardWriter) -> int:
+    """Copy the records that a shard has already; return the seed to go on with.
+
+    Raises:
+        ShardError: One is damaged.
+    """
+    shard = Shard(block.path)
+    for row, span in enumerate(block.kept):
+        shard.check(row, span)
+        writer.copy(shard.batch(row))
+    return shard.read(len(block.kept) - 1, ["seed"])["seed"] + 1
 
 
 def rollouts(block: Block) -> Iterator[Demonstration | Skipped]:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
+from openvima.data.checksums import Span
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
@@ -177,6 +178,7 @@ class Block:
         seeds: Seeds to try, in order.
         env_config: As in `GenerateConfig`.
         failed_path: File for the episodes that the oracle did not solve; None throws them away.
+        kept: Records that the file begins with already; they are copied.
     """
 
     path: Path
@@ -185,6 +187,7 @@ class Block:
     seeds: range
     env_config: EnvConfig
     failed_path: Path | None = None
+    kept: tuple[Span, ...] = ()
 
 
 def plan(config: GenerateConfig) -> list[Block]:

@@ -5,14 +5,21 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from openvima.data.encoding import ShardInfo
-from openvima.data.manifest import BROKEN_NAME, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME, check_failed
+from openvima.data.manifest import (
+    BROKEN_NAME,
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    PREVIOUS_NAME,
+    check_failed,
+)
 from openvima.data.planning import COMMAND, Block, GenerateConfig
 from openvima.data.reader import read_manifest
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
-_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME)
+_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, PREVIOUS_NAME)
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

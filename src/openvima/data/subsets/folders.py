@@ -4,11 +4,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from openvima.data.manifest import BROKEN_NAME, CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
+from openvima.data.manifest import (
+    BROKEN_NAME,
+    CACHE_FOLDER,
+    FAILED_FOLDER,
+    INDEX_NAME,
+    MANIFEST_NAME,
+    PREVIOUS_NAME,
+)
 from openvima.errors import DatasetError
 from openvima.folder_lock import is_lock_file
 
-_NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
+_NAMES = (MANIFEST_NAME, PREVIOUS_NAME, INDEX_NAME, BROKEN_NAME, FAILED_FOLDER, CACHE_FOLDER)
 
 
 def check_out(out: Path, sources: Sequence[Path], *, force: bool) -> None:

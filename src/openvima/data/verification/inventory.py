@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from openvima.data.manifest import (
@@ -14,6 +13,7 @@ from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
     ORIGIN_TYPES,
+    index_parts,
     parse_index,
     parse_manifest,
     read_inside,
@@ -74,16 +74,7 @@ class Inventory:
 
     def index_parts(self) -> dict[str, pa.Table]:
         """Return the rows of the index by shard."""
-        if self.index is None or self.index.num_rows == 0:
-            return {}
-        shards = self.index.column("shard").combine_chunks().dictionary_encode()
-        codes = shards.indices.to_numpy()
-        order = np.argsort(codes, kind="stable")
-        starts = np.searchsorted(codes[order], np.arange(1, len(shards.dictionary)))
-        names = shards.dictionary.to_pylist()
-        return {
-            name: self.index.take(rows) for name, rows in zip(names, np.split(order, starts), strict=True)
-        }
+        return {} if self.index is None else index_parts(self.index)
 
 
 def take_inventory(folder: Path) -> Inventory:

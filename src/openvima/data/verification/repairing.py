@@ -125,7 +125,7 @@ def _regenerate(
             for name in written:
                 (folder / name).parent.mkdir(exist_ok=True)
                 os.replace(staging / name, folder / name)
-    finish(settings, [replace(b, info=replace(b.info, versions=dict(versions))) for b in blocks])
+    finish(settings, [replace(b, info=replace(b.info, versions=dict(versions))) for b in blocks], reuse=False)
     return tuple(written)
 
 

@@ -162,8 +162,9 @@ def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
 def _summary_faults(task: ShardTask, summary: ShardSummary) -> Iterator[str]:
     """Yield contradictions of manifest and index with the shard."""
     if task.entry is not None and summary.entry != task.entry:
-        names = [key for key, value in summary.entry.items() if task.entry.get(key) != value]
-        yield f"the manifest says otherwise of its {', '.join(names) or 'entries'}"
+        names = [key for key, value in task.entry.items() if summary.entry.get(key) != value]
+        if names:
+            yield f"the manifest says otherwise of its {', '.join(names)}"
     if task.index is not None and not task.index.combine_chunks().equals(summary.index.combine_chunks()):
         names = [
             name
