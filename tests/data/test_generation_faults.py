@@ -223,6 +223,7 @@ def test_a_quota_reached_while_writing_loses_no_finished_shard(
     assert f"cannot write to {tmp_path}: File too large. 2 of 4 shards are whole and were kept" in message
     assert "same command then goes on" in message
     there = contents(tmp_path)
+    assert there.pop(".dataset.json.old") == before["dataset.json"]
     assert there.items() <= before.items()
     assert {f"{task}-train-00000.arrow" for task in TASKS} <= there.keys()
     assert main(words) == 0
