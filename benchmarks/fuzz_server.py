@@ -252,17 +252,18 @@ class Probe:
     def __init__(self, ask: Callable[[], None]) -> None:
         self._ask = ask
         self._stop = threading.Event()
-        self._started: float | None = None
-        self._longest_s = 0.0
+        self._waits_s: list[float] = []
         self.failures: list[str] = []
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def longest_s(self) -> float:
-        """Longest wait since the last call, that which still lasts included."""
-        started = self._started
-        waiting = time.perf_counter() - started if started is not None else 0.0
-        longest, self._longest_s = max(self._longest_s, waiting), 0.0
+        """Longest wait since the last call, once what is asked now is answered, too."""
+        count = len(self._waits_s)
+        while len(self._waits_s) == count:
+            time.sleep(0.01)
+        longest = max(self._waits_s)
+        self._waits_s.clear()
         return longest
 
     def stop(self) -> None:
@@ -272,14 +273,13 @@ class Probe:
 
     def _run(self) -> None:
         while not self._stop.wait(0.05):
-            self._started = time.perf_counter()
+            started = time.perf_counter()
             try:
                 self._ask()
             except Exception as error:  # whatever it is, the server did not answer
                 self.failures.append(f"{type(error).__name__}: {error}")
                 self._stop.wait(1)
-            self._longest_s = max(self._longest_s, time.perf_counter() - self._started)
-            self._started = None
+            self._waits_s.append(time.perf_counter() - started)
 
 
 def attack(
