@@ -36,14 +36,11 @@ class ObjectHeadConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class CandidateHeadConfig:
+class CandidateHeadConfig(ObjectHeadConfig):
     """Sizes of the head that points at place candidates, and weights of its losses.
 
     Args:
-        hidden_width: Width of the hidden layers that predict offset and yaw.
-        num_yaw_bins: Classes of the rotation between pick and place, over a full circle; bin 0 is none.
-        offset_weight: Weight of the offset loss relative to the pointers'.
-        yaw_weight: Weight of the yaw loss.
+        hidden_width, num_yaw_bins, offset_weight, yaw_weight: As in `ObjectHeadConfig`.
         appearance_loss_weight: Weight of the losses of picking, and of placing at an object in view, by
             appearance alone. They train the attention to the prompt and the grounding of words; known objects
             can be found without, novel ones cannot.
@@ -54,10 +51,6 @@ class CandidateHeadConfig:
             last.
     """
 
-    hidden_width: int = 128
-    num_yaw_bins: int = 72
-    offset_weight: float = 2.0
-    yaw_weight: float = 0.5
     appearance_loss_weight: float = 0.5
     grounding_loss_weight: float = 0.5
     num_prompt_queries: int = 2
