@@ -209,8 +209,8 @@ def draw_point(axes: Any, count: int, mean: LevelMean, colour: str) -> None:
 def draw_published(axes: Any, level: str) -> None:
     """Draw the published curves over fractions of the data, and VIMA-200M with all of it."""
     for model, mark in (("VIMA", "o"), ("MIDAS", "s")):
-        fractions = sorted(_fractions(model, "92M"), key=lambda entry: entry.data_share)
-        counts = [PUBLISHED_DEMONSTRATIONS * entry.data_share for entry in fractions]
+        fractions = sorted(_fractions(model, "92M"), key=lambda entry: entry.data_fraction)
+        counts = [PUBLISHED_DEMONSTRATIONS * entry.data_fraction for entry in fractions]
         rates = [entry.levels[level] for entry in fractions]
         style = {"color": FAINT, "linewidth": 1.2, "markersize": 4, "markerfacecolor": PAPER}
         axes.plot(counts, rates, "--" + mark, label=f"{model} 92M, published", **style)

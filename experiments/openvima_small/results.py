@@ -177,7 +177,7 @@ def _empty(why: str) -> Table:
 
 
 def _beside() -> list[PublishedModel]:
-    whole = {(model.model, model.size): model for model in published_models() if model.data_share == 1}
+    whole = {(model.model, model.size): model for model in published_models() if model.data_fraction == 1}
     return [whole[name] for name in BESIDE]
 
 

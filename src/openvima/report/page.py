@@ -49,7 +49,7 @@ def write_report(
     Args:
         results: What was found.
         out: The HTML file to write.
-        command: The command that repeats the evaluation; by default put together from `results.config`.
+        command: The command that repeats the evaluation; by default composed from `results.config`.
         metrics: `metrics.jsonl` of the training run, for its curves.
         runs: Folders of training runs, for theirs.
         clips: Recorded episodes.

@@ -1,4 +1,4 @@
-"""Success rates of the papers' models, as published elsewhere: for orientation beside one's own."""
+"""Published success rates of the papers' models, for comparison."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,12 @@ from openvima.evaluation.results import Results
 # The only model whose success by task was published for all levels.
 BESIDE = ("VIMA", "200M")
 RELIABILITY = (
-    "Published elsewhere, not measured here. Level means are read off figures of the VIMA and MIDAS papers, "
-    "to about 0.2 points; those with ~ to about 0.5. Those with * were printed by the authors. Rates by task "
-    "of VIMA 200M were printed too, and are taken from public re-implementations that quote them. Each model "
-    "was scored on 200 episodes a task, which alone leaves about 1.6 points either way on the means of L1 to "
-    "L3 and 3.5 on L4. Another simulator, other assets and demonstrations, and detected instead of true "
-    "boxes in some cases: differences of a few points to them mean nothing."
+    "Published numbers, not measured here. Level means are read off figures of the VIMA and MIDAS papers, to "
+    "about 0.2 points; those with ~ to about 0.5. Those with * were printed by the authors. Rates by task of "
+    "VIMA 200M were printed, too, and are taken from public re-implementations that quote them. Each model "
+    "was evaluated on 200 episodes per task; that alone gives an uncertainty of 1.6 points on the means of "
+    "L1 to L3 and 3.5 on L4. Simulator, assets and demonstrations differ, and some results use detected "
+    "boxes: differences of a few points are not meaningful."
 )
 
 
@@ -25,9 +25,9 @@ class PublishedModel:
     """Level means of a model from a paper.
 
     Args:
-        model: Its name there.
+        model: Its name in the paper.
         size: Parameters of its controller, such as "200M".
-        data_share: Share of the demonstrations that it was trained on.
+        data_fraction: Fraction of the demonstrations that it was trained on.
         levels: Success rate at each level (%).
         printed: Whether the authors printed the numbers; else they are read off figures.
         rough: Levels whose number is read off to half a point only.
@@ -36,15 +36,15 @@ class PublishedModel:
     model: str
     size: str
     levels: Mapping[str, float]
-    data_share: float = 1.0
+    data_fraction: float = 1.0
     printed: bool = False
     rough: tuple[str, ...] = field(default=())
 
     @property
     def name(self) -> str:
-        """Name with size, and with the share of data where it is not all."""
-        share = "" if self.data_share == 1 else f", {100 * self.data_share:g} % of the data"
-        return f"{self.model} {self.size}{share}"
+        """Name with size, and the fraction of the data if it is not all."""
+        fraction = "" if self.data_fraction == 1 else f", {100 * self.data_fraction:g} % of the data"
+        return f"{self.model} {self.size}{fraction}"
 
     def written(self, level: str) -> str:
         """The rate at a level with its mark, as explained in `RELIABILITY`; a dash where there is none."""
@@ -62,7 +62,7 @@ def published_models() -> tuple[PublishedModel, ...]:
 
 def leading_models() -> list[PublishedModel]:
     """The largest of each kind, trained on all data."""
-    largest = {row.model: row for row in published_models() if row.data_share == 1}  # sizes ascend
+    largest = {row.model: row for row in published_models() if row.data_fraction == 1}  # sizes ascend
     return list(largest.values())
 
 
