@@ -13,6 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = (
     *sorted((ROOT / "src").rglob("*.py")),
+    *sorted((ROOT / "src").rglob("*.j2")),
+    *sorted((ROOT / "src").rglob("MODEL_CARD.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
     *sorted((ROOT / "docs").rglob("*.py")),
     *sorted((ROOT / "examples").rglob("*.py")),
