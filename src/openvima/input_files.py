@@ -3,8 +3,9 @@
 import json
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import yaml
 
@@ -16,7 +17,7 @@ _MAX_INTEGER = 2**63
 _MAX_REASON = 200  # characters
 
 
-def open_regular(file: Path) -> BinaryIO:
+def open_regular(file: Path) -> BufferedReader:
     """Open a regular file for reading. A FIFO or device is refused and never waited for.
 
     Raises:

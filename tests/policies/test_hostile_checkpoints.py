@@ -142,6 +142,15 @@ def test_weights_that_are_not_finite_are_refused(saved, published, value: float)
         load_published(published)
 
 
+def test_names_of_layers_may_be_anything(saved) -> None:
+    weights = load_file(saved / WEIGHTS_FILE)
+    strange = {f"decoder.self_blocks.{name}": torch.zeros(1) for name in ("", "0,a", "²", "9" * 5000, "x.y")}
+    save_file({**weights, **strange}, saved / WEIGHTS_FILE)
+    with pytest.raises(CheckpointError, match=r"unexpected: decoder\.self_blocks") as caught:
+        load_checkpoint(saved)
+    assert len(str(caught.value)) < 2000
+
+
 def test_a_huge_header_is_not_read(saved) -> None:
     with (saved / WEIGHTS_FILE).open("r+b") as file:
         file.write(struct.pack("<Q", 90_000_000))

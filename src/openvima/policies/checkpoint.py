@@ -5,6 +5,7 @@ config.yaml          config of the network, precision of the weights
 tokenizer/           files of the T5 tokenizer, for policies that use it
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from openvima.policies.tensor_files import file_digest, read_safetensors, write_
 from openvima.policies.tokenizer import Tokenizer
 
 _KIND = "network"
+_LAYER = re.compile(r"decoder\.self_blocks\.([0-9]{1,4})\.")
 _MAX_LISTED = 5  # names that a message lists per kind of problem
 _PRECISIONS = {
     "float32": torch.float32,
@@ -239,8 +241,8 @@ def _size_mismatch(tensors: Mapping[str, torch.Tensor], expected: Mapping[str, t
 
 
 def _sizes(tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
-    layers = [name.split(".")[2] for name in tensors if name.startswith("decoder.self_blocks.")]
-    sizes = {"layers": 1 + max(int(layer) for layer in layers)} if layers else {}
+    layers = [int(match[1]) for match in map(_LAYER.match, tensors) if match]
+    sizes = {"layers": 1 + max(layers)} if layers else {}
     for what, name, axis in (("width", "observation_out.weight", 0), ("words", "prompt.words.weight", 0)):
         if name in tensors and tensors[name].ndim > axis:
             sizes[what] = tensors[name].shape[axis]

@@ -4,13 +4,15 @@ from collections.abc import Sequence
 
 import torch
 
+from openvima.errors import echo
+
 
 def listed(what: str, names: Sequence[str], *, limit: int) -> list[str]:
     """Return ["what: first, second and 3 more"], or an empty list without names."""
     if not names:
         return []
     more = f" and {len(names) - limit} more" if len(names) > limit else ""
-    return [f"{what}: {', '.join(names[:limit])}{more}"]
+    return [f"{what}: {', '.join(map(echo, names[:limit]))}{more}"]
 
 
 def described(dtype: torch.dtype, shape: Sequence[int] | None = None) -> str:
