@@ -226,8 +226,9 @@ def compose(
     index = pa.concat_tables([INDEX_SCHEMA.empty_table(), *(summary.index for summary in summaries)])
     tasks: dict[str, TaskCounts] = {}
     for summary in summaries:
-        names = ("episodes", "steps", "redraws")
-        counts = TaskCounts(*(summary.entry[name] for name in names), Counter(summary.entry["skipped"]))
+        entry = summary.entry
+        skipped = Counter(entry["skipped"])
+        counts = TaskCounts(entry["episodes"], entry["steps"], entry["redraws"], skipped)
         for task in summary.index.column("task").unique().to_pylist():  # a shard has one
             tasks.setdefault(task, TaskCounts()).add(counts)
     manifest = {
