@@ -106,9 +106,9 @@ def write_safetensors(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
 
 
 def file_digest(file: Path) -> str:
-    """Return a hash of a file's content."""
+    """Return the SHA-256 of a file's content, as hexadecimal text."""
     with open_regular(file) as stream:
-        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_finite(tensors: Mapping[str, torch.Tensor], file: Path) -> None:
