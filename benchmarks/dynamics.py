@@ -1,6 +1,6 @@
 """Agreement of the physics with VIMA-Bench: final poses of bodies after recorded actions.
 
-    python benchmarks/dynamics.py --episodes FILE --assets DIR [--json FILE]
+    python benchmarks/dynamics.py --episodes FILE [FILE …] --assets DIR [--json FILE]
 
 Replays every step of recorded episodes from its recorded start, with the original asset pack and the
 benchmark's inexact arm (`compat`). `oracle` steps are clean solutions; `perturbed` ones rotate and shift
@@ -25,13 +25,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--episodes", type=Path, required=True, help="recorded episodes, episodes.json.gz")
+    parser.add_argument(
+        "--episodes", type=Path, nargs="+", required=True, help="recorded episodes, such as episodes.json.gz"
+    )
     parser.add_argument("--assets", type=Path, required=True, help="checkout with the original asset pack")
     parser.add_argument("--json", type=Path, help="file to write the result to")
     arguments = parser.parse_args()
     try:
         assets = OriginalAssets(arguments.assets)
-        steps = [replay(step, assets) for step in read_steps(arguments.episodes)]
+        steps = [replay(step, assets) for file in arguments.episodes for step in read_steps(file)]
     except (RecordingError, OpenVimaError) as error:
         parser.error(str(error))
     modes = sorted({step.step.mode for step in steps})

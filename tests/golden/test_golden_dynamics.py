@@ -14,11 +14,12 @@ import pytest
 from golden_episodes import StepDifference, read_steps, replay, summary
 from openvima.catalog.original import OriginalAssets
 
-EPISODES = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "dynamics" / "episodes.json.gz"
+FOLDER = Path(os.environ.get("OPENVIMA_GOLDEN", "../shared/golden")) / "dynamics"
+EPISODES = (FOLDER / "episodes.json.gz", FOLDER / "episodes_extra.json.gz")
 ASSETS = Path(os.environ.get("OPENVIMA_REFERENCE_ASSETS", "../shared/reference_assets"))
 
 pytestmark = [
-    pytest.mark.skipif(not EPISODES.is_file(), reason=f"{EPISODES} is absent; set OPENVIMA_GOLDEN"),
+    pytest.mark.skipif(not EPISODES[1].is_file(), reason=f"{EPISODES[1]} is absent; set OPENVIMA_GOLDEN"),
     pytest.mark.skipif(not ASSETS.is_dir(), reason=f"{ASSETS} is absent; set OPENVIMA_REFERENCE_ASSETS"),
 ]
 
@@ -27,8 +28,9 @@ pytestmark = [
 def differences() -> dict[str, list[StepDifference]]:
     assets = OriginalAssets(ASSETS)
     found: dict[str, list[StepDifference]] = {"oracle": [], "perturbed": []}
-    for step in read_steps(EPISODES):
-        found[step.mode].append(replay(step, assets))
+    for file in EPISODES:
+        for step in read_steps(file):
+            found[step.mode].append(replay(step, assets))
     return found
 
 

@@ -173,6 +173,20 @@ def test_a_block_that_rides_along_ends_where_physics_alone_pushes_it(monkeypatch
         assert ours.pose.z == pytest.approx(theirs.pose.z, abs=1e-4)
 
 
+def test_a_row_of_blocks_ends_where_it_does_with_no_block_asleep(monkeypatch) -> None:
+    row: list[Body] = [("small block", x, 0.0, 0.0) for x in (0.68, 0.62, 0.54, 0.45)]
+    aside: list[Body] = [("small block", 0.6, 0.3, 0.4)]
+    scene = table(*row, *aside, end_effector="spatula")
+    action = Action.planar((0.7, 0.0), (0.45, 0.0))
+    sleeping, awake = World(scene, ASSETS), World(scene, ASSETS)
+    sleeping.execute(action)
+    monkeypatch.setattr(Spatula, "_wake", lambda spatula, _: spatula._sleeping.clear())
+    awake.execute(action)
+    assert sleeping.scene[8] == scene[8]
+    for ours, theirs in zip(sleeping.scene.placements, awake.scene.placements, strict=True):
+        assert ours.pose.planar_distance(theirs.pose) < 3e-3
+
+
 def test_riding_bodies_are_watched_on_their_way() -> None:
     world = blocks((0.68, 0.0, 0.0))
     seen = []

@@ -74,13 +74,13 @@ class View:
         Returns:
             The push, possibly with the spatula off-centre; None if every variant collides.
         """
-        if touches_line(push, self.lines):
+        block_area = push.block_area()
+        if touches_line(block_area, self.lines):
             return None
         others = [
             (block, -self.overlap_m if object_id in self.met_ids else 0.0)
             for object_id, block in self.others(goal)
         ]
-        block_area = push.block_area()
         if any(block_area.comes_near(other, margin) for other, margin in others):
             return None
         for shifted in push.variants():
@@ -90,10 +90,9 @@ class View:
         return None
 
 
-def touches_line(push: Push, lines: Sequence[Zone]) -> bool:
-    """Whether a pushed block may touch a line."""
-    area = push.block_area()
-    return any(area.comes_near(Rectangle.of_zone(line)) for line in lines)
+def touches_line(block_area: Rectangle, lines: Sequence[Zone]) -> bool:
+    """Whether a block pushed over an area may touch a line."""
+    return any(block_area.comes_near(Rectangle.of_zone(line)) for line in lines)
 
 
 def ends(zone: Zone, start: Point) -> Iterator[Point]:
