@@ -128,6 +128,9 @@ class Bodies:
             sleeping: Indices of free bodies at rest that nothing can touch meanwhile. They are left out.
         """
         rows = [self._joint[index] for index in sleeping]
+        if not rows:
+            mujoco.mj_step(self.model, self.data, num_ticks)
+            return
         before = self._positions[rows]
         self._positions[rows, 2] += PARKED_M
         mujoco.mj_step(self.model, self.data, num_ticks)

@@ -42,10 +42,10 @@ def waypoints(zone: Zone, lines: tuple[Zone, ...]) -> tuple[Waypoint, ...]:
     )
     found = []
     for point in itertools.chain.from_iterable(_beside(line, zone) for line in lines if line.x > zone.x):
-        if touches_line(Push.between(point, point).block_area(), wider):
+        if touches_line(Push.between(point, point), wider):
             continue
         pushes = [Push.between(point, end) for end in ends(zone, point)]
-        lengths = [push.length_m for push in pushes if not touches_line(push.block_area(), wider)]
+        lengths = [push.length_m for push in pushes if not touches_line(push, wider)]
         if lengths:
             found.append(Waypoint(point, min(lengths)))
     return tuple(found)
