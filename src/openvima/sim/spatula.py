@@ -101,8 +101,10 @@ class Spatula:
 
         Squeezed between spatula and floor, the physics would fling it away; VIMA-Bench nudges it.
         """
-        pose = self._bodies.pose(index)
-        spatula = self._pose()
+        pose, spatula = self._bodies.pose(index), self._pose()
+        reach = self._bodies.shapes[index].radius_m + tools.SPATULA_HALF_SIZE_M[1]
+        if pose.planar_distance(spatula) > math.sqrt(2) * reach:
+            return False
         corners = spatula.inverse().transform(pose.transform(self._bodies.shapes[index].points[:, :3]))
         half = np.array(tools.SPATULA_HALF_SIZE_M)
         low, high = corners.min(axis=0) - half, corners.max(axis=0) + half  # body grown by the spatula
@@ -155,10 +157,11 @@ class Spatula:
             return None
         before, tip = self._recent[-_CARRIED_STRIDES]
         change = self._bodies.coordinates() - before
+        if 2 * np.abs(change[:, 3:]).max() >= CARRIED_ROTATION_RAD:
+            return None
         stands = np.abs(change[:, :3]).max(axis=1) < CARRIED_SHIFT_M
         rides = np.abs(change[:, :3] - np.subtract(self._tip, tip)).max(axis=1) < CARRIED_SHIFT_M
-        turns = 2 * np.abs(change[:, 3:]).max(axis=1) >= CARRIED_ROTATION_RAD
-        if turns.any() or not (stands | rides).all():
+        if not (stands | rides).all():
             return None
         return tuple(
             index for index, riding in zip(self._bodies.rigid, rides.tolist(), strict=True) if riding
