@@ -115,7 +115,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     Version history:
         v1: Sweeps leave bodies out of reach out of the physics and carry aligned ones farther, for speed:
-            swept bodies end elsewhere by 1.4 mm in the median. The suction cup grasps a free body up to 2 mm
+            swept bodies end elsewhere by 1.1 mm in the median. The suction cup grasps a free body up to 2 mm
             beside it before it reaches the fixed body below, as VIMA-Bench's does. Episodes are sampled, and
             all other actions executed, as in v0.
         v0: First version.

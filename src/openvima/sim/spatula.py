@@ -21,7 +21,7 @@ from openvima.sim.primitive_state import PrimitiveState
 SWEEP_M_S = 0.12  # 0.5 mm a tick; VIMA-Bench takes 350–430 ticks for 0.2 m
 MAX_SPEED = 0.5  # m/s, of bodies squeezed out between the spatula and a fixed body
 # Pushed bodies jitter, but hardly shift against the spatula. Carrying them without physics saves three of
-# four ticks and changes final positions as much as a 0.1 % faster spatula (1.4 mm in the median, at most 12).
+# four ticks and changes final positions as much as a 0.1 % faster spatula (1.5 mm in the median, at most 12).
 CARRIED_SHIFT_M = 6e-4  # bodies that shift against the spatula by less than this, and rotate by less …
 CARRIED_ROTATION_RAD = 0.02  # … than this …
 _CARRIED_STRIDES = 4  # … in so many strides of physics are carried
