@@ -357,6 +357,7 @@ def test_a_batch_too_large_for_its_longest_prompt_is_refused_before_it_is_encode
 ) -> None:
     monkeypatch.setattr(policy.network, "encode_images", lambda images: pytest.fail("encoded"))
     long = replace(prompts[0], text="put the " * 100 + prompts[0].text)
+    policy = policy.new_session()
     with pytest.raises(
         PolicyError, match=r"40 prompts of up to 2\d\d tokens .* takes (1|2)\d of that length"
     ):
@@ -372,6 +373,7 @@ def test_a_history_longer_than_the_position_table_is_refused(policy, prompts, po
 
 def test_histories_that_take_too_much_together_are_refused(policy, prompts, pool, monkeypatch) -> None:
     monkeypatch.setattr("openvima.policies.inference.MAX_CACHED_TOKENS", 60)
+    policy = policy.new_session()
     policy.reset([prompts[0], prompts[1]])
     with pytest.raises(
         PolicyError, match=r"the histories of 2 episodes have \d+ tokens each.* takes 60 in all"

@@ -125,6 +125,7 @@ class NetworkPolicy(Policy):
             self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._temperature = temperature
         self._seed = generator.initial_seed() if generator else 0
+        self._is_bounded = False  # batches of one's own may be as large as the memory allows
         self._num_prompts = 0
         self._episodes: _Episodes | None = None
 
@@ -133,7 +134,7 @@ class NetworkPolicy(Policy):
         """Start a batch of episodes.
 
         Raises:
-            PolicyError: The batch is empty or too large for its longest prompt, or a prompt is too long.
+            PolicyError: The batch is empty, a prompt is too long, or a session's batch is too large for it.
             PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
@@ -141,7 +142,7 @@ class NetworkPolicy(Policy):
             raise PolicyError("reset got no prompts; give one for each episode.")
         batch, stack = self.processor.encode_prompts(prompts)
         count, length = batch.word_ids_BL.shape
-        if count * length**2 > MAX_PROMPT_PAIRS:
+        if self._is_bounded and count * length**2 > MAX_PROMPT_PAIRS:
             raise PolicyError(
                 f"{count} prompts of up to {length} tokens are too many at once; this policy takes "
                 f"{MAX_PROMPT_PAIRS // length**2} of that length. Reset with fewer episodes (--batch)."
@@ -201,8 +202,9 @@ class NetworkPolicy(Policy):
         return actions
 
     def new_session(self) -> "NetworkPolicy":
-        """Return a policy that shares the network and has its own episodes."""
+        """Return a policy for one client: it shares the network and has its own, bounded batches."""
         other = copy(self)
+        other._is_bounded = True
         other._num_prompts, other._episodes = 0, None  # never changed in place, so nothing else is shared
         return other
 
@@ -254,7 +256,7 @@ class NetworkPolicy(Policy):
     def _step(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
         """Decode one action for every running episode."""
         cached = getattr(episodes.state, "cache", episodes.state).mask_BS
-        if cached.numel() > MAX_CACHED_TOKENS:
+        if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(
                 f"the histories of {len(cached)} episodes have {cached.shape[1]} tokens each, padded; this "
                 f"policy takes {MAX_CACHED_TOKENS:,} in all. Act in fewer episodes (--batch) or steps."
