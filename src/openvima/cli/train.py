@@ -27,8 +27,8 @@ Example: openvima train --data demos --preset nano --out run
 presets and your own learners, else "paper". --init-from disables the pretraining of recipe and file; set
 --pretraining.steps to pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
-the file, and the file over the recipe. Code that the file names, as a learner or detector of your own, runs
-only with --trust-code. The defaults below are those of the selected recipe and file.
+the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
+--trust-code lets the file name code that is run, such as a learner or detector of your own.
 
 Several GPUs or machines: torchrun --nproc-per-node 8 -m openvima train --data demos --out run ...
 """
