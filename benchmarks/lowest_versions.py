@@ -60,8 +60,9 @@ class Environment:
         return {name: version for name, version in (line.split("==") for line in lines) if name in declared()}
 
     def install_mujoco(self, version: str) -> None:
-        """Replace MuJoCo."""
-        self._uv("install", f"mujoco=={version}")
+        """Replace MuJoCo, which consists of two packages from 4.0 on, that overwrite files of the one before."""
+        packages = ("mujoco", "mujoco-core")
+        self._uv("install", f"mujoco=={version}", *(f"--reinstall-package={name}" for name in packages))
 
     def check(self, arguments: list[str]) -> dict[str, Any]:
         """Run Python; return command, seconds and whether it passed, else the end of its output."""
@@ -130,7 +131,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         environment = Environment(Path(folder))
         lowest = environment.install(options.torch)
-        results = [environment.check(arguments) for arguments in checks(options.torch, options.tests)]
+        results = []
+        for arguments in checks(options.torch, options.tests):
+            results.append(environment.check(arguments))
+            print(results[-1]["command"], flush=True, file=sys.stderr)
         for version in filter(None, options.mujoco.split(",")):
             environment.install_mujoco(version)
             results.append({"mujoco": version, **environment.check([str(ROOT / DIGESTS)])})
