@@ -60,7 +60,7 @@ class Environment:
         return {name: version for name, version in (line.split("==") for line in lines) if name in declared()}
 
     def install_mujoco(self, version: str) -> None:
-        """Replace MuJoCo, which consists of two packages from 4.0 on, that overwrite files of the one before."""
+        """Replace MuJoCo; from 4.0 on it is two packages, which may lack files after a change."""
         packages = ("mujoco", "mujoco-core")
         self._uv("install", f"mujoco=={version}", *(f"--reinstall-package={name}" for name in packages))
 
