@@ -103,10 +103,10 @@ def declared() -> set[str]:
 def checks(torch: str, tests: list[str]) -> list[list[str]]:
     """Return the arguments of Python for each check, in order."""
     verbs = [
-        "generate --tasks rotate,sweep_without_touching --episodes 10 --out data --workers 2",
+        "generate --tasks rotate,sweep_without_exceeding --episodes 10 --out data --workers 2",
         "data verify data --replay 2",
         "data export-lerobot data lerobot",
-        "evaluate --policy oracle --tasks all --levels L1,L4 --episodes 3 --out oracle",
+        "evaluate --policy oracle --tasks rotate,twist,novel_noun --levels L1 --episodes 3 --out oracle",
         "report oracle",
         "demo rotate --out rotate.mp4",
         *(["train --data data --preset nano --schedule.steps 5 --out run"] if torch else []),
