@@ -158,13 +158,13 @@ def test_prompts_that_do_not_fit_together_are_refused(layout: str, demonstration
 
 @pytest.mark.parametrize("name", ["nano", "vima-nano"])
 def test_more_objects_than_a_history_holds_are_refused(name: str, demonstrations) -> None:
-    """With one token for each object two steps of 250 fit, with one for each view only one."""
+    """With one token for each object eight steps of 60 fit, with one for each view four."""
     demo = demonstrations[0]
     policy = NetworkPolicy(build_network(preset(name), seed=0))
     policy.reset([demo.prompt])
     with pytest.raises(PolicyError, match=r"this policy takes 512\. Give.*fewer objects"):
-        for _ in range(3):
-            policy.act([crowded(250)])
+        for _ in range(9):
+            policy.act([crowded(60)])
 
 
 def test_objects_come_in_the_order_of_their_ids_where_published_policies_know_it(starts) -> None:
