@@ -15,6 +15,7 @@ from naive_inputs import NaiveProcessor, batch_histories, batch_prompts  # noqa:
 from noisy_extractor import HOOK, NoisyExtractor  # noqa: E402
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.object_cache.cache_file import CACHE_VERSION  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.detector.plugins import PluggedExtractor, detected_object_cache, plugged_boxes  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
@@ -228,7 +229,7 @@ def test_true_boxes_alone_need_no_detector_and_detected_ones_no_true_tokens(sett
     short = {**settings, "pretraining.steps": 0, "schedule.steps": 2, "object_cache": tmp_path / "tokens"}
     detected = train(TrainingConfig.of({**short, "loader.boxes": HOOK, "loader.detected_prob": 1.0}))
     (folder,) = (tmp_path / "tokens").iterdir()
-    assert folder.name == f"objects-v3-{plugged_boxes(HOOK).name}"
+    assert folder.name == f"objects-v{CACHE_VERSION}-{plugged_boxes(HOOK).name}"
     plain = train(TrainingConfig.of({**short, "out": tmp_path / "plain"}))
     assert len(list((tmp_path / "tokens").iterdir())) == 2
     none = train(
