@@ -8,7 +8,7 @@ import pytest
 from openvima.scene import Episode, SceneImage
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
-NUM_EPISODES = 2000
+NUM_EPISODES = 1000
 # Standard deviations of a chi-square statistic; chance exceeds it less than once in 100,000 tests.
 LIMIT = 6.0
 
