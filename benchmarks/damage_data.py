@@ -24,6 +24,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from damage import BLOCKS, damaged
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.manifest import INDEX_NAME, MANIFEST_NAME, manifest_checksum
 from openvima.data.object_cache.cache import open_object_cache
@@ -34,31 +35,6 @@ from sim import circumstances
 
 TASKS = ("rotate", "sweep_without_exceeding")
 HOSTILE = ("../{}", "/tmp/{}", "sub/{}", "..\\{}", "", ".", "..", "a\0{}", ".{}", "~/{}", "{}/../../{}")
-
-
-def damaged(content: bytes, rng: random.Random) -> bytes:
-    """The content after one to five accidents."""
-    result = bytearray(content)
-    for _ in range(rng.choice((1, 1, 1, 2, 5))):
-        place, other = rng.randrange(len(result)), rng.randrange(len(result))
-        block = min(rng.choice((1, 8, 64, 512, 4096)), len(result) - max(place, other))
-        accident = rng.choice(("bit", "noise", "zeros", "swap", "cut", "lose", "grow"))
-        if accident == "bit":
-            result[place] ^= 1 << rng.randrange(8)
-        elif accident == "noise":
-            result[place : place + block] = rng.randbytes(block)
-        elif accident == "zeros":
-            result[place : place + block] = bytes(block)
-        elif accident == "swap" and abs(place - other) >= block:
-            first, second = result[place : place + block], result[other : other + block]
-            result[place : place + block], result[other : other + block] = second, first
-        elif accident == "cut":
-            del result[max(place, 1) :]
-        elif accident == "lose" and len(result) > 2 * block:
-            del result[place : place + block]
-        elif accident == "grow":
-            result[place:place] = rng.randbytes(block)
-    return bytes(result)
 
 
 def outcome(folder: Path, expected: list[str]) -> str:
@@ -136,7 +112,7 @@ def main() -> None:
             else:
                 path = rng.choice([p for p in whole if p.suffix != ".arrow"] + [rng.choice(list(whole))])
                 kind = "shard" if path.suffix == ".arrow" else path.name
-                path.write_bytes(damaged(whole[path], rng))
+                path.write_bytes(damaged(whole[path], rng, blocks=(*BLOCKS, 4096), cut_prob=1))
                 found = outcome(folder, expected)
                 if path.read_bytes() == whole[path]:
                     found = "harmless"  # the accidents undid each other

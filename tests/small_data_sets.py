@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from damage import damaged
 from openvima.data import Dataset, Demonstration, Shard, ShardWriter
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import MANIFEST_NAME, finish_folder, manifest_checksum
@@ -70,33 +71,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def damaged(content: bytes, seed: int) -> bytes:
-    """The content with a random accident: bits, bytes, blocks, order or length."""
-    rng, result = random.Random(seed), bytearray(content)
-    for _ in range(rng.choice((1, 1, 1, 2, 5))):
-        place, other = rng.randrange(len(result)), rng.randrange(len(result))
-        block = min(rng.choice((1, 8, 64, 512)), len(result) - max(place, other))
-        accident = rng.choice(("bit", "byte", "noise", "zeros", "swap", "cut", "lose", "grow"))
-        if accident == "bit":
-            result[place] ^= 1 << rng.randrange(8)
-        elif accident == "byte":
-            result[place] = rng.choice((0, 127, 128, 255))
-        elif accident == "noise":
-            result[place : place + block] = rng.randbytes(block)
-        elif accident == "zeros":
-            result[place : place + block] = bytes(block)
-        elif accident == "swap" and abs(place - other) >= block:
-            first, second = result[place : place + block], result[other : other + block]
-            result[place : place + block], result[other : other + block] = second, first
-        elif accident == "cut" and rng.random() < 0.3:
-            del result[max(place, 1) :]
-        elif accident == "lose" and len(result) > 2 * block:
-            del result[place : place + block]
-        elif accident == "grow":
-            result[place:place] = rng.randbytes(block)
-    return bytes(result)
-
-
 def read_all(folder: Path) -> list[str] | None:
     """Content hashes of a data set as it is read; None if reading ends with one of our errors."""
     try:
@@ -116,7 +90,7 @@ def read_damaged_shards(whole: Path, copy: Path, seeds: range, result: Path) -> 
     """
     content, odd = whole.read_bytes(), []
     for seed in seeds:
-        copy.write_bytes(damaged(content, seed))
+        copy.write_bytes(damaged(content, random.Random(seed)))
         try:
             shard = Shard(copy)
             shard.table(["seed", "skipped"]).to_pylist()

@@ -109,7 +109,6 @@ def _run(verb: str, rest: list[str]) -> int:
             return _fail(f"{type(error).__name__}: {error}", 1)
         message = f"cannot use {error.filename}: {reason}. Give a path that can be read and written."
         return _fail(message, 2)
-
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
             raise
