@@ -41,8 +41,8 @@ def test_where_something_is_found_it_is_left_as_it_is():
     ("hook", "message"),
     [
         ("extractor", "MODULE:FUNCTION"),
-        ("no_such_module:make", "cannot be imported"),
-        ("no/such/file.py:make", "cannot be imported"),
+        ("no_such_module:make", "no such module"),
+        ("no/such/file.py:make", "no such Python file"),
         ("openvima.perception.objects:make", "has no function 'make'"),
         ("builtins:dict", "returned a dict"),
     ],

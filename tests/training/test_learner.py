@@ -65,9 +65,9 @@ def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, t
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere:make", "No module named 'nowhere'"),
-        ("json:make", "no attribute 'make'"),
-        ("math:pi", "preset is 'math:pi', which is a float; it must be a function"),
+        ("nowhere:make", "names 'nowhere', and there is no such module"),
+        ("json:make", "json has no function 'make'"),
+        ("math:pi", "preset is 'math:pi', which is a float; name a function"),
         ("builtins:dict", "builtins:dict returned a dict; it must return a Learner"),
     ],
 )
@@ -76,11 +76,11 @@ def test_a_learner_that_cannot_be_made_is_named(name: str, message: str) -> None
         make_learner(name)
 
 
-def test_errors_of_a_custom_learner_propagate(monkeypatch, example) -> None:
+def test_errors_of_a_custom_learner_name_their_place(monkeypatch, example) -> None:
     import custom_learner
 
     monkeypatch.setattr(custom_learner, "Matcher", None)
-    with pytest.raises(TypeError, match="not callable"):
+    with pytest.raises(ConfigError, match=r"not callable \(custom_learner.py, line \d+\)"):
         make_learner(example)
 
 

@@ -7,16 +7,12 @@ FILE.py:FUNCTION               the same, from a Python file
 """
 
 import hashlib
-import importlib
-import importlib.util
 import json
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import cast
 
 from openvima.data.object_cache.cache import Boxes, ObjectCache, Report, open_object_cache
@@ -28,6 +24,7 @@ from openvima.policies.detection import DetectedObjects
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.sources import checkpoint_folder
 from openvima.scene import PromptImage
+from openvima.user_code import call_function, is_code, load_function, source_hash
 
 DETECTOR = "detector"
 _FORM = (
@@ -48,7 +45,12 @@ def extractor_maker(source: str) -> Callable[[], object]:
         CheckpointError: There is no trained detector.
     """
     folder = _folder_of(source)
-    return _function_of(source)[1] if folder is None else partial(load_extractor, folder)
+    if folder is not None:
+        return partial(load_extractor, folder)
+    if not is_code(source):
+        raise ConfigError(f"boxes is {source!r}; give {_FORM}.")
+    load_function(source, what="boxes")
+    return partial(call_function, source, what="boxes")
 
 
 def plugged_extractor(source: str) -> ObjectExtractor:
@@ -83,9 +85,7 @@ def plugged_boxes(source: str) -> Boxes:
         weights = hashlib.blake2b((checkpoint_folder(folder) / WEIGHTS_FILE).read_bytes()).hexdigest()
         name, content = DETECTOR, json.dumps([sizes, least, weights], sort_keys=True).encode()
     else:
-        module, _ = _function_of(source)
-        file, name = getattr(module, "__file__", None), source.rpartition(":")[2]
-        content = Path(file).read_bytes() if file else source.encode()
+        name, content = source.rpartition(":")[2], source_hash(source, what="boxes").encode()
     digest = hashlib.blake2b(content, digest_size=_DIGEST_BYTES).hexdigest()
     return Boxes(f"{name}-{digest}", partial(plugged_extractor, source))
 
@@ -153,32 +153,6 @@ def _folder_of(source: str) -> Path | None:
     """The folder of a trained detector; None for other forms."""
     name, _, folder = source.partition("=")
     return detector_folder(folder or None) if name == DETECTOR else None
-
-
-def _function_of(source: str) -> tuple[ModuleType, Callable[[], object]]:
-    """Import the module or file, and look up the function."""
-    where, _, name = source.rpartition(":")
-    if not where or not name:
-        raise ConfigError(f"boxes is {source!r}; give {_FORM}.")
-    try:
-        module = _import_file(Path(where)) if where.endswith(".py") else importlib.import_module(where)
-    except (ImportError, OSError) as error:
-        raise ConfigError(f"boxes is {source!r}, but {where} cannot be imported ({error}).") from error
-    made = getattr(module, name, None)
-    if not callable(made):
-        raise ConfigError(f"boxes is {source!r}, but {where} has no function {name!r}; give {_FORM}.")
-    return module, made
-
-
-def _import_file(path: Path) -> ModuleType:
-    path = path.absolute()
-    spec = importlib.util.spec_from_file_location(f"openvima_boxes_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ImportError("no Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def _one_thread() -> AbstractContextManager[None]:

@@ -3,19 +3,18 @@
 import functools
 import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import os
 import pkgutil
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
-from openvima.errors import ConfigError, LevelError, UnknownTaskError, unknown_name
+from openvima.errors import LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
+from openvima.user_code import load_file
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
@@ -174,21 +173,4 @@ def _load_task_files() -> None:
     for entry_point in importlib.metadata.entry_points(group=ENTRY_POINTS):
         entry_point.load()
     for path in filter(None, os.environ.get(TASK_FILES_VARIABLE, "").split(os.pathsep)):
-        _import_file(Path(path))
-
-
-def _import_file(path: Path) -> None:
-    """Import a task file from any folder.
-
-    Raises:
-        ConfigError: There is no such Python file.
-    """
-    spec = importlib.util.spec_from_file_location(f"openvima_task_{path.stem}", path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise ConfigError(
-            f"{TASK_FILES_VARIABLE} names {str(path)!r}, which is not a Python file; "
-            f"give paths separated by {os.pathsep!r}."
-        )
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+        load_file(Path(path), what=TASK_FILES_VARIABLE)

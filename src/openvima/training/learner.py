@@ -1,6 +1,5 @@
 """`Learner`, the trained module: it makes batches of demonstrations, and computes a loss."""
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example
+from openvima.user_code import call_function
 
 # From examples and, in training, one generator for each, to a batch.
 Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], Any]
@@ -183,21 +183,12 @@ def make_learner(name: str) -> Learner:
     """Make a learner by the name of its function.
 
     Args:
-        name: "module:function"; the function takes no arguments and returns a `Learner`.
+        name: MODULE:FUNCTION or FILE.py:FUNCTION; the function takes no arguments and returns a `Learner`.
 
     Raises:
-        ConfigError: There is no such module or function, or it returns something else.
+        ConfigError: There is no such function, it raises, or it returns something else.
     """
-    module, _, function = name.partition(":")
-    try:
-        make = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f"preset is {name!r}; it must name a function as module:function ({error})."
-        ) from None
-    if not callable(make):
-        raise ConfigError(f"preset is {name!r}, which is a {type(make).__name__}; it must be a function.")
-    learner = make()
+    learner = call_function(name, what="preset")
     if not isinstance(learner, Learner):
         raise ConfigError(f"{name} returned a {type(learner).__name__}; it must return a Learner.")
     return learner
