@@ -292,3 +292,17 @@ def test_judging_changes_nothing() -> None:
     scene = problem.scene.with_poses(in_zone(4))
     assert advance(problem, progress, scene) == advance(problem, progress, scene)
     assert progress == begin(problem)
+
+
+def test_a_problem_without_goals_never_ends_by_itself() -> None:
+    problem = put_problem(goals=(), constraints=())
+    progress, outcome = advance(problem, begin(problem), problem.scene.with_poses({TARGET: BASE_POSE}))
+    assert outcome == Outcome()
+    assert (
+        advance(problem, progress, problem.scene.with_poses({TARGET: Pose.planar(2.0, 0.0)}))[1] == Outcome()
+    )
+
+
+def test_constraints_hold_without_goals_too() -> None:
+    problem = put_problem(goals=(), constraints=(ZoneKeptClear((TARGET,), Zone(0.5, 0.2, 0.1, 0.1)),))
+    assert judged(problem, {TARGET: BASE_POSE}).failure

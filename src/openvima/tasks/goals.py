@@ -68,7 +68,8 @@ def advance(problem: Problem, progress: Progress, scene: Scene) -> tuple[Progres
     """Evaluate goals and constraints after a step.
 
     The order of the checks is part of the benchmark: constraints come before goals, so an object put into its
-    base on top of a distractor is a failure.
+    base on top of a distractor is a failure. A problem without goals never succeeds; it ends by a violated
+    constraint or at the step limit.
 
     Args:
         problem: The episode's problem.
@@ -93,6 +94,8 @@ def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress,
     reason = progress.violation or _disturbance(problem, open_before, progress, scene)
     if reason:
         return Outcome(failure=True, reason=reason)
+    if not problem.goals:  # nothing to fulfil: only the step limit ends the episode
+        return Outcome()
     num_met = len(problem.goals) - len(progress.open_goals)
     num_required = len(problem.goals) if problem.num_required is None else problem.num_required
     if num_met == num_required:

@@ -56,6 +56,8 @@ def oracle_action(
     Raises:
         OracleError: No goal is open, or the object to move is not visible from above.
     """
+    if not problem.goals:
+        raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
     goals = [problem.goals[index] for index in progress.open_goals]
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
