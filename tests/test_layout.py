@@ -115,6 +115,24 @@ def test_import_openvima_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
+def test_packages_list_their_public_names_without_importing_them() -> None:
+    packages = [
+        file.parent for file in SOURCE.rglob("__init__.py") if "lazy_names(" in file.read_text("utf-8")
+    ]
+    names = [".".join(folder.relative_to(SOURCE.parent).parts) for folder in packages]
+    assert {"openvima", "openvima.data", "openvima.evaluation"} <= set(names)
+    code = (
+        "import importlib, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    module = importlib.import_module(name)\n"
+        "    assert set(module.__all__) <= set(dir(module)), name\n"
+        "    assert 'lazy_names' not in dir(module), name\n"
+        "print(sorted({'torch', 'mujoco', 'matplotlib', 'av', 'pyarrow'} & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
 @pytest.mark.parametrize(
     "module", ["openvima.env", "openvima.data", "openvima.tasks", "openvima.sim", "openvima.render"]
 )

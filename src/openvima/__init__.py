@@ -1,9 +1,9 @@
 """Multimodal-prompt robot manipulation: a fast, deterministic VIMA-Bench and the VIMA policy family."""
 
-import importlib
 from typing import TYPE_CHECKING
 
 from openvima.env.registration import make, register_with_gymnasium
+from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.env import TabletopEnv, make_vec
@@ -15,11 +15,6 @@ __all__ = ["TabletopEnv", "__version__", "list_tasks", "make", "make_vec"]
 
 _HOMES = {"TabletopEnv": "env", "make_vec": "env", "list_tasks": "tasks"}
 
-
-def __getattr__(name: str) -> object:  # these import heavier packages
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"openvima.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)  # these import heavier packages
 
 register_with_gymnasium()

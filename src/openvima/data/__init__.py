@@ -1,7 +1,8 @@
 """Writing and reading demonstrations."""
 
-import importlib
 from typing import TYPE_CHECKING
+
+from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.data.generation import generate
@@ -48,8 +49,4 @@ __all__ = [
     "verify",
 ]
 
-
-def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"openvima.data.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -1,10 +1,10 @@
 """The Gymnasium environment, alone or several at once."""
 
-import importlib
 from typing import TYPE_CHECKING
 
 from openvima.env.config import EnvConfig
 from openvima.env.registration import make, register_environments
+from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.env.action_validation import stack_actions
@@ -28,8 +28,4 @@ _HOMES = {
     "stack_actions": "action_validation",
 }
 
-
-def __getattr__(name: str) -> object:  # importing the environment imports MuJoCo and Numba
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"openvima.env.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)  # importing the environment imports MuJoCo and Numba

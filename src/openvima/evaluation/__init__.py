@@ -1,7 +1,8 @@
 """Evaluating policies on the four levels."""
 
-import importlib
 from typing import TYPE_CHECKING
+
+from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison, compare
@@ -41,8 +42,4 @@ __all__ = [
     "wilson_interval",
 ]
 
-
-def __getattr__(name: str) -> object:  # the simulator is imported on first use
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"openvima.evaluation.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)  # the simulator is imported on first use

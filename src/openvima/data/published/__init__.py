@@ -1,7 +1,8 @@
 """Reading and importing the data set that the benchmark's authors published."""
 
-import importlib
 from typing import TYPE_CHECKING
+
+from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.data.published.importing import ImportConfig, import_published
@@ -18,8 +19,4 @@ _HOMES = {
 
 __all__ = ["Broken", "EpisodeKey", "ImportConfig", "PublishedData", "import_published"]
 
-
-def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"openvima.data.published.{_HOMES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
