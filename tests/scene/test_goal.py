@@ -65,7 +65,7 @@ def test_a_block_is_in_a_zone_only_with_all_its_points(x: float, inside: bool) -
 @pytest.mark.parametrize(("x", "touches"), [(0.5349, True), (0.5351, False)])
 def test_a_block_touches_a_line_with_one_point(x: float, touches: bool) -> None:
     line = NeverTouches((4,), Zone(0.5, 0.0, 0.04, 0.3), "line")
-    assert line.touching(scene_with_block(Pose.planar(x, 0.0))) == (4 if touches else None)
+    assert line.is_met(scene_with_block(Pose.planar(x, 0.0))) is not touches
 
 
 def test_a_zone_ends_below_a_height_of_30_centimetres() -> None:

@@ -7,6 +7,7 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError, PolicyError
 from openvima.evaluation.results import EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
+from openvima.scene.goal import object_of
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
 WRONG_PICKED = "only wrong objects were picked up within the step limit"
@@ -52,8 +53,8 @@ class _EpisodeSlot:
         if picks and not self.grasped:
             return NOTHING_PICKED, NOTHING_PICKED
         problem = self.env.episode.problem
-        right = {goal.object_id for goal in (*problem.goals, *problem.prerequisites)}
-        if picks and not self.grasped & right:
+        right = {object_of(goal) for goal in (*problem.goals, *problem.prerequisites)}
+        if picks and None not in right and not self.grasped & right:
             return WRONG_PICKED, WRONG_PICKED
         num_met = len(problem.goals) - len(self.env.progress.open_goals)
         needed = problem.num_required or len(problem.goals)

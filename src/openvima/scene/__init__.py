@@ -1,21 +1,18 @@
 """Frozen dataclasses: poses, scenes, prompts, goals, episodes, actions."""
 
 from openvima.scene.action import ACTION_SHAPES, Action
-from openvima.scene.episode import Episode, Outcome, Problem
-from openvima.scene.goal import (
-    AtPose,
+from openvima.scene.constraint import (
     Constraint,
     DistractorsApart,
     EveryStepCounts,
-    Goal,
     InOrder,
-    InZone,
     NeverTouches,
-    Tolerance,
-    Zone,
+    StepConstraint,
+    StepContext,
     ZoneKeptClear,
-    block_points,
 )
+from openvima.scene.episode import Episode, Outcome, Problem
+from openvima.scene.goal import AtPose, Condition, Goal, InZone, Tolerance, Zone, block_points
 from openvima.scene.pose import Pose, angle_difference
 from openvima.scene.prompt import (
     ObjectImage,
@@ -51,6 +48,7 @@ __all__ = [
     "WORKSPACE_LOW",
     "Action",
     "AtPose",
+    "Condition",
     "Constraint",
     "DistractorsApart",
     "EndEffector",
@@ -72,6 +70,8 @@ __all__ = [
     "RenderedPrompt",
     "Scene",
     "SceneImage",
+    "StepConstraint",
+    "StepContext",
     "Tolerance",
     "Zone",
     "ZoneKeptClear",

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from openvima.errors import SceneError
-from openvima.scene.goal import AtPose, Constraint, Goal
+from openvima.scene.constraint import Constraint
+from openvima.scene.goal import AtPose, Goal, is_condition
 from openvima.scene.prompt import Prompt
 from openvima.scene.scene import Scene
 
@@ -15,8 +16,9 @@ class Problem:
     Args:
         scene: All objects at their start, at rest.
         prompt: The prompt.
-        goals: The goals, in the order of the oracle unless it may choose.
-        constraints: The constraints, in the order of their tests.
+        goals: The goals, in the order of the oracle unless it may choose; anything with `is_met(scene)`.
+        constraints: The constraints, in the order of their tests; those of `scene.constraint`, or anything
+            with `is_met(scene)`.
         stages: Sizes of groups of consecutive goals. After a step only goals of the first group with an open
             one are tested, so a step never completes goals of two groups. Empty: all goals are one group.
         num_required: Exact number of goals to fulfil (more at once is a failure); None means all.
@@ -25,7 +27,7 @@ class Problem:
         oracle_max_steps: Step limit of the oracle; None: that of the task.
 
     Raises:
-        SceneError: The stages do not add up to the number of goals.
+        SceneError: The stages do not add up to the number of goals, or a goal or constraint cannot be tested.
     """
 
     scene: Scene
@@ -38,6 +40,15 @@ class Problem:
     oracle_max_steps: int | None = None
 
     def __post_init__(self) -> None:
+        for goal in self.goals:
+            if not is_condition(goal):
+                raise SceneError(f"a goal is a {type(goal).__name__}; it must have a method is_met(scene).")
+        for constraint in self.constraints:
+            if not is_condition(constraint) and not callable(getattr(constraint, "violation", None)):
+                raise SceneError(
+                    f"a constraint is a {type(constraint).__name__}; it must have a method is_met(scene) or "
+                    "violation(context)."
+                )
         if self.stages and sum(self.stages) != len(self.goals):
             raise SceneError(f"stages {self.stages} must add up to the number of goals, {len(self.goals)}.")
 

@@ -1,10 +1,37 @@
-"""Goals and constraints: conditions on the poses of a scene."""
+"""Goals: conditions on the poses of a scene. Any object with `is_met(scene)` is one."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeAlias, TypeGuard
 
 from openvima.scene.pose import Pose, angle_difference, rotate
 from openvima.scene.scene import Scene
+
+
+class Condition(Protocol):
+    """A condition on a scene: a goal, or a constraint that must hold. Anything with `is_met` is one.
+
+    What else the environment uses, where present:
+
+    | member | meaning |
+    |---|---|
+    | `object_id: int` | the object that a goal is about: its loss is a failure, and reasons name it |
+    | `oracle_move(scene)` | an `AtPose` or `InZone` that the oracle pursues to meet the goal |
+    | `reason(scene) -> str` | why it is not met, one sentence: the reason of a failure |
+    | `monitored: bool` | of a constraint: test it during motion too, at least every 25 ticks |
+    | `renumbered(new_of)` | the same condition for other object ids, which `new_of` maps from old to new |
+
+    Sampling permutes the ids of a problem's objects. A condition without `renumbered` goes on seeing the ids
+    with which it was made.
+    """
+
+    def is_met(self, scene: Scene, /) -> bool:
+        """Whether it holds in a scene."""
+        ...
+
+
+Goal: TypeAlias = Condition
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +119,15 @@ class AtPose:
         """Whether the object is at the target."""
         return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
 
+    def oracle_move(self, scene: Scene) -> "AtPose":
+        """Return the goal itself: one pick and place meets it."""
+        return self
+
+    def renumbered(self, new_of: Mapping[int, int]) -> "AtPose":
+        """Return the goal for other object ids."""
+        relative_to = None if self.relative_to is None else new_of[self.relative_to]
+        return replace(self, object_id=new_of[self.object_id], relative_to=relative_to)
+
 
 @dataclass(frozen=True, slots=True)
 class InZone:
@@ -111,76 +147,42 @@ class InZone:
         """Whether the block is in the zone."""
         return all(self.zone.contains(point) for point in block_points(scene[self.object_id].pose))
 
+    def oracle_move(self, scene: Scene) -> "InZone":
+        """Return the goal itself: sweeps meet it."""
+        return self
 
-Goal = AtPose | InZone
-
-
-@dataclass(frozen=True, slots=True)
-class DistractorsApart:
-    """No distractor is near a goal's target, and no goal's object near a distractor.
-
-    Tested after every step, whether the goals are met or not: a distractor within a goal's
-    `tolerance.position_m` of its target, or the goal's object matching the distractor's pose within the
-    goal's whole tolerance, is a violation.
-
-    Args:
-        object_ids: The distractors.
-        at_end: Test only once, in the step that fulfils the last of the goals.
-        goals: Indices of the goals that count; None: all of the episode.
-    """
-
-    object_ids: tuple[int, ...]
-    at_end: bool = False
-    goals: tuple[int, ...] | None = None
+    def renumbered(self, new_of: Mapping[int, int]) -> "InZone":
+        """Return the goal for other object ids."""
+        relative_to = None if self.relative_to is None else new_of[self.relative_to]
+        return replace(self, object_id=new_of[self.object_id], relative_to=relative_to)
 
 
-@dataclass(frozen=True, slots=True)
-class ZoneKeptClear:
-    """No point of these blocks is in the zone; tested after every step."""
-
-    object_ids: tuple[int, ...]
-    zone: Zone
+OracleMove: TypeAlias = AtPose | InZone
+"""Goals that the oracle pursues: by pick and place, and by sweeps."""
 
 
-@dataclass(frozen=True, slots=True)
-class NeverTouches:
-    """No point of these blocks ever enters the zone; tested during motion, and permanent.
-
-    Args:
-        object_ids: The blocks.
-        zone: The forbidden rectangle.
-        name: Name of the zone in the reason of a failure, such as "line".
-    """
-
-    object_ids: tuple[int, ...]
-    zone: Zone
-    name: str
-
-    def touching(self, scene: Scene) -> int | None:
-        """Id of the first object that touches the zone now, or None."""
-        for object_id in self.object_ids:
-            pose = scene[object_id].pose
-            if not self.zone.is_near(pose):
-                continue
-            if any(self.zone.contains(point) for point in block_points(pose)):
-                return object_id
-        return None
+def is_condition(value: object) -> TypeGuard[Condition]:
+    """Whether a value can be tested in a scene."""
+    return callable(getattr(value, "is_met", None))
 
 
-@dataclass(frozen=True, slots=True)
-class InOrder:
-    """None of these goals is fulfilled while an earlier goal of the episode is open; tested after every step.
-
-    Args:
-        goals: Indices of the later goals.
-    """
-
-    goals: tuple[int, ...]
+def object_of(goal: Goal) -> int | None:
+    """Id of the object that a goal is about; None if it names none."""
+    return getattr(goal, "object_id", None)
 
 
-@dataclass(frozen=True, slots=True)
-class EveryStepCounts:
-    """Each step has to fulfil a goal; the first one that does not ends the episode."""
+def is_monitored(condition: object) -> bool:
+    """Whether a constraint is tested during motion too."""
+    return bool(getattr(condition, "monitored", False))
 
 
-Constraint = DistractorsApart | ZoneKeptClear | NeverTouches | InOrder | EveryStepCounts
+def oracle_move(goal: Goal, scene: Scene) -> OracleMove | None:
+    """The built-in goal that the oracle pursues to meet a goal; None if it states none."""
+    move = getattr(goal, "oracle_move", None)
+    return None if move is None else move(scene)
+
+
+def unmet_reason(condition: Condition, scene: Scene) -> str:
+    """One sentence on why a condition is not met."""
+    reason = getattr(condition, "reason", None)
+    return f"{type(condition).__name__} is violated" if reason is None else str(reason(scene))

@@ -69,6 +69,11 @@ class Scene:
                 return placement
         raise SceneError(f"no object has id {object_id}; the scene holds {[p.id for p in self.placements]}.")
 
+    def describe(self, object_id: int) -> str:
+        """Name an object for a reason or an error, such as "object 6 (red letter A)"."""
+        placement = self[object_id]
+        return f"object {object_id} ({placement.texture} {placement.object})"
+
     def with_poses(self, poses: Mapping[int, Pose]) -> "Scene":
         """Return the scene with some objects moved; `poses` maps object ids to new link-frame poses."""
         moved = tuple(p.at(poses[p.id]) if p.id in poses else p for p in self.placements)

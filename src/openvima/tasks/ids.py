@@ -1,26 +1,20 @@
 """Object ids independent of roles."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from openvima.scene import (
-    Constraint,
-    EveryStepCounts,
-    Goal,
-    InOrder,
-    NeverTouches,
-    Placement,
-    Problem,
-    Prompt,
-    PromptFill,
-    Scene,
-    SceneImage,
+from openvima.scene import Condition, Placement, Problem, Prompt, PromptFill, Scene, SceneImage
+from openvima.scene.goal import (
+    OracleMove,
+    is_condition,
+    is_monitored,
+    object_of,
+    oracle_move,
+    unmet_reason,
 )
-
-AnyGoal = TypeVar("AnyGoal", bound=Goal)
 
 
 def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
@@ -50,9 +44,9 @@ def shuffled_ids(problem: Problem, rng: np.random.Generator) -> Problem:
         problem,
         scene=_renumbered_scene(problem.scene, new_of),
         prompt=Prompt(problem.prompt.text, images),
-        goals=tuple(_renumbered_goal(goal, new_of) for goal in problem.goals),
-        constraints=tuple(_renumbered_constraint(constraint, new_of) for constraint in problem.constraints),
-        prerequisites=tuple(_renumbered_goal(goal, new_of) for goal in problem.prerequisites),
+        goals=tuple(_renumbered(goal, new_of) for goal in problem.goals),
+        constraints=tuple(_renumbered(constraint, new_of) for constraint in problem.constraints),
+        prerequisites=tuple(_renumbered(goal, new_of) for goal in problem.prerequisites),
     )
 
 
@@ -65,18 +59,55 @@ def _renumbered_scene(scene: Scene, new_of: dict[int, int]) -> Scene:
     return replace(scene, placements=tuple(sorted(placements, key=lambda placement: placement.id)))
 
 
-def _renumbered_goal(goal: AnyGoal, new_of: dict[int, int]) -> AnyGoal:
-    relative_to = None if goal.relative_to is None else new_of[goal.relative_to]
-    return replace(goal, object_id=new_of[goal.object_id], relative_to=relative_to)
+def _renumbered(condition: Any, new_of: dict[int, int]) -> Any:  # Any: a goal gives a goal
+    """Return a goal or constraint for new ids."""
+    if hasattr(condition, "renumbered"):
+        return condition.renumbered(new_of)
+    return RenumberedCondition(condition, new_of) if is_condition(condition) else condition
 
 
-def _renumbered_constraint(constraint: Constraint, new_of: dict[int, int]) -> Constraint:
-    if isinstance(constraint, InOrder | EveryStepCounts):
-        return constraint
-    object_ids = tuple(sorted(new_of[object_id] for object_id in constraint.object_ids))
-    if isinstance(constraint, NeverTouches):
-        return NeverTouches(object_ids, constraint.zone, constraint.name)
-    return replace(constraint, object_ids=object_ids)
+@dataclass(frozen=True, slots=True)
+class RenumberedCondition:
+    """A condition without `renumbered`; it sees scenes with the ids with which it was made.
+
+    Args:
+        condition: The goal or constraint.
+        new_of: Old id to new id.
+    """
+
+    condition: Condition
+    new_of: Mapping[int, int]
+
+    @property
+    def object_id(self) -> int | None:
+        """New id of the object that the condition is about."""
+        old_id = object_of(self.condition)
+        return None if old_id is None else self.new_of[old_id]
+
+    @property
+    def monitored(self) -> bool:
+        """Whether it is tested during motion too."""
+        return is_monitored(self.condition)
+
+    def is_met(self, scene: Scene) -> bool:
+        """Whether the condition is met."""
+        return self.condition.is_met(self._as_made(scene))
+
+    def reason(self, scene: Scene) -> str:
+        """Why the condition is not met."""
+        return unmet_reason(self.condition, self._as_made(scene))
+
+    def oracle_move(self, scene: Scene) -> OracleMove | None:
+        """Return what the oracle pursues, with the new ids."""
+        move = oracle_move(self.condition, self._as_made(scene))
+        return None if move is None else move.renumbered(self.new_of)
+
+    def renumbered(self, new_of: Mapping[int, int]) -> "RenumberedCondition":
+        """Return the condition for other ids."""
+        return RenumberedCondition(self.condition, {old: new_of[new] for old, new in self.new_of.items()})
+
+    def _as_made(self, scene: Scene) -> Scene:
+        return _renumbered_scene(scene, {new: old for old, new in self.new_of.items()})
 
 
 def _renumbered_image(fill: PromptFill, new_of: dict[int, int], new_in_prompt: dict[int, int]) -> PromptFill:

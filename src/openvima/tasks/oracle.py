@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.catalog import Assets
-from openvima.errors import OracleError
+from openvima.errors import OracleError, echo
 from openvima.scene import Action, AtPose, InZone, Pose, Problem, Scene
+from openvima.scene.goal import oracle_move
 from openvima.tasks.goals import Progress
 from openvima.tasks.sweeping import plan_sweep
 
@@ -54,7 +55,8 @@ def oracle_action(
         The action, within the bounds of actions.
 
     Raises:
-        OracleError: No goal is open, or the object to move is not visible from above.
+        OracleError: No goal is open, the first one states no move, or the object to move is not visible from
+            above.
     """
     if not problem.goals:
         raise OracleError("the episode has no goals, so the oracle has nothing to do; give it some.")
@@ -62,13 +64,19 @@ def oracle_action(
     if not goals:
         raise OracleError("all goals are met; the oracle has nothing left to do. Reset the environment.")
     pending = [goal for goal in problem.prerequisites if not goal.is_met(scene)]
-    goal = (pending or goals)[0]
+    first = (pending or goals)[0]
+    goal = oracle_move(first, scene)
+    if goal is None:
+        raise OracleError(
+            f"the oracle cannot pursue the goal {echo(repr(first))}: it has no oracle_move(scene), or this "
+            "returned None."
+        )
     if isinstance(goal, AtPose):
         point = visible_point(scene, goal.object_id, assets=assets, rng=rng if compat else None)
         action = _pick_and_place(goal, scene[goal.object_id].pose, point, compat=compat)
     else:
-        zone_goals = [goal for goal in goals if isinstance(goal, InZone)]
-        sweep = plan_sweep(zone_goals, scene, problem, compat=compat)
+        moves = (oracle_move(goal, scene) for goal in goals)
+        sweep = plan_sweep([m for m in moves if isinstance(m, InZone)], scene, problem, compat=compat)
         goal, action = sweep.goal, Action.planar(sweep.start, sweep.end)
     place_id = TIED_TO_TABLE if goal.relative_to is None else goal.relative_to
     return OracleDecision(action, goal.object_id, place_id)
@@ -97,8 +105,7 @@ def visible_point(
     labels = label_raster(scene, assets)
     rows, columns = np.nonzero(labels == object_id)
     if not len(rows):
-        name = f"object {object_id} ({scene[object_id].texture} {scene[object_id].object})"
-        raise OracleError(f"{name} is not visible from above, so it cannot be picked.")
+        raise OracleError(f"{scene.describe(object_id)} is not visible from above, so it cannot be picked.")
     points = cell_centres(rows, columns)
     if rng is not None:
         x, y = (points[rng.integers(len(points))] - CELL_M / 2).tolist()
