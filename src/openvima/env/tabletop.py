@@ -1,6 +1,6 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +13,7 @@ from gymnasium import spaces
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.env.object_names import ObjectNames
-from openvima.errors import ConfigError, EpisodeError, SamplingError
+from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.render import channels_last
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Image, Rasteriser
@@ -28,6 +28,7 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
+from openvima.sim.ur5 import JOINT_LIMITS
 from openvima.sim.world import World
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
@@ -35,6 +36,8 @@ from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.seeding import checked_seed, make_rng
 
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
+MODALITIES = ("rgb", "segm", "depth", "joints")
+DEFAULT_MODALITIES = ("rgb", "segm")
 FRAMES_PER_SECOND = 30
 _LARGEST_SEED = 2**31  # of the seeds that a reset without one draws
 
@@ -81,12 +84,14 @@ class _Run:
 class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     """A UR5 arm at a table, with a multimodal prompt, two cameras, and pick-and-place or sweep actions.
 
-    **Observation** — a dictionary; the cameras `front` and `top` are fixed.
+    **Observation** — a dictionary; the cameras `front` and `top` are fixed. `ee` and what `modalities` names:
 
     | key | shape, dtype | meaning |
     |---|---|---|
     | `rgb` / view | (3, 128, 256) uint8 | red, green, blue; row 0 on top |
     | `segm` / view | (128, 256) uint8 | object id of each pixel: 0 floor, 1 table sheet, 255 nothing |
+    | `depth` / view | (128, 256) float32 | metres from the camera plane, along the optical axis |
+    | `joints` | (6,) float32 | joint angles of the arm, base to wrist, radians |
     | `ee` | int | 0 suction cup, 1 spatula |
 
     **Action** — a dictionary; all four keys, float32 (any floating-point dtype is taken).
@@ -106,8 +111,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image), `success`,
     `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
-    0), `num_steps`, `task`, `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of
-    object and texture). The images of the prompt are in `prompt`, an attribute.
+    0), `num_steps`, `joints` (as in observations), `task`, `level`, `domain`, `seed`, `end_effector`, and
+    `objects` (id to the names of object and texture). The images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
@@ -131,12 +136,13 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         hide_arm: Leave arm and tool out of the images, as in all published data; else they are ids 2 to 4.
         realtime: Record `frames`, 30 a second, while a step runs.
         render_mode: None, or "rgb_array": `render` returns both views, front above top.
+        modalities: What observations hold besides `ee`: of "rgb", "segm", "depth" and "joints".
         **task_options: Arguments of the task.
 
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
-        ConfigError: The domain, the render mode or an option of the task is invalid.
+        ConfigError: The domain, the render mode, a modality or an option of the task is invalid.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
@@ -152,6 +158,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         hide_arm: bool = True,
         realtime: bool = False,
         render_mode: str | None = None,
+        modalities: Iterable[str] = DEFAULT_MODALITIES,
         **task_options: Any,
     ) -> None:
         _check_render_mode(render_mode)
@@ -165,7 +172,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self.realtime = realtime
         self.render_mode = render_mode
         self.task_options = task_options
-        self.observation_space = _observation_space()
+        self.modalities = modalities
         self.action_space = _action_space()
         self._rasteriser = Rasteriser(self.assets)
         self._run: _Run | None = None
@@ -265,6 +272,26 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         )
 
     @property
+    def modalities(self) -> tuple[str, ...]:
+        """What observations hold besides `ee`; `observation_space` follows what is assigned.
+
+        Raises:
+            ConfigError: A modality is unknown, or there is none.
+        """
+        return self._modalities
+
+    @modalities.setter
+    def modalities(self, names: Iterable[str]) -> None:
+        names = (names,) if isinstance(names, str) else tuple(names)
+        for name in names:
+            if name not in MODALITIES:
+                raise ConfigError(unknown_name("modality", name, MODALITIES))
+        if not names:
+            raise ConfigError(f"modalities is empty; give at least one of {', '.join(MODALITIES)}.")
+        self._modalities = tuple(name for name in MODALITIES if name in names)
+        self.observation_space = _observation_space(self._modalities)
+
+    @property
     def episode(self) -> Episode:
         """The running episode."""
         return self._running().episode
@@ -293,6 +320,11 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         return self._running().outcome
 
     @property
+    def joints(self) -> np.ndarray:
+        """Joint angles of the arm, base to wrist, shape (6,), float32, radians."""
+        return self._running().world.joints.astype(np.float32)
+
+    @property
     def joint_path(self) -> np.ndarray:
         """Waypoints of the arm in the last step, shape (W, 6), float32, radians."""
         return self._running().joint_path
@@ -318,22 +350,24 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             **self.task_options,
         )
 
-    def _images(self) -> dict[View, Image]:
+    def _images(self, *, depth: bool = False) -> dict[View, Image]:
         world = self._running().world
         scene = world.scene
         if self.hide_arm:
-            return self._rasteriser.scene(scene)
+            return self._rasteriser.scene(scene, depth=depth)
         from openvima.sim.arm_view import arm_drawables
 
-        return self._rasteriser.scene(scene, extra=arm_drawables(world.joints, scene.end_effector))
+        arm = arm_drawables(world.joints, scene.end_effector)
+        return self._rasteriser.scene(scene, extra=arm, depth=depth)
 
     def _observe(self) -> dict[str, Any]:
-        images = self._images()
-        return {
-            "rgb": {view: images[view].rgb for view in VIEWS},
-            "segm": {view: images[view].segm for view in VIEWS},
-            "ee": END_EFFECTORS.index(self.scene.end_effector),
+        images = self._images(depth="depth" in self._modalities)
+        seen = {
+            name: {view: getattr(images[view], name) for view in VIEWS} for name in ("rgb", "segm", "depth")
         }
+        values = {**seen, "joints": self.joints}
+        chosen = {name: values[name] for name in self._modalities}
+        return {**chosen, "ee": END_EFFECTORS.index(self.scene.end_effector)}
 
     def _info(self) -> dict[str, Any]:
         run = self._running()
@@ -345,6 +379,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "reason": run.outcome.reason,
             "grasped": run.grasped or 0,  # never None: vector environments collect numbers in arrays
             "num_steps": run.num_steps,
+            "joints": self.joints,
             "task": episode.task,
             "level": episode.level,
             "domain": episode.domain,
@@ -354,11 +389,19 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         }
 
 
-def _observation_space() -> spaces.Dict:
-    rgb: dict[str, spaces.Space] = {view: spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8) for view in VIEWS}
-    segm: dict[str, spaces.Space] = {view: spaces.Box(0, 255, IMAGE_SHAPE, np.uint8) for view in VIEWS}
+def _observation_space(modalities: tuple[str, ...]) -> spaces.Dict:
+    images = {
+        "rgb": spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8),
+        "segm": spaces.Box(0, 255, IMAGE_SHAPE, np.uint8),
+        "depth": spaces.Box(0, np.inf, IMAGE_SHAPE, np.float32),
+    }
+    limits = JOINT_LIMITS.astype(np.float32)
+    known: dict[str, spaces.Space] = {
+        **{name: spaces.Dict(dict.fromkeys(VIEWS, space)) for name, space in images.items()},
+        "joints": spaces.Box(-limits, limits, dtype=np.float32),
+    }
     ee = spaces.Discrete(len(END_EFFECTORS))
-    return spaces.Dict({"rgb": spaces.Dict(rgb), "segm": spaces.Dict(segm), "ee": ee})
+    return spaces.Dict({**{name: known[name] for name in modalities}, "ee": ee})
 
 
 def _action_space() -> spaces.Dict:

@@ -61,7 +61,7 @@ class AblatedInput:
 
     def observation(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:  # Any: as the environment's
         """Return an observation with mapped ids."""
-        if self.id_map is None:
+        if self.id_map is None or "segm" not in observation:
             return observation
         return {**observation, "segm": _renumbered(observation["segm"], self.id_map)}
 

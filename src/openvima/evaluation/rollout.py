@@ -6,7 +6,7 @@ from typing import Any
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError, PolicyError
 from openvima.evaluation.results import EpisodeOutcome, failure_kind
-from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
+from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
 from openvima.scene.goal import object_of
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
@@ -90,7 +90,7 @@ def play(
     Args:
         envs: Environments of one task and level.
         seeds: Seed of the episode of each.
-        policy: Decides the actions.
+        policy: Decides the actions; its `modalities` become those of the environments.
         after_step: Called with an environment after each of its steps, for recording.
 
     Returns:
@@ -99,6 +99,9 @@ def play(
     Raises:
         PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
     """
+    if isinstance(policy, PromptedRolloutPolicy):
+        for env in envs:
+            env.modalities = policy.modalities
     slots = [_EpisodeSlot(env, seed) for env, seed in zip(envs, seeds, strict=True)]
     policy.begin(envs)
     while any(slot.outcome is None for slot in slots):

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 from openvima.detector.plugins import plugged_extractor
-from openvima.env.tabletop import TabletopEnv
+from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import Batch
@@ -70,6 +70,11 @@ class PromptedRolloutPolicy:
         self._policy = policy
         self._ablation = ablation
         self._inputs: list[AblatedInput] = []
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """What the policy asks observations to hold, as `TabletopEnv` takes it."""
+        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Reset the policy with the prompts."""

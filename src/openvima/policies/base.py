@@ -14,8 +14,9 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 class Policy(Protocol):
     """Anything that maps prompt and history to actions, for several episodes at once.
 
-    Optional attributes, read by policy servers: `new_session()` returns a policy with episodes of its own,
-    and `prompt_limits` is the `PromptLimits` of the policy.
+    Optional attributes: `modalities` names what observations hold, as `TabletopEnv` takes it; evaluations
+    provide that. Policy servers read two more: `new_session()` returns a policy with episodes of its own, and
+    `prompt_limits` is the `PromptLimits` of the policy.
     """
 
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
@@ -26,8 +27,8 @@ class Policy(Protocol):
         """Decide the next action of every episode.
 
         Args:
-            observations: One for each prompt: `rgb` and `segm` (view name to array) and `ee`. None for an
-                episode that has ended.
+            observations: One for each prompt: `ee`, and `rgb` and `segm` (view name to array) or what else
+                `modalities` names. None for an episode that has ended.
 
         Returns:
             For each observation the four arrays of an action, float32, within bounds; None for None. An

@@ -1,6 +1,16 @@
 """Rendering: fixed cameras, a triangle rasteriser, and the label raster of the table."""
 
-from openvima.render.camera import CAMERAS, FRONT, TOP, VIEWS, Camera, View, project, unproject
+from openvima.render.camera import (
+    CAMERAS,
+    FRONT,
+    TOP,
+    VIEWS,
+    Camera,
+    View,
+    points_from_depth,
+    project,
+    unproject,
+)
 from openvima.render.image_layout import channels_first, channels_last
 from openvima.render.labels import CELL_M, LABEL_SHAPE, cell_centres, empty_labels, label_raster, stamp
 from openvima.render.rasteriser import Drawable, Image, Rasteriser
@@ -22,6 +32,7 @@ __all__ = [
     "channels_last",
     "empty_labels",
     "label_raster",
+    "points_from_depth",
     "project",
     "stamp",
     "unproject",

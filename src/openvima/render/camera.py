@@ -166,6 +166,33 @@ def unproject(pixels: np.ndarray, camera: Camera, z: float | np.ndarray = 0.0) -
     return np.stack([x, y], axis=-1)
 
 
+def points_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Unproject a depth image of one view to points in the world.
+
+    Args:
+        depth: Metres from the camera plane, along the optical axis, shape (H, W); infinite for background.
+        camera: The view.
+
+    Returns:
+        Positions in metres of the surface that each pixel samples, shape (H, W, 3), float64; NaN for
+        background.
+
+    Raises:
+        ShapeError: The depth image has another size than the camera's.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise ShapeError(
+            f"depth has shape {depth.shape}; the {camera.view} camera takes {(camera.height, camera.width)}."
+        )
+    rows, columns = np.indices(depth.shape)
+    away = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
+    right = (columns - camera.width / 2) / camera.focal_px * away
+    up = (camera.height - 1 - rows - camera.height / 2) / camera.focal_px * away
+    world_to_camera = np.array([camera.right, camera.up, camera.away])
+    seen = np.stack([right, up, away], axis=-1) - world_to_camera[:, 3]
+    return seen @ np.linalg.inv(world_to_camera[:, :3]).T
+
+
 def _check_last_axis(name: str, array: np.ndarray, length: int) -> None:
     if array.shape[-1:] != (length,):
         raise ShapeError(f"{name} has shape {array.shape}; its last axis must have length {length}.")

@@ -11,7 +11,7 @@ from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View
 from openvima.render.indexed import IndexedMesh, KernelBuffers, indexed, magnified, matrix_3x4
-from openvima.render.kernels import draw_triangles
+from openvima.render.kernels import MICROMETRES, draw_triangles
 from openvima.scene import (
     BACKGROUND_ID,
     FLOOR_ID,
@@ -62,11 +62,14 @@ class Image:
         rgb: Colours, shape (3, H, W), uint8, row 0 on top.
         segm: Object ids, shape (H, W), uint8; 0 floor, 1 sheet, 255 background.
         height: Metres above the table, shape (H, W), float32; NaN for background. None unless requested.
+        depth: Metres from the camera plane, along the optical axis, shape (H, W), float32; infinite for
+            background. None unless requested.
     """
 
     rgb: np.ndarray
     segm: np.ndarray
     height: np.ndarray | None = None
+    depth: np.ndarray | None = None
 
 
 class Rasteriser:
@@ -93,6 +96,7 @@ class Rasteriser:
         *,
         views: Sequence[View] = VIEWS,
         height: bool = False,
+        depth: bool = False,
         extra: Sequence[Drawable] = (),
         enlarge: int = 1,
     ) -> dict[View, Image]:
@@ -102,6 +106,7 @@ class Rasteriser:
             scene: The scene; of coinciding surfaces, the larger id is visible.
             views: Cameras, in the order of the result.
             height: Whether to return height maps too.
+            depth: Whether to return depth images too.
             extra: Further bodies, drawn before the objects.
             enlarge: Factor on the resolution of 128 × 256 pixels, for videos.
 
@@ -114,7 +119,7 @@ class Rasteriser:
             ConfigError: `enlarge` is below 1.
         """
         bodies = [*extra, *(self._drawable(placement) for placement in scene.placements)]
-        return self._draw(bodies, views, height=height, enlarge=enlarge, table=True)
+        return self._draw(bodies, views, height=height, depth=depth, enlarge=enlarge, table=True)
 
     def prompt(self, prompt: Prompt) -> RenderedPrompt:
         """Render all images of a prompt in both views.
@@ -167,19 +172,21 @@ class Rasteriser:
         *,
         table: bool,
         height: bool = False,
+        depth: bool = False,
         enlarge: int = 1,
     ) -> dict[View, Image]:
         prepared = [_prepared(body) for body in bodies]
         images: dict[View, Image] = {}
         for view in views:
             empty = _empty_canvas(CAMERAS[view].enlarged(enlarge), table)
-            depth = self._depth.setdefault(empty.segm.shape, np.empty(empty.segm.shape))
-            np.copyto(depth, empty.depth)
+            buffer = self._depth.setdefault(empty.segm.shape, np.empty(empty.segm.shape))
+            np.copyto(buffer, empty.depth)
             heights = empty.height.copy() if height else _NO_HEIGHTS
-            canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), heights, depth)
+            canvas = _Canvas(empty.camera, empty.rgb.copy(), empty.segm.copy(), heights, buffer)
             for body in prepared:
                 _draw_body(body, canvas, self._buffers)
-            images[view] = Image(canvas.rgb, canvas.segm, heights if height else None)
+            distances = _distances(buffer, CAMERAS[view]) if depth else None
+            images[view] = Image(canvas.rgb, canvas.segm, heights if height else None, distances)
         return images
 
 
@@ -240,6 +247,14 @@ def _empty_canvas(camera: Camera, table: bool) -> _Canvas:
         for body in (floor, sheet):
             _draw_body(_prepared(body), canvas, KernelBuffers())
     return canvas
+
+
+def _distances(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Metres from the camera plane, float32, of what `project_vertices` calls depth."""
+    far = camera.away[3]  # depth is MICROMETRES · far · (distance - far) / distance
+    with np.errstate(invalid="ignore"):
+        distances = far * far / (far - depth / MICROMETRES)
+    return np.where(np.isinf(depth), np.inf, distances).astype(np.float32)
 
 
 def _rectangle(length_x: float, length_y: float) -> TriangleMesh:

@@ -15,6 +15,8 @@ import pytest
 from openvima.cli.main import main
 from openvima.data import Demonstration
 from openvima.data.lerobot import LerobotConfig, export_lerobot
+from openvima.data.records import rollout_oracle
+from openvima.env import TabletopEnv
 from openvima.errors import ConfigError, DatasetError, ShardError
 
 VIDEO_KEYS = [
@@ -353,3 +355,15 @@ def test_the_command_exports_and_names_the_folder(
 def test_a_task_that_is_not_there_is_an_error(tmp_path: Path, export: Path) -> None:
     with pytest.raises(DatasetError, match="stak"):
         export_lerobot(LerobotConfig(tmp_path / "demos", tmp_path / "other", tasks=("stak",)))
+
+
+def test_a_policy_sees_the_exported_states_when_it_acts(tmp_path: Path, store: Callable[..., Path]) -> None:
+    env = TabletopEnv("manipulate_old_neighbor", modalities=("joints",))
+    demo = rollout_oracle(TabletopEnv("manipulate_old_neighbor"), 1)
+    assert demo.num_steps > 1
+    export_lerobot(LerobotConfig(store([demo]), tmp_path / "out"))
+    states = table(tmp_path / "out", "data/chunk-000/file-000.parquet")["observation.state"].to_pylist()
+    observation, _ = env.reset(seed=1)
+    for action, state in zip(demo.actions, states, strict=True):
+        assert [*observation["joints"].tolist(), observation["ee"]] == state
+        observation, *_ = env.step(action)

@@ -1,0 +1,16 @@
+"""Pages that begin with an example quote it as it stands."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = {"observations": "joints_and_depth"}
+
+
+@pytest.mark.parametrize(("page", "example"), PAGES.items())
+def test_the_page_begins_with_its_example(page: str, example: str) -> None:
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    code = (ROOT / "examples" / f"{example}.py").read_text(encoding="utf-8")
+    assert len(code.splitlines()) <= 40
+    assert text.split("```")[1] == f"python\n{code}"
