@@ -16,6 +16,7 @@ def main(
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
+    prompts: str = "multimodal",
     device: str = "cpu",
     boxes: str | None = None,
 ) -> int:
@@ -34,6 +35,8 @@ def main(
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
+        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
+            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
@@ -56,7 +59,7 @@ def main(
     from openvima.evaluation.sources import PolicySource
 
     PolicySource(policy, policy).check()  # before a scene is built
-    env_config = EnvConfig(assets, compat, difficulty)
+    env_config = EnvConfig(assets, compat, difficulty, prompts)
     batch = Batch(
         policy,
         policy,

@@ -30,6 +30,7 @@ def main(
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
+    prompts: str = "multimodal",
     ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
@@ -65,6 +66,8 @@ def main(
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
         difficulty: easy, as for all published results, medium or hard.
+        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
+            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all.
         boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
@@ -105,7 +108,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        env_config=EnvConfig(assets, compat, difficulty),
+        env_config=EnvConfig(assets, compat, difficulty, prompts),
         batch=batch,
         force=force,
         device=device,

@@ -30,6 +30,7 @@ def main(
     assets: str = "procedural",
     compat: bool = False,
     difficulty: str = "easy",
+    prompts: str = "multimodal",
     force: bool = False,
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
@@ -58,6 +59,8 @@ def main(
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
         difficulty: easy, as for all published results, medium or hard.
+        prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
+            object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
         force: Delete the data set that is in the folder.
 
     Returns:
@@ -74,7 +77,7 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        env_config=EnvConfig(assets, compat, difficulty),
+        env_config=EnvConfig(assets, compat, difficulty, prompts),
         compression=compression,
         images=images,
         keep_failed=keep_failed,

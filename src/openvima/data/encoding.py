@@ -14,6 +14,7 @@ from openvima.data.image_layout import ImageBuffers
 from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
+from openvima.tasks.prompts import MULTIMODAL
 
 _METADATA_KEY = b"openvima"
 _WORD = re.compile(r"\w[\w .+-]{0,100}")
@@ -57,6 +58,7 @@ class ShardInfo:
         versions: Package name to version.
         compat: Whether the original benchmark was followed also where it is odd.
         difficulty: "easy", "medium" or "hard".
+        prompts: "multimodal", or what replaces object images in prompts; only then recorded.
         compression: Codec of the buffers, "lz4" or "zstd".
         images: Whether images are stored; without, they are drawn anew on reading.
 
@@ -74,6 +76,7 @@ class ShardInfo:
     versions: dict[str, str]
     compat: bool = False
     difficulty: str = "easy"
+    prompts: str = MULTIMODAL
     compression: str = "lz4"
     images: bool = True
 
@@ -89,6 +92,8 @@ class ShardInfo:
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
         fields = {name: getattr(self, name) for name in self.__slots__}
+        if self.prompts == MULTIMODAL:
+            del fields["prompts"]
         text = json.dumps({"schema": SCHEMA_VERSION, **fields}, sort_keys=True)
         return {_METADATA_KEY: text.encode()}
 

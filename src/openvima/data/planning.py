@@ -21,6 +21,8 @@ from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
+from openvima.tasks.prompts import MULTIMODAL
+from openvima.tasks.sampling import check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 
 Engine = Literal["processes", "ray"]
@@ -47,7 +49,8 @@ class GenerateConfig:
 
     Args:
         out: The folder.
-        tasks: Names of the tasks; ("all",) means all that the level has.
+        tasks: Names of the tasks; ("all",) means all that the level has, and with text prompts a
+            text form.
         episodes: Successful episodes of each task.
         level: "train" or "L1" to "L4".
         start_seed: First seed.
@@ -119,13 +122,16 @@ class GenerateConfig:
         Raises:
             UnknownTaskError: There is no such task.
             LevelError: There is no such level, or a task is not defined at it.
+            ConfigError: A named task has no text form, which the prompts need; "all" leaves it out.
         """
         if self.level not in LEVELS:
             raise LevelError(unknown_name("level", self.level, LEVELS))
         if self.tasks == ("all",):
-            return tuple(sorted(task for task in list_tasks() if self.level in task_spec(task).levels))
+            there = (task for task in list_tasks() if self.level in task_spec(task).levels)
+            return tuple(sorted(task for task in there if takes_prompts(task, self.env_config.prompts)))
         for task in self.tasks:
             task_spec(task).pool(self.level)
+            check_text_form(task, self.env_config.prompts)
         return tuple(sorted(set(self.tasks)))
 
     def record(self) -> dict[str, Any]:  # Any: JSON
@@ -158,7 +164,12 @@ class GenerateConfig:
             settings: dict[str, Any] = {
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
-                "env_config": EnvConfig(record["assets"], record["compat"], record["difficulty"]),
+                "env_config": EnvConfig(
+                    record["assets"],
+                    record["compat"],
+                    record["difficulty"],
+                    record.get("prompts", MULTIMODAL),
+                ),
                 **{name: record[name] for name in ("level", "episodes", "start_seed")},
                 **{name: record[name] for name in ("compression", "images")},
             }
@@ -214,6 +225,7 @@ def plan(config: GenerateConfig) -> list[Block]:
                 versions=versions,
                 compat=config.env_config.compat,
                 difficulty=config.env_config.difficulty,
+                prompts=config.env_config.prompts,
                 compression=config.compression,
                 images=config.images,
             )

@@ -84,6 +84,7 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         domain=demo.domain,
         assets=rasteriser.assets,
         compat=info.compat,
+        prompts=info.prompts,
         **options,
     )
     return rasteriser.prompt(episode.problem.prompt)

@@ -135,7 +135,7 @@ def _surplus(found: ShardInfo, config: GenerateConfig) -> str:
 
 
 def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
-    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty", "compression")
-    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in (*names, "images")]
+    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty", "prompts")
+    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in (*names, "compression", "images")]
     pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
     return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]

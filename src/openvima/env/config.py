@@ -1,9 +1,10 @@
-"""Settings that all environments of a run share: assets, difficulty, fidelity."""
+"""Settings that all environments of a run share: assets, difficulty, fidelity, prompts."""
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
 from openvima.tasks.options import check_difficulty
+from openvima.tasks.prompts import MULTIMODAL, check_prompts
 
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
@@ -17,17 +18,20 @@ class EnvConfig:
         assets: Asset pack: "procedural", "original" or the folder of a checkout of VIMA-Bench.
         compat: Reproduce VIMA-Bench's quirks.
         difficulty: "easy", as for all published results, "medium" or "hard".
+        prompts: "multimodal", as for all published results, "text" or "mixed"; see `openvima.make`.
 
     Raises:
-        ConfigError: There is no such difficulty.
+        ConfigError: There is no such difficulty or form of prompts.
     """
 
     assets: str = "procedural"
     compat: bool = False
     difficulty: str = "easy"
+    prompts: str = MULTIMODAL
 
     def __post_init__(self) -> None:
         check_difficulty(self.difficulty)
+        check_prompts(self.prompts)
 
     def make(self, task: str, level: str, *, domain: str, realtime: bool = False) -> "TabletopEnv":
         """Build an environment.
@@ -39,7 +43,7 @@ class EnvConfig:
             realtime: Record `frames` during each step.
 
         Raises:
-            ConfigError: The task does not have this difficulty.
+            ConfigError: The task does not have this difficulty, or has no text form.
         """
         from openvima.env.tabletop import TabletopEnv
 
@@ -49,6 +53,7 @@ class EnvConfig:
             domain=domain,
             assets=self.assets,
             compat=self.compat,
+            prompts=self.prompts,
             realtime=realtime,
             **self.options(),
         )
@@ -60,8 +65,11 @@ class EnvConfig:
         return {"difficulty": self.difficulty}
 
     def record(self) -> dict[str, str | bool]:
-        """Return the settings for a record, without paths."""
-        return {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
+        """Return the settings for a record, without paths and without the prompts if they are published."""
+        record = {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
+        if self.prompts == MULTIMODAL:
+            del record["prompts"]
+        return record
 
 
 DEFAULT_ENV_CONFIG = EnvConfig()

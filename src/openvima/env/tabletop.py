@@ -33,6 +33,7 @@ from openvima.sim.world import World
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
+from openvima.tasks.sampling import check_text_form
 from openvima.tasks.seeding import checked_seed, make_rng
 
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
@@ -109,7 +110,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     **End** — `terminated` on success or failure; `truncated` after `episode.max_steps` steps otherwise.
 
-    **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image), `success`,
+    **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
+    `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
     `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
     0), `num_steps`, `joints` (as in observations), `task`, `level`, `domain`, `seed`, `end_effector`, and
     `objects` (id to the names of object and texture). The images of the prompt are in `prompt`, an attribute.
@@ -133,6 +135,10 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
         compat: Reproduce VIMA-Bench's quirks: objects hover at the start, ids follow the order of
             spawning, the oracle picks any visible point.
+        prompts: "multimodal", as published; "text": a description such as "the red swirl letter A" in place
+            of each object image; "mixed": in place of each with probability ½. "text,paraphrased" and
+            "mixed,paraphrased" use synonyms. Images of scenes stay, and so do prompts of episodes that
+            `reset` is given.
         hide_arm: Leave arm and tool out of the images, as in all published data; else they are ids 2 to 4.
         realtime: Record `frames`, 30 a second, while a step runs.
         render_mode: None, or "rgb_array": `render` returns both views, front above top.
@@ -142,7 +148,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
-        ConfigError: The domain, the render mode, a modality or an option of the task is invalid.
+        ConfigError: The domain, the prompts, the render mode, a modality or an option of the task is invalid,
+            or the task has no text form.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
@@ -155,6 +162,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         domain: str = "user",
         assets: str | Path | Assets = "procedural",
         compat: bool = False,
+        prompts: str = "multimodal",
         hide_arm: bool = True,
         realtime: bool = False,
         render_mode: str | None = None,
@@ -168,6 +176,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self.domain = domain
         self.assets = load_assets(assets)
         self.compat = compat
+        check_text_form(task, prompts)
+        self.prompts = prompts
         self.hide_arm = hide_arm
         self.realtime = realtime
         self.render_mode = render_mode
@@ -347,6 +357,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             domain=self.domain,
             assets=self.assets,
             compat=self.compat,
+            prompts=self.prompts,
             **self.task_options,
         )
 
@@ -374,6 +385,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         episode, problem = run.episode, run.episode.problem
         return {
             "prompt": problem.prompt.text,
+            "prompt_ambiguous": problem.prompt.is_ambiguous,
             "success": run.outcome.success,
             "failure": run.outcome.failure,
             "reason": run.outcome.reason,

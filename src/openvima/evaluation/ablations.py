@@ -3,7 +3,7 @@
 | ablation | input of the policy |
 |---|---|
 | `no_prompt` | the same prompt in every episode: one full stop and no image |
-| `other_prompt_images` | its own words, with the images of another episode of the task and level |
+| `other_prompt_images` | its own words, with the images, or their descriptions, of another episode |
 | `scrambled_words` | its own images; each word, number and mark replaced by a random word of the vocabulary |
 | `shuffled_objects` | permuted object ids, in segmentations and in the records of the prompt |
 | `detected_boxes` | boxes from a detector |
@@ -29,7 +29,8 @@ from openvima.errors import SamplingError
 from openvima.evaluation.in_context import demonstrated
 from openvima.policies.tokenizer import word_ids
 from openvima.render.rasteriser import Rasteriser
-from openvima.scene import ObjectRecord, Prompt, PromptImage, RenderedPrompt
+from openvima.scene import Episode, ObjectRecord, Prompt, PromptImage, RenderedPrompt
+from openvima.tasks.prompts import MULTIMODAL, rewritten
 from openvima.tasks.sampling import sample_episode
 from openvima.tasks.seeding import make_rng
 
@@ -93,31 +94,41 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
 
 
 def _with_images_of_another(env: TabletopEnv, rng: np.random.Generator) -> RenderedPrompt:
-    """Sample seeds until an episode has images of the same names and kinds."""
+    """Sample seeds until an episode has images of the same names and kinds, and describe the same of them."""
     episode = env.episode
-    prompt = episode.problem.prompt
+    own = episode if env.prompts == MULTIMODAL else _multimodal(env, episode.seed)
+    prompt = own.problem.prompt
     for _ in range(_MAX_TRIES):
         seed = int(rng.integers(_LARGEST_SEED))
         if seed == episode.seed:
             continue
         try:
-            other = sample_episode(
-                episode.task,
-                level=episode.level,
-                seed=seed,
-                domain=episode.domain,
-                assets=env.assets,
-                compat=env.compat,
-                **env.task_options,
-            )
+            other = _multimodal(env, seed)
         except SamplingError:
             continue
         images = other.problem.prompt.images
         if _kinds(images) == _kinds(prompt.images):
-            return Rasteriser(env.assets).prompt(Prompt(prompt.text, images))
+            prompt_rng = make_rng(
+                own.domain, own.task, own.level, own.seed, "prompt", attempt=own.num_redraws
+            )
+            swapped = rewritten(Prompt(prompt.text, images), other.problem.scene, env.prompts, prompt_rng)
+            return Rasteriser(env.assets).prompt(swapped)
     raise SamplingError(
         f"{_MAX_TRIES} other episodes of {episode.task} at level {episode.level} have no images for "
         f"{prompt.text!r}; evaluate this task without the ablation {OTHER_PROMPT_IMAGES}."
+    )
+
+
+def _multimodal(env: TabletopEnv, seed: int) -> Episode:
+    """Sample an episode of an environment, with the published prompt."""
+    return sample_episode(
+        env.task,
+        level=env.level,
+        seed=seed,
+        domain=env.domain,
+        assets=env.assets,
+        compat=env.compat,
+        **env.task_options,
     )
 
 

@@ -20,6 +20,7 @@ from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
 from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.sampling import check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 
 REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound
@@ -39,7 +40,8 @@ class EvaluationConfig:
             preset, a run folder, a published file, an id on the Hugging Face Hub; or the address of a policy
             server such as "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by
             default it has its own.
-        tasks: Names of tasks, or ("all",) for every task that the level holds.
+        tasks: Names of tasks, or ("all",) for every task that the level holds, with text
+            prompts every one that has a text form.
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
@@ -231,12 +233,19 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: No level holds any of the tasks.
+        ConfigError: No level holds any of the tasks, or one that was named has no text form, which the
+            prompts need.
     """
     for level in config.levels:
         if level not in LEVELS:
             raise LevelError(unknown_name("level", level, LEVELS))
-    tasks = dict.fromkeys(list_tasks() if "all" in config.tasks else config.tasks)
+    prompts = config.env_config.prompts
+    if "all" in config.tasks:
+        tasks = [task for task in list_tasks() if takes_prompts(task, prompts)]
+    else:
+        tasks = list(dict.fromkeys(config.tasks))
+        for task in tasks:
+            check_text_form(task, prompts)
     pairs = [
         (task, level)
         for level in dict.fromkeys(config.levels)

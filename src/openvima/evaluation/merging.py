@@ -9,7 +9,13 @@ from openvima.errors import ConfigError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 
 # Settings that decide which episode a seed stands for, with what holds for files that do not name them.
-_SAME_EPISODES = {"domain": "eval", "assets": "procedural", "compat": False, "difficulty": "easy"}
+_SAME_EPISODES = {
+    "domain": "eval",
+    "assets": "procedural",
+    "compat": False,
+    "difficulty": "easy",
+    "prompts": "multimodal",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from openvima.env.config import EnvConfig
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
@@ -18,6 +19,7 @@ def score(
     episodes: int = DEFAULT_EPISODES,
     seed: int = 0,
     ablations: tuple[str, ...] = (),
+    prompts: str = "multimodal",
 ) -> Results:
     """Evaluate policy objects on the episodes of `openvima evaluate`.
 
@@ -28,6 +30,8 @@ def score(
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
         ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes".
+        prompts: "multimodal", "text" or "mixed", see `openvima.make`; such as "text" for a policy that reads
+            language alone.
 
     Returns:
         Success rates and the outcome of every episode.
@@ -44,7 +48,13 @@ def score(
         2
     """
     config = EvaluationConfig(
-        tuple(policies), tasks=tasks, levels=levels, episodes=episodes, seed=seed, ablations=ablations
+        tuple(policies),
+        tasks=tasks,
+        levels=levels,
+        episodes=episodes,
+        seed=seed,
+        env_config=EnvConfig(prompts=prompts),
+        ablations=ablations,
     )
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}

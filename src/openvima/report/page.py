@@ -25,6 +25,7 @@ _FUNCTIONS = (  # that the templates in `html/templates/report/` call
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
     "difficulty": "easy",
+    "prompts": "multimodal",
     "batch": 16,
     "boxes": "",
     "device": "cpu",

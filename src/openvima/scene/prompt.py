@@ -52,10 +52,13 @@ class Prompt:
     Args:
         text: The text with a placeholder for each image, such as "Put the {a} into the {b}.".
         images: Placeholder names and image contents, in the order of first appearance in the text.
+        is_ambiguous: Descriptions in place of images fit objects that the images differ from, as two that
+            differ in height alone.
     """
 
     text: str
     images: tuple[tuple[str, PromptFill], ...]
+    is_ambiguous: bool = False
 
     @staticmethod
     def parse(template: str, **fills: PromptFill | str | int) -> "Prompt":

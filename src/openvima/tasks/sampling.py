@@ -1,10 +1,14 @@
 """Sampling of episodes: a task's draw from its own generator, and new draws after bad luck."""
 
+import functools
+from dataclasses import replace
+
 from openvima.catalog import Assets
 from openvima.errors import ConfigError, SamplingError, unknown_name
-from openvima.scene import Episode
+from openvima.scene import Episode, ObjectImage
 from openvima.tasks.ids import shuffled_ids
-from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, task_spec
+from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewritten
+from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, list_tasks, task_spec
 from openvima.tasks.seeding import checked_seed, make_rng
 from openvima.tasks.table import TableSampler
 
@@ -19,6 +23,7 @@ def sample_episode(
     domain: str = "user",
     assets: "str | Assets" = "procedural",
     compat: bool = False,
+    prompts: str = MULTIMODAL,
     **options: object,
 ) -> Episode:
     """Sample one episode of a task.
@@ -31,6 +36,9 @@ def sample_episode(
         assets: Asset pack: "procedural", a folder with the original pack, or a pack already loaded.
         compat: Sample as the original benchmark does: objects hover at the start, ids follow the order of
             placing, and starts that overlap or are decided already are accepted.
+        prompts: "multimodal", "text" (descriptions in place of object images) or "mixed" (in place of each
+            with probability ½); "text,paraphrased" and "mixed,paraphrased" use synonyms. Nothing else of
+            the episode depends on it.
         **options: The task's own options, as `task_spec(task).options` lists them.
 
     Returns:
@@ -39,7 +47,8 @@ def sample_episode(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or the task is not defined there.
-        ConfigError: The seed, the domain or an option is not allowed.
+        ConfigError: The seed, the domain, the form of prompts or an option is not allowed, or the task has no
+            text form.
         SamplingError: No draw in a hundred could place all objects.
 
     Example:
@@ -51,6 +60,7 @@ def sample_episode(
     spec = task_spec(task)
     level, number = spec.checked_level(level), checked_seed(seed)
     _check_options(spec, options)
+    check_text_form(task, prompts)
     pool, pack = spec.pool(level), load_assets(assets)
     reason = SamplingError()
     for attempt in range(MAX_REDRAWS + 1):
@@ -63,12 +73,50 @@ def sample_episode(
             continue
         if not compat:
             problem = shuffled_ids(problem, make_rng(domain, task, level, number, "ids", attempt=attempt))
+        if prompts != MULTIMODAL:
+            rng = make_rng(domain, task, level, number, "prompt", attempt=attempt)
+            problem = replace(problem, prompt=rewritten(problem.prompt, problem.scene, prompts, rng))
         oracle_max_steps = problem.oracle_max_steps or spec.oracle_max_steps
         max_steps = oracle_max_steps + EXTRA_STEPS
         return Episode(task, level, domain, number, problem, oracle_max_steps, max_steps, num_redraws=attempt)
     raise SamplingError(
         f"{MAX_REDRAWS + 1} draws of {task} at level {level}, seed {number}, failed: {reason}"
     )
+
+
+@functools.cache
+def has_text_form(task: str) -> bool:
+    """Whether prompts of a task contain images of single objects, which text can replace.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+    """
+    fills = sample_episode(task, seed=0).problem.prompt.images
+    return any(isinstance(fill, ObjectImage) for _, fill in fills)
+
+
+def takes_prompts(task: str, prompts: str) -> bool:
+    """Whether prompts of a task can have a form: all can, except text for those without a text form.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        ConfigError: There is no such form.
+    """
+    check_prompts(prompts)
+    return not prompts.startswith("text") or has_text_form(task)
+
+
+def check_text_form(task: str, prompts: str) -> None:
+    """Check that prompts of a task can have a form.
+
+    Raises:
+        ConfigError: There is no such form, or it is text and all images of the task's prompts are scenes.
+    """
+    if not takes_prompts(task, prompts):
+        tasks = ", ".join(name for name in list_tasks() if has_text_form(name))
+        raise ConfigError(
+            f"task {task!r} has no text form: its prompt images are scenes. Tasks with one: {tasks}."
+        )
 
 
 def _check_options(spec: TaskSpec, options: dict[str, object]) -> None:

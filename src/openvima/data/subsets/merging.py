@@ -160,7 +160,8 @@ def _first_of_each(parts: Sequence[_Part]) -> tuple[np.ndarray, pa.Table]:
     tables = []
     for part in parts:
         info = part.info
-        setup = setups.setdefault((info.assets, info.compat, info.difficulty), len(setups))
+        env_config = (info.assets, info.compat, info.difficulty, info.prompts)
+        setup = setups.setdefault(env_config, len(setups))
         rows = part.dataset.index.select(_NAME).take(part.episodes)
         tables.append(rows.append_column("setup", pa.array(np.full(len(rows), setup))))
     names = pa.concat_tables(tables)

@@ -169,7 +169,7 @@ def _record_of(shards: Sequence[Shard]) -> dict[str, Any]:  # Any: JSON
     info, episodes = shards[0].info, Counter[str]()
     for shard in shards:
         episodes[shard.info.task] += len(shard)
-    names = ("level", "shard_size", "compression", "images", "assets", "compat", "difficulty")
+    names = ("level", "shard_size", "compression", "images", "assets", "compat", "difficulty", "prompts")
     counts = {"episodes": max(episodes.values()), "start_seed": info.first_seed}
     return {"tasks": sorted(episodes), **counts, **{name: getattr(info, name) for name in names}}
 

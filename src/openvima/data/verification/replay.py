@@ -231,7 +231,7 @@ def _when(step: int) -> str:
 
 
 def _setup(task: ReplayTask) -> EnvConfig:
-    return EnvConfig(task.assets, task.info.compat, task.info.difficulty)
+    return EnvConfig(task.assets, task.info.compat, task.info.difficulty, task.info.prompts)
 
 
 @lru_cache(maxsize=4)

@@ -16,6 +16,7 @@ from openvima.data.shard import Shard, remedy
 from openvima.data.verification.episodes import faults
 from openvima.data.verification.findings import Problem, by_cause
 from openvima.errors import OpenVimaError, ShardError
+from openvima.tasks.prompts import MULTIMODAL
 
 _KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "success")
 
@@ -150,9 +151,10 @@ def _record_faults(
 
 def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
     """Yield contradictions between a generated shard and the manifest."""
-    for name in ("level", "domain", "assets", "compat", "difficulty", "compression", "images"):
-        if name in task.config and getattr(info, name) != task.config[name]:
-            yield f"{name} is {getattr(info, name)}, in the manifest {task.config[name]}"
+    settings = {"prompts": MULTIMODAL, **task.config} if task.config else {}
+    for name in ("level", "domain", "assets", "compat", "difficulty", "prompts", "compression", "images"):
+        if name in settings and getattr(info, name) != settings[name]:
+            yield f"{name} is {getattr(info, name)}, in the manifest {settings[name]}"
     if task.versions and info.versions != task.versions:
         yield f"it was written by {info.versions}, says the manifest {task.versions}"
     if task.config and task.path.name != info.file_name:

@@ -1,0 +1,124 @@
+"""Text prompts: descriptions such as "the red swirl letter A" in place of object images."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from openvima.catalog import NEUTRAL_TEXTURE, object_spec
+from openvima.errors import ConfigError, unknown_name
+from openvima.scene import ObjectImage, Placement, Prompt, Scene
+
+MULTIMODAL = "multimodal"
+PROMPTS = (MULTIMODAL, "text", "mixed", "text,paraphrased", "mixed,paraphrased")
+"""Forms of prompts: published; all object images described; each with probability ½; with synonyms."""
+
+_REPLACED_PROB = 0.5  # of an object image in mixed prompts
+_PLACEHOLDER = re.compile(r"\{(\w+)\}")
+_INTRODUCED = re.compile(r"\bis an? [\w-]+ $")  # "This is a wug {image}."
+_ARTICLE = re.compile(r"\b([Aa])n? $")
+_PLURAL = re.compile(r"\b(two|three|four|five|six|all|both|some|\d+) $", re.IGNORECASE)
+_DETERMINED = re.compile(  # "the {image}", "the same {image}", "the less kobar {image}", "any {image}"
+    r"\b(the( less| more)?( [\w-]+)?|this|that|each|every|any|one) $", re.IGNORECASE
+)
+_VOWEL = re.compile(r"[aeiou]|[AEFHILMNORSX](?![A-Za-z])")  # as it sounds: "an L-shaped block"
+
+
+def check_prompts(prompts: str) -> None:
+    """Check a form of prompts.
+
+    Raises:
+        ConfigError: It is none of `PROMPTS`.
+    """
+    if prompts not in PROMPTS:
+        allowed = f"Allowed: {'; '.join(PROMPTS)}."
+        raise ConfigError(unknown_name("form of prompts", prompts, PROMPTS, allowed))
+
+
+def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generator) -> Prompt:
+    """Replace object images of a prompt by descriptions: texture and name.
+
+    Images of scenes stay. Images of a shape alone, which are gray, are described by the name alone.
+
+    Args:
+        prompt: The multimodal prompt.
+        scene: The objects on the table; they decide whether the descriptions are ambiguous.
+        prompts: One of `PROMPTS`.
+        rng: Generator of the choices. Equal ones choose the same images with and without synonyms.
+
+    Returns:
+        The prompt with the remaining images, marked where its words are ambiguous.
+
+    Example:
+        >>> rewritten(prompt, scene, "text", rng).text  # doctest: +SKIP
+        'Put the red swirl letter A into the blue bowl.'
+    """
+    form, _, synonyms = prompts.partition(",")
+    draws = rng.random((len(prompt.images), 2))
+    nouns: dict[str, str] = {}
+    shown = {name: fill.placement for name, fill in prompt.images if isinstance(fill, ObjectImage)}
+    for (name, _fill), (image_draw, noun_draw) in zip(prompt.images, draws, strict=True):
+        if name in shown and (form == "text" or image_draw < _REPLACED_PROB) and form != MULTIMODAL:
+            names = _names(shown[name])
+            nouns[name] = names[int(noun_draw * len(names))] if synonyms else names[0]
+    phrases = {name: _description(shown[name], noun) for name, noun in nouns.items()}
+    return replace(
+        prompt,
+        text=_with_phrases(prompt.text, phrases),
+        images=tuple((name, fill) for name, fill in prompt.images if name not in nouns),
+        is_ambiguous=any(_is_ambiguous(shown[n], noun, shown.values(), scene) for n, noun in nouns.items()),
+    )
+
+
+def _names(placement: Placement) -> tuple[str, ...]:
+    spec = object_spec(placement.object)
+    return (spec.name, *spec.aliases)
+
+
+def _description(placement: Placement, noun: str) -> str:
+    return noun if placement.texture == NEUTRAL_TEXTURE else f"{placement.texture} {noun}"
+
+
+def _is_ambiguous(image: Placement, noun: str, shown: Iterable[Placement], scene: Scene) -> bool:
+    """Whether a description fits objects on the table or in the prompt that its image differs from."""
+    gray = image.texture == NEUTRAL_TEXTURE
+
+    def differs(other: Placement, size: bool) -> bool:
+        if noun not in _names(other) or not (gray or other.texture == image.texture):
+            return False
+        if other.object != image.object:
+            return True
+        return not gray and (other.scale != image.scale or (size and other.size != image.size))
+
+    on_table = any(placement.id == image.id for placement in scene.placements)
+    rivals = scene.placements if on_table else ()
+    return any(differs(other, True) for other in rivals) or any(differs(other, False) for other in shown)
+
+
+def _with_phrases(text: str, phrases: Mapping[str, str]) -> str:
+    """Put phrases in place of placeholders, each with the article that its sentence needs."""
+    result = ""
+    for number, piece in enumerate(_PLACEHOLDER.split(text)):
+        if number % 2 == 0:
+            result += piece
+        elif piece in phrases:
+            result = _continued(result, phrases[piece])
+        else:
+            result += f"{{{piece}}}"
+    return result
+
+
+def _continued(before: str, phrase: str) -> str:
+    """Append a phrase to the beginning of a text."""
+    article = "an" if _VOWEL.match(phrase) else "a"
+    if _INTRODUCED.search(before):
+        return f"{before.rstrip()}: {article} {phrase}"
+    if found := _ARTICLE.search(before):
+        return f"{before[: found.start()]}{found[1]}{article[1:]} {phrase}"
+    if _PLURAL.search(before):
+        return f"{before}{phrase}{'es' if phrase.endswith(('s', 'x', 'sh', 'ch')) else 's'}"
+    if _DETERMINED.search(before):
+        return before + phrase
+    starts_sentence = not before or before.rstrip().endswith((".", "!", "?"))
+    return f"{before}{'The' if starts_sentence else 'the'} {phrase}"
