@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
-from openvima.errors import ConfigError, MissingExtraError, WorkerError
+from openvima.errors import ConfigError, WorkerError
+from openvima.extras import import_extra
 from openvima.multiprocess import THREAD_VARIABLES, Counts, Job
 
 POLL_S = 0.5
@@ -61,14 +62,11 @@ def _import_ray() -> ModuleType:
     # Read when Ray is imported: no usage statistics, no deprecation warnings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError:
-        raise MissingExtraError(
-            "running on a Ray cluster needs ray: pip install openvima[scale]. "
-            "Without it, --engine processes uses the CPUs of this machine."
-        ) from None
-    return ray
+    return import_extra(
+        "ray",
+        "running on a Ray cluster needs ray: pip install openvima[scale]. "
+        "Without it, --engine processes uses the CPUs of this machine.",
+    )
 
 
 @contextlib.contextmanager

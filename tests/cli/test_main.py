@@ -12,7 +12,7 @@ import pytest
 
 from openvima import __version__
 from openvima.cli.main import VERBS, main
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, ShardError
 
 
 def fail_with(error: Exception) -> Callable[[Sequence[str]], int]:
@@ -117,8 +117,11 @@ def test_wrong_input_is_refused_before_any_work(
         (MemoryError("Unable to allocate 9 GiB"), "out of memory while working on here; lower --workers"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory"), "out of memory while working on here"),
         (RuntimeError("CUDA out of memory."), "out of memory while working on here"),
+        (ValueError("Error: engine error: Could not allocate memory"), "out of memory while working on here"),
+        (ImportError("x.so: failed to map segment from shared object"), "out of memory while working on"),
+        (ShardError("a.arrow: Memory mapping file failed: Cannot allocate memory"), "out of memory while"),
     ],
-    ids=["disk", "quota", "memory", "torch", "cuda"],
+    ids=["disk", "quota", "memory", "torch", "cuda", "mujoco", "library", "arrow"],
 )
 def test_a_full_disk_or_memory_is_one_line_with_path_and_remedy(
     error: Exception, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -129,6 +132,18 @@ def test_a_full_disk_or_memory_is_one_line_with_path_and_remedy(
     shown = capsys.readouterr().err.strip()
     assert message in shown
     assert "\n" not in shown
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the address space is limited on Linux only")
+@pytest.mark.parametrize("verb", ["train --data x --out here", "generate --out here"])
+def test_too_little_address_space_is_one_line(verb: str) -> None:
+    command = f"ulimit -v 800000; exec {sys.executable} -m openvima {verb}"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr == (
+        "openvima: out of memory while working on here; raise `ulimit -v`, which is 800000 kB. "
+        "Complete files were kept.\n"
+    )
 
 
 def test_what_a_message_quotes_cannot_steer_the_terminal(

@@ -3,7 +3,6 @@
 import argparse
 import errno
 import importlib
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE
 from openvima.errors import OpenVimaError, echo, unknown_name
+from openvima.memory import address_space_remedy, lacks_memory, require_address_space
 
 # Verb → summary. Each verb is a module of this package.
 VERBS = {
@@ -31,8 +31,6 @@ VERBS = {
 _HELP = ("-h", "--help")
 _MAX_MESSAGE = 4000  # characters
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# How torch, MuJoCo and threads say that there is no memory.
-_NO_MEMORY = re.compile(r"can.?t allocate|could not allocate|out of memory|start new thread", re.IGNORECASE)
 _MEMORY_REMEDIES = {
     "train": "lower --loader.batch-size or raise --optimizer.grad-accum-steps",
     "detector": "lower --loader.batch-size",
@@ -41,6 +39,8 @@ _MEMORY_REMEDIES = {
     "quickstart": "lower --workers",
     "data": "lower --workers",
 }
+# Least address space of the verbs that simulate or train, in 2**20 bytes.
+_LEAST_MB = dict.fromkeys(("demo", "generate", "train", "detector", "evaluate", "quickstart"), 1000)
 
 OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 
@@ -77,9 +77,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(verb: str, rest: list[str]) -> int:
     import tyro
 
-    module = importlib.import_module(f"openvima.cli.{verb}")
-    commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
     try:
+        if verb in _LEAST_MB and not set(_HELP) & set(rest):
+            require_address_space(_LEAST_MB[verb])
+        module = importlib.import_module(f"openvima.cli.{verb}")
+        commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)
             if names_none and hasattr(module, "DEFAULT"):
@@ -93,27 +95,32 @@ def _run(verb: str, rest: list[str]) -> int:
             status = tyro.cli(module.main, prog=f"openvima {verb}", args=rest)
         sys.stdout.flush()  # while a full disk can still be reported
         return status
-    except OpenVimaError as error:
-        usage = isinstance(error, ValueError | KeyError | ImportError)
-        return _fail(f"{type(error).__name__}: {error}", 2 if usage else 1)
     except KeyboardInterrupt:
         return _fail("interrupted; complete files were kept, and the same command resumes.", 130)
     except BrokenPipeError:  # the reader of our output, such as `head`, exited
         sys.stderr.close()
         return 1
-    except OSError as error:  # an unusable path, or a full disk
-        reason = error.strerror or type(error).__name__
-        if error.errno in _NO_SPACE:
-            return _fail(f"cannot write {error.filename or _out(rest)}: {reason}. {FREE_SPACE}", 1)
-        if error.filename is None:
-            return _fail(f"{type(error).__name__}: {error}", 1)
-        message = f"cannot use {error.filename}: {reason}. Give a path that can be read and written."
-        return _fail(message, 2)
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
-            raise
-        remedy = _MEMORY_REMEDIES.get(verb, "close other programs")
-        return _fail(f"out of memory while working on {_out(rest)}; {remedy}. Complete files were kept.", 1)
+    except Exception as error:
+        message, status = _explained(error, verb, rest)
+        return _fail(message, status)
+
+
+def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, int]:
+    """Return the line that reports an exception, and the exit status; raise it if it is a bug."""
+    name, out = type(error).__name__, _out(rest)
+    if lacks_memory(error):
+        remedy = address_space_remedy() or _MEMORY_REMEDIES.get(verb, "close other programs")
+        return f"out of memory while working on {out}; {remedy}. Complete files were kept.", 1
+    if isinstance(error, OpenVimaError):
+        return f"{name}: {error}", 2 if isinstance(error, ValueError | KeyError | ImportError) else 1
+    if not isinstance(error, OSError):
+        raise error
+    reason = error.strerror or name
+    if error.errno in _NO_SPACE:
+        return f"cannot write {error.filename or out}: {reason}. {FREE_SPACE}", 1
+    if error.filename is None:
+        return f"{name}: {error}", 1
+    return f"cannot use {error.filename}: {reason}. Give a path that can be read and written.", 2
 
 
 def _out(words: Sequence[str]) -> str:

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from openvima.detector.frames import Frame
-from openvima.errors import ConfigError, MissingExtraError
+from openvima.errors import ConfigError
+from openvima.extras import import_extra
 from openvima.policies.detection import Detections
 
 _CATEGORY = 1  # of all objects
@@ -99,12 +100,9 @@ def evaluate_detector(detect: Callable[[np.ndarray], Detections], frames: Iterab
 
 def require_pycocotools() -> None:
     """Raise a MissingExtraError that names the extra if pycocotools cannot be imported."""
-    try:
-        import pycocotools  # noqa: F401  # whether it is installed
-    except ImportError as error:
-        raise MissingExtraError(
-            "COCO metrics need pycocotools; install it with: pip install 'openvima[detector]'"
-        ) from error
+    import_extra(
+        "pycocotools", "COCO metrics need pycocotools; install it with: pip install 'openvima[detector]'"
+    )
 
 
 def _metrics(

@@ -18,6 +18,7 @@ from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
 from openvima.evaluation.versions import versions
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
+from openvima.policies.base import require_torch
 from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
@@ -121,6 +122,7 @@ def _check_weights(config: EvaluationConfig) -> None:
     """Load each network once, so that a damaged one is named before episodes of the others."""
     for source in config.sources:
         if source.kind == "run":
+            require_torch(f"policy {source.name!r}")
             from openvima.policies.checkpoint import load_network
 
             load_network(source.source)

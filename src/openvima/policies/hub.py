@@ -1,10 +1,10 @@
 """Policies on the Hugging Face Hub. No request is made unless a name can only be a repository id."""
 
 import re
-from importlib import import_module
 from pathlib import Path
 
-from openvima.errors import CheckpointError, MissingExtraError
+from openvima.errors import CheckpointError
+from openvima.extras import import_extra
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
@@ -32,13 +32,11 @@ def fetch_from_hub(hub_id: str, patterns: tuple[str, ...]) -> Path:
         MissingExtraError: `huggingface_hub` is not installed.
         CheckpointError: There is no such repository, or it cannot be reached.
     """
-    try:
-        hub = import_module("huggingface_hub")
-    except ImportError as error:
-        raise MissingExtraError(
-            f"there is no folder {hub_id!r} here; to fetch it from the Hugging Face Hub, install "
-            "huggingface_hub: pip install huggingface_hub"
-        ) from error
+    hub = import_extra(
+        "huggingface_hub",
+        f"there is no folder {hub_id!r} here; to fetch it from the Hugging Face Hub, install "
+        "huggingface_hub: pip install huggingface_hub",
+    )
     try:
         return Path(hub.snapshot_download(hub_id, allow_patterns=list(patterns)))
     except Exception as error:  # the client passes on those of its HTTP library, which has changed before

@@ -6,7 +6,6 @@ Nothing is downloaded unless an id is given.
 
 import re
 from collections.abc import Iterable, Mapping
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -16,11 +15,11 @@ import torch
 from openvima.errors import (
     CheckpointError,
     InputFileError,
-    MissingExtraError,
     PolicyError,
     PromptError,
     echo,
 )
+from openvima.extras import import_extra
 from openvima.input_files import open_regular
 from openvima.policies.hub import fetch_from_hub
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -254,7 +253,4 @@ def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
 
 
 def _require(module: str, what: str, packages: str) -> ModuleType:
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise MissingExtraError(f"{what} needs {module}; install it with: pip install {packages}") from error
+    return import_extra(module, f"{what} needs {module}; install it with: pip install {packages}")

@@ -7,12 +7,12 @@ are there.
 """
 
 import math
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from openvima.errors import MessageError, MissingExtraError
+from openvima.errors import MessageError
+from openvima.extras import import_extra
 
 DTYPES = {
     dtype.str: dtype
@@ -37,12 +37,7 @@ def require_extra() -> None:
         MissingExtraError: A package is missing; the message names the extra.
     """
     for module in ("msgpack", "websockets"):
-        try:
-            import_module(module)
-        except ImportError as error:
-            raise MissingExtraError(
-                f"policy servers need {module}; install it with: pip install 'openvima[serve]'"
-            ) from error
+        import_extra(module, f"policy servers need {module}; install it with: pip install 'openvima[serve]'")
 
 
 def pack(message: object) -> bytes:

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from openvima.errors import MissingExtraError, ShapeError
+from openvima.errors import ShapeError
+from openvima.extras import import_extra
 
 FRAMES_PER_SECOND = 30
 _CRF = "21"  # keeps textures clear at about 100 kB for 5 s
@@ -20,12 +21,7 @@ def import_av() -> Any:  # Any: PyAV is optional
     Raises:
         MissingExtraError: It is not installed.
     """
-    try:
-        import av
-    except ImportError as error:
-        message = "videos need PyAV; install it with: pip install 'openvima[report]'"
-        raise MissingExtraError(message) from error
-    return av
+    return import_extra("av", "videos need PyAV; install it with: pip install 'openvima[report]'")
 
 
 def open_video(path: Path, frames_per_second: int) -> tuple[Any, Any]:  # Any: PyAV is optional
