@@ -24,6 +24,7 @@ VERBS = {
     "train": "train a policy on demonstrations",
     "detector": "train and evaluate the object detector",
     "evaluate": "evaluate policies on levels L1 to L4",
+    "verify-results": "confirm an evaluation from its recorded actions",
     "serve": "serve a policy over WebSockets",
     "report": "write the HTML report of an evaluation",
 }
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in (*_HELP, "help"):
-        verbs = "\n".join(f"  {verb:<11} {summary}" for verb, summary in VERBS.items())
+        verbs = "\n".join(f"  {verb:<15} {summary}" for verb, summary in VERBS.items())
         print(OVERVIEW.format(version=__version__, verbs=verbs), end="")
         return 0 if words else 2
     if words[0] in ("-V", "--version"):
@@ -80,7 +81,7 @@ def _run(verb: str, rest: list[str]) -> int:
     try:
         if verb in _LEAST_MB and not set(_HELP) & set(rest):
             require_address_space(_LEAST_MB[verb])
-        module = importlib.import_module(f"openvima.cli.{verb}")
+        module = importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}")
         commands: dict[str, Callable[..., int]] | None = getattr(module, "COMMANDS", None)
         if commands is not None:
             names_none = not rest or (rest[0].startswith("-") and rest[0] not in _HELP)

@@ -372,13 +372,13 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         return self._rasteriser.scene(scene, extra=arm, depth=depth)
 
     def _observe(self) -> dict[str, Any]:
-        images = self._images(depth="depth" in self._modalities)
-        seen = {
-            name: {view: getattr(images[view], name) for view in VIEWS} for name in ("rgb", "segm", "depth")
+        seen = {name for name in self._modalities if name != "joints"}
+        images = self._images(depth="depth" in seen) if seen else {}
+        values = {
+            name: {view: getattr(images[view], name) for view in VIEWS} if name in seen else self.joints
+            for name in self._modalities
         }
-        values = {**seen, "joints": self.joints}
-        chosen = {name: values[name] for name in self._modalities}
-        return {**chosen, "ee": END_EFFECTORS.index(self.scene.end_effector)}
+        return {**values, "ee": END_EFFECTORS.index(self.scene.end_effector)}
 
     def _info(self) -> dict[str, Any]:
         run = self._running()

@@ -1,5 +1,6 @@
 """Results of an evaluation: outcomes of episodes, counted by policy, task and level."""
 
+import hashlib
 import json
 import re
 from collections import Counter
@@ -14,6 +15,8 @@ from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_inter
 
 SCHEMA = 1
 FILE_NAME = "results.json"
+# What replaying the actions cannot prove.
+DECLARED = "who acted (policies) and what they observed (ablation, boxes, device, precision, near_ties)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +136,14 @@ class Results:
         versions: Versions of the packages that results depend on.
         policies: For each policy name what it is: {"kind": …} and for trained ones {"sha256": …},
             for remote ones {"metadata": …}.
+        actions_sha256: Of the recorded actions, which `verify_results` replays; empty without any.
     """
 
     rows: tuple[Row, ...]
     config: dict[str, Any] = field(default_factory=dict)  # plain JSON values
     versions: dict[str, str] = field(default_factory=dict)
     policies: dict[str, dict[str, Any]] = field(default_factory=dict)  # plain JSON values
+    actions_sha256: str = ""
 
     def policy_names(self) -> list[str]:
         """Names of the policies, in the order of the rows."""
@@ -184,8 +189,11 @@ class Results:
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,
+            "actions_sha256": self.actions_sha256,
+            "declared": DECLARED,
         }
-        return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        content["sha256"] = hashlib.sha256(_json_text(content).encode()).hexdigest()
+        return _json_text(content)
 
     def write(self, path: Path) -> Path:
         """Write `results.json`; an interrupted write leaves the old file or none."""
@@ -209,9 +217,14 @@ class Results:
                     "Evaluate again, or read it with the version of openvima that wrote it."
                 )
             rows = tuple(_row_from_record(record) for record in content["rows"])
-            return Results(rows, content["config"], content["versions"], content["policies"])
+            described = (content["config"], content["versions"], content["policies"])
+            return Results(rows, *described, content.get("actions_sha256", ""))
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
             raise DatasetError(f"{path} is damaged ({error!r}); evaluate again with --force.") from error
+
+
+def _json_text(content: Mapping[str, object]) -> str:
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def failure_kind(reason: str) -> str:

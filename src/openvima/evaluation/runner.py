@@ -12,6 +12,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
 from openvima.detector.plugins import extractor_maker
 from openvima.errors import ConfigError
+from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import load_rollout_policy, one_thread
@@ -41,6 +42,14 @@ class PreparedEvaluation:
     batches: tuple[Batch, ...]
     policies: dict[str, dict[str, Any]]  # Any: plain values
     versions: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Rollouts:
+    """The episodes of a batch: how each ended, and its valid actions."""
+
+    outcomes: tuple[EpisodeOutcome, ...]
+    actions: tuple[Steps, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +119,15 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         _check_weights(config)
         started = time.perf_counter()
-        outcomes = _play_all(config, prepared.batches, policies, found, report)
-        results = Results(rows_of(prepared.batches, outcomes), config.record(), found, policies)
+        played = _play_all(config, prepared.batches, policies, found, report)
+        rows = rows_of(prepared.batches, {batch: rollouts.outcomes for batch, rollouts in played.items()})
+        episodes = (  # in the order of the rows
+            episode
+            for batch in prepared.batches
+            for episode in zip(batch.seeds, played[batch].actions, strict=True)
+        )
+        digest = write_actions(config.out, episodes)
+        results = Results(rows, config.record(), found, policies, digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)
     shutil.rmtree(config.out / _PARTS, ignore_errors=True)
@@ -149,29 +165,28 @@ def _play_all(
     policies: Mapping[str, Mapping[str, Any]],
     found: Mapping[str, str],
     report: Report | None,
-) -> dict[Batch, tuple[EpisodeOutcome, ...]]:
+) -> dict[Batch, Rollouts]:
     """Run the batches that are not finished yet."""
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
     prints = {name: json.dumps([what, dict(found)], sort_keys=True) for name, what in policies.items()}
     jobs = [Job(batch, prints[batch.policy]) for batch in batches]
     kept = {job.batch: _kept(job, config.out) for job in jobs}
-    outcomes = {batch: played for batch, played in kept.items() if played is not None}
-    total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in outcomes)
+    finished = {batch: played for batch, played in kept.items() if played is not None}
+    total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in finished)
     if report is not None:
         report(done, total, "")
-    for job, played in _played(config, [job for job in jobs if job.batch not in outcomes]):
-        records = [asdict(outcome) for outcome in played]
-        atomic_write_file(job.part(config.out), json.dumps(records, ensure_ascii=False) + "\n")
-        outcomes[job.batch] = played
+    for job, played in _played(config, [job for job in jobs if job.batch not in finished]):
+        atomic_write_file(job.part(config.out), json.dumps(asdict(played), ensure_ascii=False) + "\n")
+        finished[job.batch] = played
         done += job.batch.episodes
         if report is not None:
             words = (job.batch.policy, job.batch.ablation, job.batch.task, job.batch.level)
             report(done, total, " ".join(filter(None, words)))
-    return outcomes
+    return finished
 
 
-def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tuple[EpisodeOutcome, ...]]]:
+def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, Rollouts]]:
     """Run batches on the configured engine and yield them as they finish."""
     if config.engine == "processes":
         yield from imap_unordered(play_batch, jobs, config.workers or 1)
@@ -184,27 +199,29 @@ def _played(config: EvaluationConfig, jobs: list[Job]) -> Iterator[tuple[Job, tu
         yield sent[job], played
 
 
-def play_batch(job: Job, count: Callable[[int], None]) -> tuple[EpisodeOutcome, ...]:
+def play_batch(job: Job, count: Callable[[int], None]) -> Rollouts:
     """Run one batch in a worker process, possibly on another machine."""
     from openvima.evaluation.rollout import play
 
     batch = job.batch
     with one_thread(batch):
-        rollout_policy = load_rollout_policy(batch, job.fingerprint)
+        recorder = ActionRecorder(load_rollout_policy(batch, job.fingerprint))
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
-        outcomes = tuple(play(envs, batch.seeds, rollout_policy))
+        outcomes = tuple(play(envs, batch.seeds, recorder))
     count(len(outcomes))
-    return outcomes
+    return Rollouts(outcomes, tuple(recorder.steps))
 
 
-def _kept(job: Job, folder: Path) -> tuple[EpisodeOutcome, ...] | None:
-    """Outcomes of a batch from an interrupted run; None if there are none, or no usable ones."""
+def _kept(job: Job, folder: Path) -> Rollouts | None:
+    """Episodes of a batch from an interrupted run; None if there are none, or no usable ones."""
     try:
-        records = json.loads(job.part(folder).read_text(encoding="utf-8"))
-        outcomes = tuple(EpisodeOutcome(**record) for record in records)
-    except (OSError, ValueError, TypeError):
+        record = json.loads(job.part(folder).read_text(encoding="utf-8"))
+        outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
+        actions = tuple(record["actions"])
+        whole = [len(steps) for steps in actions] == [outcome.steps for outcome in outcomes]
+    except (OSError, ValueError, TypeError, LookupError):
         return None
-    return outcomes if [outcome.seed for outcome in outcomes] == list(job.batch.seeds) else None
+    return Rollouts(outcomes, actions) if whole and [o.seed for o in outcomes] == [*job.batch.seeds] else None
 
 
 def _write_log(config: EvaluationConfig, results: Results, seconds: float) -> None:

@@ -4,6 +4,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 from openvima import __version__
+from openvima.env.registration import ENVIRONMENT_VERSION
 
 _PACKAGES = ("numpy", "numba", "mujoco", "gymnasium")
 
@@ -17,7 +18,11 @@ def versions(*, with_torch: bool) -> dict[str, str]:
     Returns:
         Package name to version, without importing any of them.
     """
-    found = {"openvima": __version__, "python": platform.python_version()}
+    found = {
+        "openvima": __version__,
+        "environments": f"v{ENVIRONMENT_VERSION}",
+        "python": platform.python_version(),
+    }
     for package in (*_PACKAGES, *(("torch",) if with_torch else ())):
         try:
             found[package] = version(package)

@@ -1,0 +1,149 @@
+"""Recorded actions of an evaluation: `actions.arrow`, one record a step, from which outcomes are replayed."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from openvima.atomic_io import atomic_write
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import ActionError, DatasetError, OracleError
+from openvima.evaluation.results import Row
+from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
+from openvima.input_files import open_regular
+from openvima.scene import ACTION_SHAPES, Action
+
+ACTIONS_NAME = "actions.arrow"
+ACTION_WIDTH = sum(ACTION_SHAPES.values())  # 12 numbers, in the order of `ACTION_SHAPES`
+_SCHEMA = pa.schema([("seed", pa.int64()), ("action", pa.list_(pa.float32(), ACTION_WIDTH))])
+_MAX_BYTES = 1 << 28  # five million steps
+
+Steps = list[list[float]]  # the actions of one episode, each of ACTION_WIDTH float32 numbers
+
+
+class ActionRecorder:
+    """A rollout policy that records the valid actions of another."""
+
+    def __init__(self, policy: RolloutPolicy) -> None:
+        self._policy = policy
+        self.steps: list[Steps] = []  # of each episode
+
+    def begin(self, envs: Sequence[TabletopEnv]) -> None:
+        """Start a batch of episodes."""
+        self.steps = [[] for _ in envs]
+        self._policy.begin(envs)
+
+    def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
+        """Pass on the decisions, and record those that are actions."""
+        decisions = self._policy.decide(observations)
+        for steps, observation, decision in zip(self.steps, observations, decisions, strict=False):
+            if observation is not None and (numbers := _numbers(decision)):
+                steps.append(numbers)
+        return decisions
+
+    def near_ties(self) -> Sequence[bool]:
+        """Return those of the policy."""
+        return self._policy.near_ties()
+
+
+class ActionReplay:
+    """A rollout policy that replays recorded actions; where none is left it gives an `OracleError`."""
+
+    def __init__(self, actions: Sequence[np.ndarray]) -> None:
+        self._left = [iter(steps) for steps in actions]
+
+    def begin(self, envs: Sequence[TabletopEnv]) -> None:
+        """Start: nothing is read from the environments."""
+
+    def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
+        """Give the next recorded action of each episode that is not over."""
+        return [
+            None if observation is None else _action(next(steps, None))
+            for steps, observation in zip(self._left, observations, strict=True)
+        ]
+
+    def near_ties(self) -> Sequence[bool]:
+        """Return nothing: they depend on the policy's scores."""
+        return ()
+
+
+def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]]) -> str:
+    """Write seed and actions of all episodes, in the order of `results.json`.
+
+    Returns:
+        SHA-256 of the recorded numbers, as hexadecimal text.
+    """
+    records = [(seed, step) for seed, steps in episodes for step in steps]
+    seeds = np.array([seed for seed, _ in records], np.int64)
+    numbers = np.array([step for _, step in records], np.float32).reshape(-1, ACTION_WIDTH)
+    column = pa.FixedSizeListArray.from_arrays(pa.array(numbers.reshape(-1)), ACTION_WIDTH)
+    with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, _SCHEMA) as writer:
+        writer.write_table(pa.table([pa.array(seeds), column], schema=_SCHEMA))
+    return _digest(seeds, numbers)
+
+
+def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.ndarray]], str]:
+    """Read the actions of an evaluation.
+
+    Args:
+        folder: The folder of the evaluation.
+        rows: The rows of its `results.json`.
+
+    Returns:
+        For the index of each row the actions of its episodes, shape (steps, 12), float32; and the SHA-256 of
+        the recorded numbers.
+
+    Raises:
+        DatasetError: The file is missing, damaged, too large, or has steps of other episodes than the rows.
+    """
+    path = folder / ACTIONS_NAME
+    try:
+        with open_regular(path) as stream:
+            content = stream.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise DatasetError(f"{path} has more than {_MAX_BYTES} bytes, the most that is read.")
+        table = pa.ipc.open_file(content).read_all()
+        table.validate(full=True)
+        if not table.schema.equals(_SCHEMA) or any(column.null_count for column in table.columns):
+            raise ValueError("it has other columns")
+        seeds = table.column(0).to_numpy()
+        numbers = table.column(1).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    except FileNotFoundError:
+        raise DatasetError(
+            f"there is no {path}; evaluations of this version write it. Evaluate again with --force."
+        ) from None
+    except (pa.ArrowException, OSError, ValueError, TypeError, LookupError, MemoryError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path} is damaged ({str(error).splitlines()[0] or error!r}).") from None
+    numbers = numbers.reshape(-1, ACTION_WIDTH)
+    counts = [outcome.steps for row in rows for outcome in row.outcomes]
+    if len(numbers) != sum(counts) or min(counts, default=0) < 0:
+        raise DatasetError(f"{path} has {len(numbers)} steps, but results.json counts {sum(counts)}.")
+    if not np.array_equal(seeds, np.repeat([o.seed for row in rows for o in row.outcomes], counts)):
+        raise DatasetError(f"{path} has steps of other seeds than results.json.")
+    episodes = iter(np.split(numbers, np.cumsum(counts)[:-1]))
+    return {i: [next(episodes) for _ in row.outcomes] for i, row in enumerate(rows)}, _digest(seeds, numbers)
+
+
+def _numbers(decision: Decision) -> list[float]:
+    if decision is None or isinstance(decision, OracleError):
+        return []
+    try:
+        action = decision if isinstance(decision, Action) else Action.from_arrays(decision)
+    except ActionError:
+        return []
+    return np.concatenate(list(action.to_arrays().values())).tolist()
+
+
+def _action(numbers: np.ndarray | None) -> Decision:
+    if numbers is None:
+        return OracleError("no action is recorded")
+    parts = np.split(numbers, np.cumsum(list(ACTION_SHAPES.values()))[:-1])
+    return dict(zip(ACTION_SHAPES, parts, strict=True))
+
+
+def _digest(seeds: np.ndarray, numbers: np.ndarray) -> str:
+    return hashlib.sha256(seeds.astype("<i8").tobytes() + numbers.astype("<f4").tobytes()).hexdigest()

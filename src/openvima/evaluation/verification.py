@@ -1,0 +1,239 @@
+"""Verification of results: the recorded actions are played again, without the policy."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from openvima.atomic_io import atomic_write_file
+from openvima.env.config import EnvConfig
+from openvima.errors import DatasetError, OpenVimaError, echo
+from openvima.evaluation.actions import ActionReplay, read_actions
+from openvima.evaluation.config import EvaluationConfig, cells
+from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, Row
+from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, play
+from openvima.evaluation.runner import Report
+from openvima.evaluation.versions import versions
+from openvima.input_files import read_text
+from openvima.multiprocess import imap_unordered
+
+VERIFICATION_NAME = "verification.json"
+_MAX_BYTES = 1 << 28
+_SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
+_ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION)  # no action was executed; which one was given is not recorded
+_BATCH = 16  # episodes of one job
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedResults:
+    """What a verification found.
+
+    Args:
+        folder: Folder of the evaluation.
+        episodes: Episodes that were played again.
+        problems: What contradicts the file, one sentence each; empty if all is confirmed.
+        sha256: Digest that the file names.
+        declared: What replaying cannot prove.
+    """
+
+    folder: Path
+    episodes: int
+    problems: tuple[str, ...]
+    sha256: str
+    declared: str = DECLARED
+
+    @property
+    def is_verified(self) -> bool:
+        """Whether every outcome, count, seed and version is confirmed."""
+        return not self.problems
+
+    def record(self) -> dict[str, object]:
+        """Return the result as plain JSON values."""
+        return {**asdict(self), "folder": str(self.folder), "verified": self.is_verified}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Replay:
+    """Some episodes of a row, with their recorded actions."""
+
+    row: Row
+    first: int
+    outcomes: tuple[EpisodeOutcome, ...]
+    actions: list[np.ndarray]
+    env_config: EnvConfig
+
+
+def verify_results(
+    folder: Path, *, workers: int = 1, assets: str | None = None, report: Report | None = None
+) -> VerifiedResults:
+    """Confirm an evaluation from its recorded actions.
+
+    The digest, all counts and the list of episodes are checked first. Then every episode is sampled from its
+    seed and its actions are executed again, with neither policy nor images. If everything is confirmed,
+    `verification.json` beside the results says so.
+
+    Args:
+        folder: Folder with `results.json` and `actions.arrow`.
+        workers: Processes.
+        assets: Folder of the original asset pack, for results obtained with it.
+        report: Called with episodes done, episodes in all and a note.
+
+    Raises:
+        DatasetError: A file is missing, unreadable, or of an evaluation of other versions of the simulator.
+        ConfigError: `workers` is out of range, or there are no such assets.
+    """
+    path = folder / FILE_NAME
+    try:
+        text = read_text(path, max_bytes=_MAX_BYTES)
+    except FileNotFoundError:
+        raise DatasetError(f"there is no {path}; give the folder of an evaluation.") from None
+    results = Results.read(path)
+    digest = _digest_in(text)
+    try:
+        problems = [*_text_problems(text, results), *_row_problems(results)]
+        _check_simulator(path, results.versions)
+        env_config = _env_config(results, assets)
+        actions, sha256 = read_actions(folder, results.rows)
+    except (TypeError, AttributeError, KeyError, ValueError) as error:
+        if isinstance(error, OpenVimaError):
+            raise
+        raise DatasetError(f"{path} is damaged ({echo(repr(error))}).") from None
+    if sha256 != results.actions_sha256:
+        problems.append("the actions are not those that results.json was written with")
+    if not problems:
+        problems += _replay_all(results, actions, env_config, workers, report)
+    episodes = sum(row.episodes for row in results.rows)
+    found = VerifiedResults(folder, episodes, tuple(problems), digest)
+    if found.is_verified:
+        record = {"sha256": digest, "episodes": episodes, "versions": versions(with_torch=False)}
+        atomic_write_file(folder / VERIFICATION_NAME, json.dumps(record, indent=1) + "\n")
+    return found
+
+
+def is_marked_verified(folder: Path) -> bool:
+    """Whether `verify_results` has confirmed the results that are in a folder now."""
+    try:
+        record = json.loads(read_text(folder / VERIFICATION_NAME))
+        text = read_text(folder / FILE_NAME, max_bytes=_MAX_BYTES)
+        return bool(record["sha256"]) and record["sha256"] == _digest_in(text)
+    except (OSError, ValueError, TypeError, LookupError):
+        return False
+
+
+def _digest_in(text: str) -> str:
+    """The digest in a `results.json`; empty without one."""
+    found = json.loads(text).get("sha256", "")
+    return found if isinstance(found, str) else ""
+
+
+def _text_problems(text: str, results: Results) -> Iterator[str]:
+    """Compare the file with what its outcomes give: every count, mean, interval, and the digest."""
+    if text == results.to_json():
+        return
+    given, own = json.loads(text), json.loads(results.to_json())
+    differing = [key for key in own if given.get(key) != own[key] and key != "sha256"]
+    if differing:
+        yield f"{', '.join(differing)} do not follow from the outcomes"
+    else:
+        yield "the file was edited after it was written: its digest differs"
+
+
+def _row_problems(results: Results) -> Iterator[str]:
+    """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
+    config = results.config
+    whole = EvaluationConfig(
+        ("oracle",), (*config["tasks"],), (*config["levels"],), int(config["episodes"]), int(config["seed"])
+    )
+    expected = {(task, level) for task, level in cells(whole)}
+    seeds = list(range(whole.seed, whole.seed + whole.episodes))
+    played: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for row in results.rows:
+        played.setdefault((row.policy, row.ablation), []).append((row.task, row.level))
+        if [outcome.seed for outcome in row.outcomes] != seeds:
+            yield f"{_named(row)} has other seeds than {seeds[0]} to {seeds[-1]}"
+    for (policy, ablation), found in played.items():
+        if len(found) != len(expected) or set(found) != expected:
+            yield f"{echo(policy)} {echo(ablation)} has other tasks and levels than the settings"
+    named = {policy for policy, ablation in played if not ablation}
+    if named != set(config["policies"]) or named != set(results.policies):
+        yield "the policies of the rows are not those of the settings"
+
+
+def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
+    own = versions(with_torch=False)
+    for name in _SIMULATOR:
+        if found.get(name) != own[name]:
+            raise DatasetError(
+                f"{path} was obtained with {name} {echo(str(found.get(name)))}; here is {own[name]}. "
+                "Outcomes are confirmed with the same version only."
+            )
+
+
+def _env_config(results: Results, assets: str | None) -> EnvConfig:
+    """Settings of the environments; assets are recorded without their path."""
+    known = {field.name for field in fields(EnvConfig)}
+    given = {name: value for name, value in results.config.items() if name in known}
+    if assets is not None:
+        given["assets"] = assets
+    return EnvConfig(**given)
+
+
+def _replay_all(
+    results: Results,
+    actions: Mapping[int, Sequence[np.ndarray]],
+    env_config: EnvConfig,
+    workers: int,
+    report: Report | None,
+) -> list[str]:
+    jobs = [
+        _Replay(
+            row,
+            first,
+            row.outcomes[first : first + _BATCH],
+            list(actions[index][first : first + _BATCH]),
+            env_config,
+        )
+        for index, row in enumerate(results.rows)
+        for first in range(0, row.episodes, _BATCH)
+    ]
+    total = sum(row.episodes for row in results.rows)
+    watch = None if report is None else (lambda done: report(done, total, "replaying"))
+    problems: dict[tuple[int, int], list[str]] = {}
+    places = {id(job): place for place, job in enumerate(jobs)}
+    for job, found in imap_unordered(replay_episodes, jobs, workers, report=watch):
+        problems[places[id(job)], job.first] = found
+    return [problem for place in sorted(problems) for problem in problems[place]]
+
+
+def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:
+    """Execute the actions of some episodes in a worker process; return what differs."""
+    row = job.row
+    envs = [job.env_config.make(row.task, row.level, domain="eval") for _ in job.outcomes]
+    for env in envs:
+        env.modalities = ("joints",)  # nothing is rendered
+    seeds = [outcome.seed for outcome in job.outcomes]
+    again = play(envs, seeds, ActionReplay(job.actions))
+    count(len(again))
+    return [
+        f"{_named(row)}, seed {given.seed}: {_difference(given, own)}"
+        for given, own in zip(job.outcomes, again, strict=True)
+        if _difference(given, own)
+    ]
+
+
+def _difference(given: EpisodeOutcome, own: EpisodeOutcome) -> str:
+    """Name what differs between a recorded and a replayed outcome."""
+    if own.kind == NO_ORACLE_ACTION and given.kind in _ENDED_EARLY:
+        own = replace(own, kind=given.kind, reason=given.reason)
+    own = replace(own, near_ties=given.near_ties)
+    names = [field.name for field in fields(own) if getattr(own, field.name) != getattr(given, field.name)]
+    return ", ".join(
+        f"{name} is {echo(str(getattr(given, name)))}, replayed {getattr(own, name)}" for name in names
+    )
+
+
+def _named(row: Row) -> str:
+    ablation = f" ({row.ablation})" if row.ablation else ""
+    return echo(f"{row.policy}{ablation}, {row.task}, {row.level}")

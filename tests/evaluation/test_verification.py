@@ -1,0 +1,114 @@
+"""Verification of results: replayed outcomes, and forgeries that are found."""
+
+import json
+import random
+import shutil
+
+import numpy as np
+import pytest
+
+from forge_results import KINDS, forge, is_found
+from openvima.env import EnvConfig
+from openvima.errors import DatasetError
+from openvima.evaluation import EvaluationConfig, Results, evaluate
+from openvima.evaluation.actions import ACTIONS_NAME, ActionRecorder, ActionReplay
+from openvima.evaluation.rollout import BAD_ACTION, play
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
+from openvima.evaluation.verification import VERIFICATION_NAME, is_marked_verified, verify_results
+from openvima.scene import Action
+
+TASKS = ("rotate", "sweep_without_exceeding")
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    """Oracle and random policy on two tasks."""
+    out = tmp_path_factory.mktemp("evaluation")
+    evaluate(EvaluationConfig(("oracle", "random"), TASKS, ("L1",), episodes=2, seed=60, batch=1, out=out))
+    return out
+
+
+@pytest.fixture
+def copy(evaluation, tmp_path):
+    return shutil.copytree(evaluation, tmp_path / "copy")
+
+
+def test_every_outcome_is_confirmed_and_marked(copy):
+    assert not is_marked_verified(copy)
+    found = verify_results(copy)
+    assert (found.problems, found.episodes) == ((), 8)
+    assert is_marked_verified(copy)
+    assert json.loads((copy / VERIFICATION_NAME).read_text())["sha256"] == found.sha256
+
+
+def test_the_mark_belongs_to_the_results_that_were_confirmed(copy):
+    verify_results(copy)
+    path = copy / "results.json"
+    path.write_text(path.read_text().replace(json.loads(path.read_text())["sha256"], "0" * 64))
+    assert not is_marked_verified(copy)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_forgeries_are_found(copy, evaluation, kind):
+    rng = random.Random(kind)
+    for _ in range(6):
+        shutil.copy(evaluation / "results.json", copy)
+        forge(copy, kind, rng)
+        assert is_found(copy)
+    assert not (copy / VERIFICATION_NAME).exists()
+
+
+def test_a_left_out_task_is_found(copy):
+    path = copy / "results.json"
+    results = Results.read(path)
+    kept = tuple(row for row in results.rows if (row.policy, row.task) != ("random", "rotate"))
+    fewer = Results(kept, results.config, results.versions, results.policies, results.actions_sha256)
+    path.write_text(fewer.to_json())
+    with pytest.raises(DatasetError, match="steps, but results"):
+        verify_results(copy)
+
+
+def test_exchanged_actions_are_found(copy):
+    path = copy / ACTIONS_NAME
+    content = bytearray(path.read_bytes())
+    spot = content.find(np.float32(np.sqrt(0.5)).tobytes())
+    place = spot if spot > 0 else len(content) // 2
+    content[place : place + 4] = np.float32(0.25).tobytes()
+    path.write_bytes(content)
+    assert is_found(copy)
+
+
+def test_without_actions_nothing_is_confirmed(copy):
+    (copy / ACTIONS_NAME).unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*actions\.arrow"):
+        verify_results(copy)
+
+
+def test_damaged_actions_are_refused(copy):
+    path = copy / ACTIONS_NAME
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DatasetError, match="damaged"):
+        verify_results(copy)
+
+
+class OnceRight:
+    """Acts validly in the first step and not afterwards."""
+
+    def reset(self, prompts):
+        self.steps = 0
+
+    def act(self, observations):
+        self.steps += 1
+        action = Action.planar((0.5, 0.0), (0.5, 0.0)).to_arrays()
+        if self.steps > 1:
+            action["pose1_position"] += 9
+        return [None if observation is None else action for observation in observations]
+
+
+def test_an_episode_that_an_invalid_action_ends_is_replayed_up_to_it():
+    recorder = ActionRecorder(PromptedRolloutPolicy(OnceRight()))
+    (outcome,) = play([EnvConfig().make("rotate", "L1", domain="eval")], [3], recorder)
+    assert (outcome.kind, outcome.steps, len(recorder.steps[0])) == (BAD_ACTION, 1, 1)
+    env = EnvConfig().make("rotate", "L1", domain="eval")
+    (again,) = play([env], [3], ActionReplay([np.array(steps, np.float32) for steps in recorder.steps]))
+    assert (again.success, again.steps) == (False, 1)
