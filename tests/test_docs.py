@@ -123,7 +123,7 @@ def options() -> dict[tuple[str, ...], frozenset[str]]:
     """Map each verb, with its object if it has some, to the options that its help lists."""
     found = {}
     for verb in VERBS:
-        objects = getattr(importlib.import_module(f"openvima.cli.{verb}"), "COMMANDS", {})
+        objects = getattr(importlib.import_module(f"openvima.cli.{verb.replace('-', '_')}"), "COMMANDS", {})
         for path in [(verb, name) for name in objects] or [(verb,)]:
             output = io.StringIO()
             with contextlib.redirect_stdout(output), contextlib.suppress(SystemExit):

@@ -97,6 +97,7 @@ def test_an_evaluation_leaves_results_videos_and_a_report(tmp_path):
     path = evaluate_and_report(config, progress=lambda done, total, note: notes.append(note))
     folder = path.parent
     assert sorted(file.name for file in folder.iterdir()) == [
+        "actions.arrow",
         "evaluation_log.json",
         "report.html",
         "results.json",
