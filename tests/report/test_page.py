@@ -14,6 +14,7 @@ from openvima.report import write_report
 from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
 from openvima.report.page import default_command
+from openvima.report.published import published_tasks
 from openvima.video.clips import load_clips, save_clips
 
 
@@ -238,13 +239,27 @@ def test_ablations_stand_beside_the_score_with_what_they_change(results, tmp_pat
     assert not section(plain, "ablations")
 
 
-def test_published_means_are_marked_and_said_to_rest_on_more_tasks(text):
+def rows_of_all_tasks(results, level):
+    """Rows as if a policy had been evaluated on all tasks of a level."""
+    return tuple(replace(results.rows[0], task=task, level=level) for task in published_tasks(level))
+
+
+def test_published_means_are_those_of_the_same_tasks(text, results, tmp_path):
     published = section(text, "published")
-    assert "those of this evaluation on 1 of 13 tasks at L1, 1 of 12 tasks at L3" in published
+    assert "same tasks: 1 of 13 at L1, 1 of 12 at L3." in published
     assert "not measured here" in published and "read off figures" in published
     rows = {row[0].split()[0]: row for row in Page(published).tables[0][1:]}
+    assert [cell.strip() for cell in rows["VIMA"][1:]] == ["–", "100.0"]  # a task of one's own; rotate alone
+    assert "MIDAS" not in rows  # its rates by task were not published
+
+    whole = replace(results, rows=rows_of_all_tasks(results, "L1"))
+    page = section(write_report(whole, tmp_path / "whole.html").read_text("utf-8"), "published")
+    rows = {row[0].split()[0]: row for row in Page(page).tables[0][1:]}
+    assert "over the same tasks." in page
+    assert rows["VIMA"][1].strip() == "81.5"
     assert rows["MIDAS"][1].strip() == "91.6"  # the last of that name: without pretraining
-    assert "2 of 13 tasks" in rows["mine"][1]
+    text = write_report(whole, tmp_path / "bare.html", with_published=False).read_text("utf-8")
+    assert "VIMA 200M" not in text and "published" not in section(text, "results")
 
 
 def test_levels_of_ones_own_have_no_published_section(results, tmp_path):

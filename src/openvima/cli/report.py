@@ -28,6 +28,7 @@ def main(
     metrics: Path | None = None,
     markdown: bool = False,
     latex: bool = False,
+    published: bool = True,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Write the report of one or several evaluations, as one HTML file that needs nothing else.
@@ -47,6 +48,7 @@ def main(
         metrics: The same for a single metrics.jsonl.
         markdown: Print tables in Markdown for a paper.
         latex: Print tables in LaTeX for a paper; they need the package booktabs.
+        published: Whether to show published numbers of the same tasks beside those measured.
         as_json: Print the comparisons as JSON.
 
     Returns:
@@ -66,7 +68,7 @@ def main(
     pairs = _pairs(compare) if compare is not None else default_pairs(found)
     comparisons = compare_pairs(found, pairs)
     suffix = out.suffix.lower() if out else ""
-    tables = paper_tables(found, comparisons)
+    tables = paper_tables(found, comparisons, published=published)
     if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
         atomic_write_file(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
         print(f"Tables: {out}")
@@ -85,7 +87,7 @@ def main(
                 print(finding(comparison, difference), file=said)
     if out is not None or not prints:
         records = [*runs, *([metrics] if metrics else [])]
-        path = _page(evaluations, merged, comparisons, out or _default_out(evaluations), records)
+        path = _page(evaluations, merged, comparisons, out or _default_out(evaluations), records, published)
         print(f"Report: {path}", file=said)
     return 0
 
@@ -132,6 +134,7 @@ def _page(
     comparisons: "Sequence[Comparison]",
     out: Path,
     records: Sequence[Path],
+    published: bool,
 ) -> Path:
     from openvima.report import write_report
     from openvima.report.assets import require_extra
@@ -146,6 +149,7 @@ def _page(
         clips=_clips(evaluations, merged),
         comparisons=comparisons,
         notes=merged.notes,
+        with_published=published,
     )
 
 

@@ -19,8 +19,8 @@ _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
     *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_description),
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
-    *(published.published_tasks, published.published_rate, published.published_coverage),
-    *(published.leading_models, published.published_models),
+    *(published.published_rate, published.published_coverage, published.published_rows),
+    published.leading_models,
 )
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
@@ -44,6 +44,7 @@ def write_report(
     clips: Sequence[Clip] = (),
     comparisons: Sequence[Comparison] | None = None,
     notes: Sequence[str] = (),
+    with_published: bool = True,
 ) -> Path:
     """Write the report of an evaluation.
 
@@ -56,6 +57,7 @@ def write_report(
         clips: Recorded episodes.
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
+        with_published: Whether to show published numbers of the same tasks.
 
     Returns:
         The file.
@@ -72,7 +74,8 @@ def write_report(
         **{function.__name__: function for function in _FUNCTIONS},
         level_names=text.LEVEL_NAMES,
         level_meanings=text.LEVEL_MEANINGS,
-        published_column=any(published.published_tasks(row.level).get(row.task) for row in results.rows),
+        published_column=with_published
+        and any(published.published_tasks(row.level).get(row.task) for row in results.rows),
         published_model=" ".join(published.BESIDE),
         reliability=published.RELIABILITY,
         results=results,
@@ -85,7 +88,9 @@ def write_report(
         clips=clips,
         comparisons=comparisons,
         ablations=ablated_policies(results),
-        published_levels=[level for level in results.levels() if published.published_tasks(level)],
+        published_results=published.published_rows(results, published.published_models())
+        if with_published
+        else [],
         training_charts=read_run_charts(records) if records else [],
         command=command or default_command(results),
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
-from openvima.report.published import leading_models, published_tasks
+from openvima.report.published import leading_models, published_coverage, published_rows
 from openvima.report.text import ablation_name, counted
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
@@ -74,8 +74,16 @@ class Table:
     lines: tuple[Line, ...]
 
 
-def paper_tables(results: Results, comparisons: Sequence[Comparison] = ()) -> list[Table]:
-    """Choose what a paper would print: level means, tasks by level of each policy, ablations, differences."""
+def paper_tables(
+    results: Results, comparisons: Sequence[Comparison] = (), *, published: bool = True
+) -> list[Table]:
+    """Choose what a paper would print: level means, tasks by level of each policy, ablations, differences.
+
+    Args:
+        results: The evaluation.
+        comparisons: Policies to compare.
+        published: Whether to add published level means, over the same tasks.
+    """
     means = results.means()
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
     with_ablations = [
@@ -83,7 +91,8 @@ def paper_tables(results: Results, comparisons: Sequence[Comparison] = ()) -> li
         for policy in results.policy_names()
         if any(row.policy == policy and row.ablation for row in results.rows)
     ]
-    return [_mean_table(results, means), *by_policy, *with_ablations, *map(_difference_table, comparisons)]
+    first = _mean_table(results, means, published=published)
+    return [first, *by_policy, *with_ablations, *map(_difference_table, comparisons)]
 
 
 def markdown(tables: Sequence[Table]) -> str:
@@ -107,7 +116,7 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX_TEXT.get(letter, letter) for letter in text)
 
 
-def _mean_table(results: Results, means: _Means) -> Table:
+def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
     levels = results.levels()
     lines = [
         Line(
@@ -121,14 +130,14 @@ def _mean_table(results: Results, means: _Means) -> Table:
         f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
         f"{_made_of(results)}"
     )
-    if any(published_tasks(level) for level in levels):
-        for number, model in enumerate(leading_models()):
-            cells = tuple(model.written(level).replace("*", "") for level in levels)
-            lines.append(Line(f"{model.name} (published)", cells, starts_group=number == 0))
+    elsewhere = published_rows(results, leading_models(), keep_marks=False) if published else []
+    if elsewhere:
+        for number, (name, cells) in enumerate(elsewhere):
+            lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))
         caption += (
             " Rows marked “published” were not measured here: they are those of the VIMA and MIDAS papers, "
-            "over all tasks of a level, in another simulator, and mostly read off figures, to about "
-            "0.2 points, those with ~ to about 0.5."
+            f"in another simulator. {published_coverage(results)} Means over all tasks of a level are mostly "
+            "read off figures, to about 0.2 points, those with ~ to about 0.5."
         )
     return Table("levels", caption, ("policy", *levels), tuple(lines))
 

@@ -46,12 +46,12 @@ class PublishedModel:
         fraction = "" if self.data_fraction == 1 else f", {100 * self.data_fraction:g} % of the data"
         return f"{self.model} {self.size}{fraction}"
 
-    def written(self, level: str) -> str:
-        """The rate at a level with its mark, as explained in `RELIABILITY`; a dash where there is none."""
-        if level not in self.levels:
-            return "–"
+    def written(self, level: str, rate: float, keep_marks: bool = True) -> str:
+        """Write a rate (%), with the marks that `RELIABILITY` explains if it is that of the level."""
+        if rate != self.levels.get(level):
+            return f"{rate:.1f}"
         mark = "~" if level in self.rough else ""
-        return f"{mark}{self.levels[level]:.1f}{'*' if self.printed else ''}"
+        return f"{mark}{rate:.1f}{'*' if self.printed and keep_marks else ''}"
 
 
 @cache
@@ -74,23 +74,55 @@ def published_tasks(level: str) -> Mapping[str, float]:
     return {}
 
 
-def published_rate(level: str, tasks: Sequence[str]) -> float | None:
-    """Mean rate (%) of VIMA 200M over tasks of a level; None unless it was published for all of them."""
+def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | None = None) -> float | None:
+    """Mean rate (%) of a model, by default VIMA 200M, over tasks of a level; None if it was not published.
+
+    Over all tasks it is the published mean of the level.
+    """
+    model = model or next(m for m in published_models() if (m.model, m.size, m.data_fraction) == (*BESIDE, 1))
     rates = published_tasks(level)
-    return sum(rates[task] for task in tasks) / len(tasks) if rates.keys() >= set(tasks) else None
+    if rates and rates.keys() == set(tasks):
+        return model.levels.get(level)
+    by_task = (model.model, model.size, model.data_fraction) == (*BESIDE, 1)
+    known = by_task and tasks and rates.keys() >= set(tasks)
+    return sum(rates[task] for task in tasks) / len(tasks) if known else None
+
+
+def published_rows(
+    results: Results, models: Sequence[PublishedModel], *, keep_marks: bool = True
+) -> list[tuple[str, tuple[str, ...]]]:
+    """Name of each model, and its mean at each level over the tasks that were evaluated there.
+
+    Args:
+        results: The evaluation to compare with.
+        models: Models; those without any number are left out.
+        keep_marks: Whether to mark numbers that the authors printed.
+    """
+    rows = []
+    for model in models:
+        rates = ((level, published_rate(level, results.tasks(level), model)) for level in results.levels())
+        means = tuple(
+            "–" if rate is None else model.written(level, rate, keep_marks) for level, rate in rates
+        )
+        if set(means) != {"–"}:
+            rows.append((model.name, means))
+    return rows
 
 
 def published_coverage(results: Results) -> str:
-    """Say on how many of a level's tasks our means rest, where it is not all."""
+    """Say on how many of a level's tasks the means rest, where it is not all."""
+    tasks = {level: results.tasks(level) for level in results.levels() if published_tasks(level)}
     partial = [
-        f"{len(set(results.tasks(level)) & published_tasks(level).keys())} of {len(published_tasks(level))} "
-        f"tasks at {level}"
-        for level in results.levels()
-        if published_tasks(level).keys() - set(results.tasks(level))
+        f"{len(set(own) & published_tasks(level).keys())} of {len(published_tasks(level))} at {level}"
+        for level, own in tasks.items()
+        if published_tasks(level).keys() != set(own)
     ]
     if not partial:
-        return "Published means rest on the same tasks."
-    return f"Published means rest on all tasks, those of this evaluation on {', '.join(partial)}."
+        return "Published means are over the same tasks."
+    return (
+        f"Published means are over the same tasks: {', '.join(partial)}. There, only the rates of "
+        f"{' '.join(BESIDE)} were published by task."
+    )
 
 
 @cache
