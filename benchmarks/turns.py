@@ -1,10 +1,14 @@
 """How much faster this commit is than another: both do the same work in turns, each in a process of its own.
 
     python benchmarks/turns.py --base CHECKOUT [--base-python PYTHON] [--seeds N] [--repeats N] [--json FILE]
+    python benchmarks/turns.py --base CHECKOUT --data DIR [--repeats N] [--json FILE]
 
 CHECKOUT is another work tree of the repository, PYTHON an interpreter with its dependencies.
 `sim`: an oracle episode of a task with all images; `decisions`: prompt and observations of such an episode,
 given to `openvima-small`.
+With a folder of demonstrations: `batches`, all of its object cache as padded batches of 128 with images, and
+`batches_without_images`; `writing`, a shard of its first 100 demonstrations; `opening`, the first episodes of
+up to 100 shards, the index read before; `reading`, the next ones of the same shards.
 After every piece of work of one process comes the same piece in the other, so that the load of the machine
 hits both. Times are CPU time, the shortest of all repeats of a piece; ratios are time before over time now,
 above 1 if this commit is faster.
@@ -16,6 +20,7 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from openvima.atomic_io import atomic_write_file
@@ -24,6 +29,8 @@ from sim import FIRST_SEED, circumstances
 
 ROOT = Path(__file__).parents[1]
 NUM_WARM_UP = 2
+
+Ratios = dict[str, dict[str, float]]
 
 # Runs in both checkouts; the function that plays the oracle has had two names.
 WORKER = """
@@ -52,14 +59,71 @@ for line in sys.stdin:
     print(time.process_time() - start, flush=True)
 """
 
+# Likewise, for what is done with demonstrations.
+DATA_WORKER = """
+import sys, tempfile, time
+from pathlib import Path
+import pyarrow as pa
+import torch
+from openvima.data import Dataset, ShardWriter
+from openvima.data.batching import BatchOrder
+from openvima.data.object_cache.cache import open_object_cache
+from openvima.policies.processor import Processor
+torch.set_num_threads(1)
+pa.set_cpu_count(1)
+folder = sys.argv[1]
+dataset = Dataset(folder)
+cache, processor = open_object_cache(dataset), Processor("objects")
+order = BatchOrder(len(cache), batch=128, lengths=cache.lengths(), drop_last=False)
+batches = [order.rows(number) for number in range(order.batches_per_epoch)]
+demos = [dataset[row] for row in range(min(100, len(dataset)))]
+info = dataset.shard(dataset.shard_names()[0]).info
+rows = {}
+for row in range(len(dataset)):
+    rows.setdefault(dataset.locate(row)[0], []).append(row)
+rows = [both[:2] for both in rows.values() if len(both) > 1][:100]
+columns = ["rgb_front", "rgb_top", "segm_front", "segm_top", "prompt", "pose0_position", "pose1_position"]
+
+def read_batch(indices, images):
+    episodes = cache.batch(indices)
+    made = processor.collate(episodes)
+    return len((made.with_images(episodes.images, episodes.num_images) if images else made).targets.steps_BT)
+
+for line in sys.stdin:
+    kind = line.strip()
+    if kind in ("opening", "reading"):
+        dataset = Dataset(folder)
+    if kind == "reading":
+        for first, _ in rows:
+            dataset.read(first, columns)
+    with tempfile.TemporaryDirectory() as target:
+        start = time.process_time()
+        if kind.startswith("batches"):
+            for indices in batches:
+                read_batch(indices, kind == "batches")
+        elif kind == "writing":
+            with ShardWriter(Path(target) / "demos.arrow", info) as writer:
+                for demo in demos:
+                    writer.write(demo)
+        else:
+            for both in rows:
+                dataset.read(both[kind == "reading"], columns)
+        print(time.process_time() - start, flush=True)
+"""
+DATA_KINDS = ("batches", "batches_without_images", "writing", "opening", "reading")
+
 
 class Checkout:
     """A process that does pieces of work with the code of a checkout."""
 
-    def __init__(self, python: str, root: Path) -> None:
+    def __init__(self, python: str, root: Path, worker: str, *arguments: str) -> None:
         environment = os.environ | {"PYTHONPATH": str(root / "src"), "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
-            [python, "-c", WORKER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+            [python, "-c", worker, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
         )
 
     def seconds(self, piece: str) -> float:
@@ -69,17 +133,45 @@ class Checkout:
         return float(self._process.stdout.readline())
 
 
-def ratio(pair: tuple[Checkout, Checkout], kind: str, task: str, seeds: range, repeats: int) -> float:
+def ratio(pair: tuple[Checkout, Checkout], pieces: Sequence[str], repeats: int) -> float:
     """Return the time of the first checkout over that of the second."""
-    best = [[math.inf, math.inf] for _ in seeds]
+    best = [[math.inf, math.inf] for _ in pieces]
     for _ in range(NUM_WARM_UP):
         for checkout in pair:
-            checkout.seconds(f"{kind} {task} {seeds[0]}")
+            checkout.seconds(pieces[0])
     for _ in range(repeats):
-        for seed, times in zip(seeds, best, strict=True):
+        for piece, times in zip(pieces, best, strict=True):
             for side, checkout in enumerate(pair):
-                times[side] = min(times[side], checkout.seconds(f"{kind} {task} {seed}"))
+                times[side] = min(times[side], checkout.seconds(piece))
     return sum(base for base, _ in best) / sum(own for _, own in best)
+
+
+def data_ratios(pythons: tuple[str, str], roots: tuple[Path, Path], folder: Path, repeats: int) -> Ratios:
+    """Compare what is done with a folder of demonstrations."""
+    first, second = (
+        Checkout(python, root, DATA_WORKER, str(folder)) for python, root in zip(pythons, roots, strict=True)
+    )
+    ratios = {}
+    for kind in DATA_KINDS:
+        ratios[kind] = round(ratio((first, second), [kind], repeats), 3)
+        print(f"{kind:28}{ratios[kind]:.2f}", flush=True)
+    return {"data": ratios}
+
+
+def task_ratios(
+    pythons: tuple[str, str], roots: tuple[Path, Path], tasks: Sequence[str], seeds: range, repeats: int
+) -> Ratios:
+    """Compare simulation and decisions, task by task."""
+    first, second = (Checkout(python, root, WORKER) for python, root in zip(pythons, roots, strict=True))
+    found: Ratios = {"sim": {}, "decisions": {}}
+    for task in tasks:
+        for kind, ratios in found.items():
+            pieces = [f"{kind} {task} {seed}" for seed in seeds]
+            ratios[task] = round(ratio((first, second), pieces, repeats), 3)
+        print(
+            f"{task:28}  sim {found['sim'][task]:.2f}  decisions {found['decisions'][task]:.2f}", flush=True
+        )
+    return found
 
 
 def main() -> None:
@@ -92,19 +184,19 @@ def main() -> None:
     parser.add_argument("--tasks", default="all", help="names with commas between them, or 'all'")
     parser.add_argument("--seeds", type=int, default=6, help="episodes of a task")
     parser.add_argument("--repeats", type=int, default=5, help="of each piece of work")
+    parser.add_argument("--data", type=Path, help="folder of demonstrations: compare data, not tasks")
     parser.add_argument("--json", type=Path, help="file to write")
     given = parser.parse_args()
     tasks = list_tasks() if given.tasks == "all" else given.tasks.split(",")
     seeds = range(FIRST_SEED, FIRST_SEED + given.seeds)
-    pair = Checkout(given.base_python, given.base.resolve()), Checkout(sys.executable, ROOT)
-    found: dict[str, dict[str, float]] = {"sim": {}, "decisions": {}}
-    for task in tasks:
-        for kind, ratios in found.items():
-            ratios[task] = round(ratio(pair, kind, task, seeds, given.repeats), 3)
-        print(
-            f"{task:28}  sim {found['sim'][task]:.2f}  decisions {found['decisions'][task]:.2f}", flush=True
-        )
-    means = {kind: round(math.prod(r.values()) ** (1 / len(tasks)), 3) for kind, r in found.items()}
+    pythons, roots = (given.base_python, sys.executable), (given.base.resolve(), ROOT)
+    if given.data:
+        found = data_ratios(pythons, roots, given.data.resolve(), given.repeats)
+    else:
+        found = task_ratios(pythons, roots, tasks, seeds, given.repeats)
+    means = {
+        kind: round(math.prod(r.values()) ** (1 / len(r)), 3) for kind, r in found.items() if kind != "data"
+    }
     print(f"{'geometric mean':28}", *(f"{kind} {mean:.2f}" for kind, mean in means.items()))
     if given.json:
         base = subprocess.run(

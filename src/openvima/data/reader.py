@@ -91,6 +91,12 @@ class Dataset:
         """Return the shard's file name and the row in it where an episode is."""
         return self._names[self._name_of[episode_index]], int(self._rows[episode_index])
 
+    def locations(self, indices: Sequence[int] | np.ndarray) -> list[tuple[str, int]]:
+        """Return where several episodes are, as `locate` does."""
+        rows = np.asarray(indices, np.int64)
+        names = [self._names[number] for number in self._name_of[rows].tolist()]
+        return list(zip(names, self._rows[rows].tolist(), strict=True))
+
     def shard_names(self) -> list[str]:
         """Return the file names of all shards that hold episodes of this data set."""
         return list(self._names)

@@ -7,14 +7,33 @@ Shape suffixes: B batch, T steps, L prompt positions, S objects in all prompts, 
 observation.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.tensor_record import TensorRecord
+
+
+@runtime_checkable
+class StoredImages(Protocol):
+    """Images of several demonstrations in files, which can be read straight into a stack."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of an image."""
+
+    def read_first(self, counts: Sequence[int], stack: np.ndarray) -> None:
+        """Copy images, one demonstration after the other.
+
+        Args:
+            counts: How many of the first images of each demonstration.
+            stack: Where to, exactly as many, (K, 3, height, width), uint8, contiguous.
+        """
+
 
 WORD = -1  # object index at a position that holds a word
 
@@ -122,6 +141,11 @@ class Batch(TensorRecord):
         first, last = numbers[starts], numbers[ends]  # of the new numbers, the first excluded
         # Those in use come first, unless augmentation left some out: then a copy of contiguous bytes will do.
         is_prefix = numbers[starts + last - first] == last
+        if isinstance(images, StoredImages) and is_prefix.all():
+            stack = _empty_stack(numbers[-1] + 1, images.shape)
+            stack[0] = 0
+            images.read_first((last - first).tolist(), stack[1:])
+            return self._renumbered(numbers, stack)
         columns = (starts, ends, first, last, is_prefix)
         stack = np.zeros((0, 0, 0, 0), np.uint8)
         for each, (start, end, before, after, prefix) in zip(
@@ -132,10 +156,17 @@ class Batch(TensorRecord):
                 stack[0] = 0
             used = each[: after - before] if prefix else each[is_used[start + 1 : end + 1]]
             stack[before + 1 : after + 1] = used
+        return self._renumbered(numbers, stack)
+
+    def _renumbered(self, numbers: np.ndarray, stack: np.ndarray) -> "Batch":
+        """Return the batch with an image stack; `numbers` are the new numbers of all images."""
+        prompts, history = self.prompts, self.history
         return replace(
             self,
-            prompts=replace(self.prompts, crop_index_VS=torch.from_numpy(numbers[prompt_index.numpy()])),
-            history=replace(self.history, crop_index_BTVN=torch.from_numpy(numbers[history_index.numpy()])),
+            prompts=replace(prompts, crop_index_VS=torch.from_numpy(numbers[prompts.crop_index_VS.numpy()])),
+            history=replace(
+                history, crop_index_BTVN=torch.from_numpy(numbers[history.crop_index_BTVN.numpy()])
+            ),
             images=torch.from_numpy(stack),
         )
 

@@ -25,11 +25,23 @@ def table_point(camera, column, row, point):
 
 
 @njit(cache=True)
-def table_points(cameras, pixels, points):
-    """Fill `points` (N, 2, 2) with those under `pixels` (N, 2, 2), one per view; cameras (2, 4, 4)."""
-    for k in range(len(pixels)):
+def pad_false_positives(
+    cameras, have_points, place, offsets, crop_index, boxes, new_index, new_boxes, points
+):
+    """Move the false detections of each step to its place in padded arrays, which are zero.
+
+    Per step (S,): `place`, `offsets` of its images, `crop_index` (S, 2), `boxes` (S, 2, 4). To fill, for P
+    places: `new_index` (P, 2), `new_boxes` (P, 2, 4), and `points` (P, 2, 2) if there are any.
+    """
+    for step in range(len(place)):
+        p = place[step]
         for view in range(2):
-            table_point(cameras[view], pixels[k, view, 0], pixels[k, view, 1], points[k, view])
+            index = crop_index[step, view]
+            new_index[p, view] = index + offsets[step] if index > 0 else 0
+            for k in range(4):
+                new_boxes[p, view, k] = boxes[step, view, k]
+            if have_points:
+                table_point(cameras[view], boxes[step, view, 0], boxes[step, view, 1], points[p, view])
 
 
 @njit(cache=True)
@@ -76,21 +88,40 @@ def pad_history(
 
 
 @njit(cache=True)
-def stack_prompt_objects(cameras, offsets, crop_index, boxes, new_index, new_boxes, masks, points):
+def pad_prompts(lengths, first, num_objects, tokens, is_valid, words, objects, mask):
+    """Pad the tokens of prompts, and number their objects across the batch.
+
+    Per prompt (B,): number of tokens `lengths`, `first` of its objects, of which there are `num_objects` in
+    all. Per token: `tokens` (W, 3), word, row of its object or -1, and part of that; `is_valid` (W,). Fills
+    the beginning of each row of `words`, `objects` and `mask`, (B, L).
+    """
+    row = 0
+    for b in range(len(lengths)):
+        for position in range(lengths[b]):
+            words[b, position] = tokens[row, 0]
+            if tokens[row, 1] >= 0:
+                objects[b, position] = tokens[row, 1] + tokens[row, 2] * num_objects + first[b]
+            mask[b, position] = is_valid[row]
+            row += 1
+
+
+@njit(cache=True)
+def stack_prompt_objects(cameras, offsets, rows, crop_index, boxes, new_index, new_boxes, masks, points):
     """Put the views of the objects of prompts first.
 
-    Given `offsets` (S,), `crop_index` (S, 2) and `boxes` (S, 2, 4), fills `new_index` and `masks` (2, S),
-    `new_boxes` (2, S, 4) and `points` (S, 2).
+    Given `offsets` and `rows` (S,), those of `crop_index` (R, 2) and `boxes` (R, 2, 4) that are asked for,
+    fills `new_index` and `masks` (2, S), `new_boxes` (2, S, 4) and `points` (S, 2).
     """
-    for row in range(len(crop_index)):
+    for k in range(len(rows)):
+        row = rows[k]
         for view in range(2):
             index = crop_index[row, view]
-            new_index[view, row] = index + offsets[row] if index > 0 else 0
-            masks[view, row] = index > 0
-            for k in range(4):
-                new_boxes[view, row, k] = boxes[row, view, k]
+            new_index[view, k] = index + offsets[k] if index > 0 else 0
+            masks[view, k] = index > 0
+            for n in range(4):
+                new_boxes[view, k, n] = boxes[row, view, n]
         view = 1 if crop_index[row, 1] > 0 else 0
-        table_point(cameras[view], boxes[row, view, 0], boxes[row, view, 1], points[row])
+        table_point(cameras[view], boxes[row, view, 0], boxes[row, view, 1], points[k])
 
 
 @njit(cache=True)

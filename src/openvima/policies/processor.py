@@ -24,13 +24,19 @@ from openvima.perception.preprocessing import (
     ObjectTable,
     PreprocessedPrompts,
     extract_observation,
-    offset_index,
     preprocess_prompt,
     split_prompt,
 )
 from openvima.policies.batch import WORD, Batch, FalsePositiveBatch, HistoryBatch, PromptBatch
 from openvima.policies.input_layout import InputLayout
-from openvima.policies.kernels import find_slots, int64, pad_history, stack_prompt_objects, table_points
+from openvima.policies.kernels import (
+    find_slots,
+    int64,
+    pad_false_positives,
+    pad_history,
+    pad_prompts,
+    stack_prompt_objects,
+)
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
 from openvima.policies.prompt_limits import PromptLimits
@@ -46,7 +52,7 @@ MAX_LAYOUTS = 2**16  # token layouts of prompts to keep
 # A token takes a character at least, and 16 are more than any word of the vocabularies has on average.
 PROMPT_LIMITS = PromptLimits(16 * MAX_PROMPT_POSITIONS, objects=MAX_PROMPT_POSITIONS)
 
-_LayoutKey = tuple[str, tuple[int, ...], tuple[int, ...]]
+_LayoutKey = tuple[str, bytes, tuple[int, ...]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,23 +176,26 @@ class Processor:
         """
         sequences = self._token_sequences(prompts)
         layouts = sequences.layouts
-        counts = np.array([len(layout.images) for layout in layouts])
-        tokens = _Steps.of([layout.tokens.shape[1] for layout in layouts])
-        words, entries, parts = np.concatenate([layout.tokens for layout in layouts], axis=1)
+        lengths = np.array([len(layout.tokens) for layout in layouts])
+        tokens = np.concatenate([layout.tokens for layout in layouts])
+        counts = np.array([len(layout.rows) for layout in layouts])
+        image_index, shown, order = np.concatenate([layout.rows for layout in layouts]).T
         first = np.cumsum(counts) - counts
-        numbered = entries + parts * len(sequences.objects) + first[tokens.b]
-        is_valid = np.ones(len(words), np.bool_) if sequences.mask is None else sequences.mask
-        image_index = np.concatenate([layout.images for layout in layouts])
-        shown = np.concatenate([layout.sources for layout in layouts])
         prompt = np.repeat(np.arange(len(layouts)), counts)
         first_image = np.cumsum(prompts.num_images) - prompts.num_images
+        shape = (len(layouts), int(lengths.max(initial=0)))
+        word_ids_BL, object_index_BL = np.full(shape, PADDING_ID), np.full(shape, WORD)
+        mask_BL = np.zeros(shape, np.bool_)
+        is_valid = np.ones(len(tokens), np.bool_) if sequences.mask is None else sequences.mask
+        pad_prompts(lengths, first, len(order), tokens, is_valid, word_ids_BL, object_index_BL, mask_BL)
         objects = sequences.objects
-        shape = (len(VIEWS), len(objects))
+        shape = (len(VIEWS), len(order))
         crop_index_VS, masks_VS = np.empty(shape, np.int64), np.empty(shape, np.bool_)
-        boxes_VS4, positions_S2 = np.empty((*shape, 4), np.int64), np.empty((len(objects), 2))
+        boxes_VS4, positions_S2 = np.empty((*shape, 4), np.int64), np.empty((len(order), 2))
         stack_prompt_objects(
             _cameras(),
-            np.zeros(len(objects), np.int64) if image_offsets is None else image_offsets[prompt],
+            np.zeros(len(order), np.int64) if image_offsets is None else image_offsets[prompt],
+            order + (np.cumsum(sequences.num_objects) - sequences.num_objects)[prompt],
             int64(objects.crop_index),
             int64(objects.boxes),
             crop_index_VS,
@@ -195,14 +204,14 @@ class Processor:
             positions_S2,
         )
         arrays = (
-            tokens.pad(words, fill=PADDING_ID),
-            tokens.pad(np.where(entries == WORD, WORD, numbered), fill=WORD),
-            tokens.pad(is_valid),
+            word_ids_BL,
+            object_index_BL,
+            mask_BL,
             crop_index_VS,
             boxes_VS4,
             masks_VS,
             positions_S2,
-            image_index,
+            np.ascontiguousarray(image_index),
             prompts.is_scene[first_image[prompt] + shown],
         )
         return PromptBatch(*(torch.from_numpy(array) for array in arrays))
@@ -220,7 +229,7 @@ class Processor:
         steps = _Steps.of(episodes.num_steps)
         counts, objects = episodes.objects_per_step.astype(np.int64), episodes.objects
         slots_BT = self._num_slots(steps, counts, np.zeros(len(episodes.num_steps), np.int64))
-        for b, t in np.argwhere(steps.exist() & (slots_BT == 0))[:1]:
+        for b, t in () if counts.all() else np.argwhere(steps.exist() & (slots_BT == 0))[:1]:
             raise DatasetError(
                 f"episode {episodes.seeds[b]} of {episodes.tasks[b]} shows no object before action {t}, so "
                 "it cannot be trained on; exclude it."
@@ -243,7 +252,7 @@ class Processor:
             self.batch_prompts(episodes.prompts, episodes.image_offsets),
             history,
             targets,
-            self._batch_false_positives(episodes.false_positives, steps, offsets[:, None]),
+            self._batch_false_positives(episodes.false_positives, steps, offsets),
         )
 
     def _batch_history(
@@ -311,12 +320,21 @@ class Processor:
     def _batch_false_positives(
         self, found: "FalsePositives", steps: "_Steps", offsets: np.ndarray
     ) -> FalsePositiveBatch:
-        boxes = found.boxes.astype(np.int64)
-        points = np.zeros((len(boxes), len(VIEWS), 2))
-        if self.layout != "frames":
-            table_points(_cameras(), np.ascontiguousarray(boxes[..., :2]), points)
-        crop_index = offset_index(found.crop_index, offsets)
-        return FalsePositiveBatch(steps.pad(crop_index), steps.pad(boxes), steps.pad(points))
+        padded = (
+            np.zeros((*steps.shape, len(VIEWS)), np.int64),
+            np.zeros((*steps.shape, len(VIEWS), 4), np.int64),
+            np.zeros((*steps.shape, len(VIEWS), 2)),
+        )
+        pad_false_positives(
+            _cameras(),
+            self.layout != "frames",
+            steps.place,
+            offsets,
+            int64(found.crop_index),
+            int64(found.boxes),
+            *(array.reshape(-1, *array.shape[2:]) for array in padded),
+        )
+        return FalsePositiveBatch(*padded)
 
     def _token_sequences(self, prompts: PreprocessedPrompts) -> "_TokenSequences":
         """Build the token sequences of prompts: words, and one or more tokens per object of an image.
@@ -324,51 +342,53 @@ class Processor:
         With layout "views" every image is padded to the slots of the prompt's largest one, as in the
         published evaluation, where this affects T5's relative positions.
         """
-        counts, ends = prompts.objects_per_image.tolist(), np.cumsum(prompts.num_images).tolist()
-        starts = [0, *ends[:-1]]
-        images = [tuple(counts[start:end]) for start, end in zip(starts, ends, strict=True)]
+        stored, ends = int64(prompts.objects_per_image), np.cumsum(prompts.num_images)
+        bounds = zip((ends - prompts.num_images).tolist(), ends.tolist(), strict=True)
+        content, size = stored.tobytes(), stored.itemsize
+        counts = [content[size * start : size * end] for start, end in bounds]
         if self.layout == "views":
-            return self._in_views(prompts, images)
-        layouts = [self._layout_of(text, each, ()) for text, each in zip(prompts.texts, images, strict=True)]
-        objects = prompts.objects
-        if any(layout.is_reordered for layout in layouts):
-            num_objects = [sum(each) for each in images]
-            first = np.cumsum(num_objects) - num_objects
-            objects = objects.select(
-                np.concatenate([row + layout.order for row, layout in zip(first, layouts, strict=True)])
-            )
-        return _TokenSequences(layouts, objects, None)
+            return self._in_views(prompts, counts)
+        layouts = self._layouts
+        found = [
+            layouts.get((text, each, ())) or self._layout_of(text, each, ())
+            for text, each in zip(prompts.texts, counts, strict=True)
+        ]
+        objects_before = np.concatenate([[0], np.cumsum(stored)])
+        num_objects = objects_before[ends] - objects_before[ends - prompts.num_images]
+        return _TokenSequences(found, prompts.objects, num_objects, None)
 
-    def _in_views(self, prompts: PreprocessedPrompts, images: Sequence[tuple[int, ...]]) -> "_TokenSequences":
+    def _in_views(self, prompts: PreprocessedPrompts, images: Sequence[bytes]) -> "_TokenSequences":
         """Move the visible objects of each view to the front; slots differ from prompt to prompt."""
         layouts, tables, masks = [], [], []
-        tables_of = prompts.objects.split(np.array([sum(counts) for counts in images]))
-        for text, counts, table in zip(prompts.texts, images, tables_of, strict=True):
+        counts_of = [np.frombuffer(each, np.int64) for each in images]
+        tables_of = prompts.objects.split(np.array([counts.sum() for counts in counts_of]))
+        for text, counts, table in zip(prompts.texts, counts_of, tables_of, strict=True):
             in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
             ends = np.cumsum(counts)
             rows = [np.arange(ends[number] - counts[number], ends[number]) for number in in_text]
             image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
             ordered = table.select(np.concatenate([np.zeros(0, np.int64), *rows]))
             objects, slots = _compact(ordered, image, len(rows))
-            layout = self._layout_of(text, counts, slots)
-            _, entries, parts = layout.tokens
+            layout = self._layout_of(text, counts.tobytes(), slots)
+            _, entries, parts = layout.tokens.T
             mask = entries == WORD
             mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
             layouts.append(layout)
             tables.append(objects)
             masks.append(mask)
-        return _TokenSequences(layouts, ObjectTable.concatenate(tables), np.concatenate(masks))
+        num_objects = np.array([len(table) for table in tables])
+        return _TokenSequences(layouts, ObjectTable.concatenate(tables), num_objects, np.concatenate(masks))
 
-    def _layout_of(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
-        """Return the cached layout of a text, given the number of objects per image."""
+    def _layout_of(self, text: str, counts: bytes, slots: tuple[int, ...]) -> "_Layout":
+        """Return the cached layout of a text, given the number of objects per image, int64."""
         key = (text, counts, slots)
         if key not in self._layouts:
             if len(self._layouts) >= MAX_LAYOUTS:
                 self._layouts.clear()
-            self._layouts[key] = self._lay_out(*key)
+            self._layouts[key] = self._lay_out(text, np.frombuffer(counts, np.int64).tolist(), slots)
         return self._layouts[key]
 
-    def _lay_out(self, text: str, counts: tuple[int, ...], slots: tuple[int, ...]) -> "_Layout":
+    def _lay_out(self, text: str, counts: Sequence[int], slots: tuple[int, ...]) -> "_Layout":
         tokens: list[tuple[int, int, int]] = []  # word, entry, part
         starts, order, count = np.cumsum([0, *counts]), [], 0
         sizes: list[int] = []  # rows of each image
@@ -390,36 +410,33 @@ class Processor:
             len(tokens), MAX_PROMPT_POSITIONS, "the prompt"
         )  # before the encoder, whose cost is quadratic
         in_text = [piece for piece in split_prompt(text) if isinstance(piece, int)]
-        return _Layout(
-            np.ascontiguousarray(np.array(tokens).T),
+        rows = [
             np.repeat(np.arange(len(sizes)), sizes),
             np.repeat(np.array(in_text, np.int64), sizes),
-            np.array(order, np.int64),
-            order != list(range(starts[-1])),
-        )
+            np.arange(count) if self.layout == "views" else np.array(order, np.int64),
+        ]
+        return _Layout(np.array(tokens), np.stack(rows, axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """The tokens of a prompt, (3, L): word, row of its object or `WORD`, and part of that.
+    """The tokens of a prompt, (L, 3): word, row of its object or `WORD`, and part of that.
 
-    `images` is the image of each row, counted in reading order, `sources` its number in the prompt; `order`
-    the rows in reading order, which may differ from the stored order.
+    `rows` (R, 3) has for each row the image, counted in reading order, its number in the prompt, and the row
+    in the table of objects, which may be in another order.
     """
 
     tokens: np.ndarray
-    images: np.ndarray
-    sources: np.ndarray
-    order: np.ndarray
-    is_reordered: bool
+    rows: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _TokenSequences:
-    """Prompts: layout of each, objects of all, and the mask of all tokens (None: all valid)."""
+    """Prompts: layout of each, objects of all, number in each, and mask of all tokens (None: all valid)."""
 
     layouts: list[_Layout]
     objects: ObjectTable
+    num_objects: np.ndarray
     mask: np.ndarray | None
 
 
@@ -442,7 +459,9 @@ class _Steps:
 
     def exist(self) -> np.ndarray:
         """Where a padded array holds steps, shape (B, T), bool."""
-        return self.pad(np.ones(len(self.b), np.bool_))
+        exist = np.zeros(self.shape, np.bool_)
+        exist.reshape(-1)[self.place] = True
+        return exist
 
     def pad(self, column: np.ndarray, fill: int = 0) -> np.ndarray:
         """Scatter one row per step into a padded array of shape (B, T, …)."""

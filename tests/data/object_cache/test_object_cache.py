@@ -162,11 +162,53 @@ def test_a_damaged_record_is_named_where_others_are_read(copy: Path) -> None:
         list(episodes.images)
 
 
+@pytest.mark.parametrize("counts", ["inputs", "fewer", "more"])
+def test_the_first_images_are_read_straight_into_a_stack(demos: Path, counts) -> None:
+    cache = open_object_cache(Dataset(demos))
+    rows = [7, 2, 9]
+    episodes = cache.batch(rows)
+    tables = [(cache[row].prompt.objects, cache[row].objects) for row in rows]
+    inputs = [max(int(table.crop_index.max()) for table in both) for both in tables]
+    asked = [count + {"inputs": 0, "fewer": -1, "more": 1}[counts] for count in inputs]
+    stack = np.zeros((sum(asked), *episodes.images.shape), np.uint8)
+    episodes.images.read_first(asked, stack)
+    expected = [cache[row].images[:count] for row, count in zip(rows, asked, strict=True)]
+    assert np.array_equal(stack, np.concatenate(expected))
+
+
+@pytest.mark.parametrize("part", ["tables", "images"])
+def test_a_batch_with_a_damaged_record_is_refused(copy: Path, part) -> None:
+    cache = open_object_cache(Dataset(copy, tasks=["rotate"]))
+    path = cache.folder / "rotate-train-00000.cache"
+    entry = CacheFile(path).index[1]
+    content = bytearray(path.read_bytes())
+    content[entry["start" if part == "tables" else "images_start"]] ^= 1
+    path.unlink()
+    path.write_bytes(content)
+    damaged = ObjectCache(Dataset(copy, tasks=["rotate"]))
+    with pytest.raises(ShardError, match=r"00000\.cache .* record 1 of 2 is wrong"):
+        episodes = damaged.batch([0, 1])
+        counts = episodes.images.entries["num_inputs"].tolist()
+        episodes.images.read_first(counts, np.zeros((sum(counts), 3, 32, 32), np.uint8))
+
+
+def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path) -> None:
+    path = next(iter(sorted(open_object_cache(Dataset(copy)).folder.iterdir())))
+    content = bytearray(path.read_bytes())
+    preamble = np.frombuffer(content, PREAMBLE, count=1)
+    start = PREAMBLE.itemsize + int(preamble["json_bytes"][0])
+    np.frombuffer(content, INDEX, count=1, offset=start)["num_steps"] = 10_000
+    preamble["checksum"] = xxh3_64_intdigest(content[16 : int(preamble["head_bytes"][0])])
+    path.write_bytes(content)
+    with pytest.raises(ShardError, match="counts more than its records hold"):
+        CacheFile(path)
+
+
 def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatch) -> None:
     monkeypatch.setattr(cache_file, "CACHE_VERSION", 3)
     path = next(open_object_cache(Dataset(copy)).folder.iterdir())
     monkeypatch.undo()
-    with pytest.raises(ShardError, match=r"of version 3, not 4\)\. .*`openvima data preprocess` makes it"):
+    with pytest.raises(ShardError, match=r"of version 3, not 5\)\. .*`openvima data preprocess` makes it"):
         CacheFile(path)
     with pytest.raises(DatasetError, match=r"lacks 6 shards, .*`openvima data preprocess .*` writes them"):
         ObjectCache(Dataset(copy))
@@ -188,7 +230,9 @@ def test_a_file_is_read_as_documented(demos: Path) -> None:
     images = np.frombuffer(content[entry["images_start"] : end], np.uint8).reshape(-1, 3, 32, 32)
     assert np.array_equal(images, cache[1].images)
     assert xxh3_64_intdigest(content[entry["start"] : entry["images_start"]]) == entry["tables_checksum"]
-    assert xxh3_64_intdigest(content[entry["images_start"] : end]) == entry["images_checksum"]
+    others = entry["images_start"] + entry["num_inputs"] * 3 * 32 * 32
+    assert xxh3_64_intdigest(content[entry["images_start"] : others]) == entry["inputs_checksum"]
+    assert xxh3_64_intdigest(content[others:end]) == entry["others_checksum"]
 
 
 def test_a_prompt_is_split_into_texts_and_images() -> None:

@@ -1,7 +1,7 @@
 """The object cache of a data set: a derived folder, written when first needed and safe to delete."""
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -16,13 +16,12 @@ from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import (
     CACHE_VERSION,
     CacheFile,
-    Record,
     file_name,
-    join_records,
     write_cache_file,
 )
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.object_cache.episode_batch import EpisodeBatch
+from openvima.data.object_cache.joined_records import read_records
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -98,7 +97,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     def __iter__(self) -> Iterator[PreprocessedEpisode]:
         return (self[index] for index in range(len(self)))
 
-    def batch(self, indices: Iterable[int]) -> EpisodeBatch:
+    def batch(self, indices: Sequence[int] | np.ndarray) -> EpisodeBatch:
         """Read several episodes together, their images when these are iterated over.
 
         Raises:
@@ -108,9 +107,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
             >>> episodes = cache.batch(order.rows(0))
             >>> Processor("objects").collate(episodes).with_images(episodes.images, episodes.num_images)
         """
-        places = [(self._files[name], row) for name, row in map(self.dataset.locate, indices)]
-        records = [file.read(row) for file, row in places]
-        return join_records(records, _Images(places, records))
+        return read_records([(self._files[name], row) for name, row in self.dataset.locations(indices)])
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
         return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
@@ -137,20 +134,8 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
             name: np.stack([file.index[column] for column in names], axis=1)
             for name, file in self._files.items()
         }
-        places = [self.dataset.locate(index) for index in range(len(self))]
+        places = self.dataset.locations(np.arange(len(self)))
         return np.array([of_file[name][row] for name, row in places], np.int64).reshape(-1, len(names))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Images(Iterable[np.ndarray]):
-    """The images of some episodes, read when they are asked for."""
-
-    places: Sequence[tuple[CacheFile, int]]
-    records: Sequence[Record]
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        for (file, row), record in zip(self.places, self.records, strict=True):
-            yield file.images(row, record.entry)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

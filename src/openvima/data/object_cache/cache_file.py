@@ -4,14 +4,15 @@
     head       JSON; the index, an `Entry` per episode; the different prompt texts
     records    tables of `OBJECT`, `STEP` and `PROMPT_IMAGE`, then the images; each at a multiple of 64 bytes
 
-The head has a checksum, compared when the file is opened; the index holds those of the tables and of the
-images of each record, compared at every read. Nothing is compressed: a batch consists of copies of contiguous
-bytes.
+The head has a checksum, compared when the file is opened; the index holds those of each record, compared at
+every read: of its tables, of the images that prompt and observations show, and of the others. These come
+last: a batch without augmentation does without them. Nothing is compressed: a batch consists of copies of
+contiguous bytes.
 """
 
 import json
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,6 @@ from xxhash import xxh3_64_intdigest
 from openvima.atomic_io import atomic_write
 from openvima.data.checksums import mapped
 from openvima.data.object_cache.episode import ACTION_PARTS, FalsePositives, PreprocessedEpisode
-from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.shard import ODD_ERRORS
 from openvima.errors import ShardError
 from openvima.perception.preprocessing import (
@@ -30,11 +30,10 @@ from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
     PreprocessedPrompt,
-    PreprocessedPrompts,
 )
 from openvima.scene import ACTION_SHAPES
 
-CACHE_VERSION = 4  # grows whenever the same demonstration gives another record
+CACHE_VERSION = 5  # grows whenever the same demonstration gives another record
 SUFFIX = ".cache"
 _ALIGNMENT = 64
 _MAGIC = b"ovcache\n"
@@ -58,7 +57,6 @@ STEP = np.dtype(
     align=True,
 )
 PROMPT_IMAGE = np.dtype([("num_objects", "<i2"), ("is_scene", "?")], align=True)
-_OBJECT_BYTES, _STEP_BYTES, _PROMPT_IMAGE_BYTES = OBJECT.itemsize, STEP.itemsize, PROMPT_IMAGE.itemsize
 
 
 class Entry(NamedTuple):
@@ -68,7 +66,8 @@ class Entry(NamedTuple):
         start: First byte of the record in the file.
         images_start: First byte of its images.
         tables_checksum: xxh3 of the bytes up to there, 64 bits.
-        images_checksum: The same of its images.
+        inputs_checksum: The same of its first images, which prompt and observations show.
+        others_checksum: The same of its other images: false detections, and what is seen after the last step.
         seed: Number of the episode.
         text_start: First byte of the prompt's text in the file, UTF-8.
         text_bytes: Length of that.
@@ -80,6 +79,7 @@ class Entry(NamedTuple):
         num_steps: Rows of the fourth, in `STEP`.
         num_prompt_images: Rows of the fifth, in `PROMPT_IMAGE`.
         num_images: Images.
+        num_inputs: Images that prompt and observations show.
         most_in_prompt: Most objects in a prompt image.
         most_in_view: Most objects in an observation, that after the last step included.
     """
@@ -87,7 +87,8 @@ class Entry(NamedTuple):
     start: int
     images_start: int
     tables_checksum: int
-    images_checksum: int
+    inputs_checksum: int
+    others_checksum: int
     seed: int
     text_start: int
     text_bytes: int
@@ -99,6 +100,7 @@ class Entry(NamedTuple):
     num_steps: int
     num_prompt_images: int
     num_images: int
+    num_inputs: int
     most_in_prompt: int
     most_in_view: int
 
@@ -107,19 +109,6 @@ _WIDE = ("start", "images_start", "seed", "text_start")
 _CODES = ["Q" if name.endswith("checksum") else "q" if name in _WIDE else "i" for name in Entry._fields]
 _ENTRY = struct.Struct("<" + "".join(_CODES))
 INDEX = np.dtype([(name, f"<{code}") for name, code in zip(Entry._fields, _CODES, strict=True)])
-
-
-class Record(NamedTuple):
-    """The tables of one episode as they are stored, and its entry in the index."""
-
-    entry: Entry
-    task: str
-    text: str
-    prompt_objects: memoryview
-    objects: memoryview
-    final_objects: memoryview
-    steps: memoryview
-    prompt_images: memoryview
 
 
 def write_cache_file(
@@ -146,13 +135,15 @@ def write_cache_file(
     tables, entries = [_tables_of(episode) for episode in episodes], []
     for episode, content in zip(episodes, tables, strict=True):
         prompt, images = episode.prompt, np.ascontiguousarray(episode.images)
+        num_inputs = max(int(table.crop_index.max(initial=0)) for table in (prompt.objects, episode.objects))
         text_start, text_bytes = places[prompt.text]
         entries.append(
             Entry(
                 start=start,
                 images_start=start + len(content),
                 tables_checksum=xxh3_64_intdigest(content),
-                images_checksum=xxh3_64_intdigest(images.data),
+                inputs_checksum=xxh3_64_intdigest(images[:num_inputs].data),
+                others_checksum=xxh3_64_intdigest(images[num_inputs:].data),
                 seed=episode.seed,
                 text_start=texts_start + text_start,
                 text_bytes=text_bytes,
@@ -164,6 +155,7 @@ def write_cache_file(
                 num_steps=episode.num_steps,
                 num_prompt_images=len(prompt.is_scene),
                 num_images=len(images),
+                num_inputs=num_inputs,
                 most_in_prompt=int(prompt.objects_per_image.max(initial=0)),
                 most_in_view=int(episode.objects_per_step.max(initial=len(episode.final))),
             )
@@ -194,99 +186,99 @@ class CacheFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._content = mapped(path)
+            self.content = mapped(path).cast("B")
             about = self._read_head()
         except ODD_ERRORS as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         self.kind: InputKind = about["kind"]
         self.source: str = about["source"]
         self.boxes: str = about["boxes"]
-        self._tasks: list[str] = about["tasks"]
+        self.tasks: list[str] = about["tasks"]
         height, width = IMAGE_SIZES[self.kind]
-        self._image_shape, self._image_bytes = (3, height, width), 3 * height * width
-        ends = self.index["images_start"] + self.index["num_images"] * self._image_bytes
-        num_bytes = _aligned(int(ends.max(initial=len(self._content) if not len(self) else 0)))
-        if len(self._content) != num_bytes:
-            raise ShardError(_unfit(path, f"it has {len(self._content):,} of {num_bytes:,} bytes"))
+        self.image_shape, self.image_bytes = (3, height, width), 3 * height * width
+        self._texts: dict[tuple[int, int], str] = {}
+        ends = self.index["images_start"] + self.index["num_images"] * self.image_bytes
+        num_bytes = _aligned(int(ends.max(initial=len(self.content) if not len(self) else 0)))
+        if len(self.content) != num_bytes:
+            raise ShardError(_unfit(path, f"it has {len(self.content):,} of {num_bytes:,} bytes"))
+        if not _fits(self.index):
+            raise ShardError(_unfit(path, "its index counts more than its records hold"))
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, row: int) -> PreprocessedEpisode:
-        record = self.read(row)
-        steps = np.frombuffer(record.steps, STEP)
-        prompt_images = np.frombuffer(record.prompt_images, PROMPT_IMAGE)
+        entry = Entry(*_ENTRY.unpack(self.entry_bytes(row)))
+        tables = self.content[entry.start : entry.images_start]
+        self.check(row, tables, entry.tables_checksum)
+        first, second = entry.num_prompt_objects, entry.num_prompt_objects + entry.num_objects
+        objects = np.frombuffer(tables, OBJECT, second + entry.num_final_objects)
+        offset = objects.nbytes
+        steps = np.frombuffer(tables, STEP, entry.num_steps, offset)
+        offset += steps.nbytes
+        prompt_images = np.frombuffer(tables, PROMPT_IMAGE, entry.num_prompt_images, offset)
         return PreprocessedEpisode(
-            task=record.task,
-            seed=record.entry.seed,
-            end_effector=record.entry.end_effector,
+            task=self.tasks[entry.task],
+            seed=entry.seed,
+            end_effector=entry.end_effector,
             prompt=PreprocessedPrompt(
-                record.text,
-                object_table(record.prompt_objects),
+                self.text(entry.text_start, entry.text_bytes),
+                object_table(objects[:first]),
                 prompt_images["num_objects"],
                 prompt_images["is_scene"],
             ),
-            objects=object_table(record.objects),
+            objects=object_table(objects[first:second]),
             objects_per_step=steps["objects_per_step"],
             pick_ids=steps["pick_ids"],
             place_ids=steps["place_ids"],
             false_positives=FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
-            final=object_table(record.final_objects),
+            final=object_table(objects[second:]),
             actions=steps["actions"],
-            images=self.images(row, record.entry),
+            images=self.images(row),
         )
 
-    def read(self, row: int) -> Record:
-        """Read the tables of one episode as they are stored.
+    def entry_bytes(self, row: int) -> memoryview:
+        """Return the entry of an episode as it is stored."""
+        return self._index_bytes[row * _ENTRY.size : (row + 1) * _ENTRY.size]
 
-        Raises:
-            ShardError: They are damaged.
-        """
-        entry, content = Entry(*_ENTRY.unpack_from(self._index_bytes, row * _ENTRY.size)), self._content
-        prompt_objects = entry.start
-        if xxh3_64_intdigest(content[prompt_objects : entry.images_start]) != entry.tables_checksum:
-            raise self._damaged(row)
-        objects = prompt_objects + entry.num_prompt_objects * _OBJECT_BYTES
-        final_objects = objects + entry.num_objects * _OBJECT_BYTES
-        steps = final_objects + entry.num_final_objects * _OBJECT_BYTES
-        prompt_images = steps + entry.num_steps * _STEP_BYTES
-        return Record(
-            entry,
-            self._tasks[entry.task],
-            str(content[entry.text_start : entry.text_start + entry.text_bytes], "utf-8"),
-            content[prompt_objects:objects],
-            content[objects:final_objects],
-            content[final_objects:steps],
-            content[steps:prompt_images],
-            content[prompt_images : prompt_images + entry.num_prompt_images * _PROMPT_IMAGE_BYTES],
-        )
-
-    def images(self, row: int, entry: Entry) -> np.ndarray:
+    def images(self, row: int) -> np.ndarray:
         """Return the images of one episode, shape (K, 3, height, width), uint8.
 
-        Args:
-            row: The episode.
-            entry: That of its record.
+        Raises:
+            ShardError: They are damaged.
+        """
+        entry = Entry(*_ENTRY.unpack(self.entry_bytes(row)))
+        start, others = entry.images_start, entry.images_start + entry.num_inputs * self.image_bytes
+        end = start + entry.num_images * self.image_bytes
+        self.check(row, self.content[start:others], entry.inputs_checksum)
+        self.check(row, self.content[others:end], entry.others_checksum)
+        return np.ndarray((entry.num_images, *self.image_shape), np.uint8, self.content, start)
+
+    def check(self, row: int, content: memoryview, checksum: int) -> None:
+        """Compare bytes of a record with their checksum.
 
         Raises:
             ShardError: They are damaged.
         """
-        start, end = entry.images_start, entry.images_start + entry.num_images * self._image_bytes
-        if xxh3_64_intdigest(self._content[start:end]) != entry.images_checksum:
-            raise self._damaged(row)
-        return np.ndarray((entry.num_images, *self._image_shape), np.uint8, self._content, start)
+        if xxh3_64_intdigest(content) != checksum:
+            reason = f"the checksum of record {row} of {len(self)} is wrong"
+            raise ShardError(_unfit(self.path, reason))
 
-    def _damaged(self, row: int) -> ShardError:
-        return ShardError(_unfit(self.path, f"the checksum of record {row} of {len(self)} is wrong"))
+    def text(self, start: int, num_bytes: int) -> str:
+        """Return a prompt's text."""
+        key = start, num_bytes
+        if key not in self._texts:
+            self._texts[key] = str(self.content[start : start + num_bytes], "utf-8")
+        return self._texts[key]
 
     def texts(self) -> set[str]:
         """Return the different prompts."""
         places = np.unique(self.index[["text_start", "text_bytes"]])
-        return {str(self._content[start : start + size], "utf-8") for start, size in places.tolist()}
+        return {self.text(start, size) for start, size in places.tolist()}
 
     def _read_head(self) -> dict:
         """Map the index, and return what the JSON says."""
-        content, size = self._content, PREAMBLE.itemsize
+        content, size = self.content, PREAMBLE.itemsize
         preamble = np.frombuffer(content[:size], PREAMBLE)
         magic, checksum, head_bytes, json_bytes = preamble[0].item()
         if magic != _MAGIC:
@@ -306,45 +298,21 @@ def file_name(shard: str) -> str:
     return str(Path(shard).with_suffix(SUFFIX))
 
 
-def join_records(records: Sequence[Record], images: Iterable[np.ndarray]) -> EpisodeBatch:
-    """Join the episodes of some records, table by table.
-
-    Args:
-        records: Their tables.
-        images: Their images.
-    """
-    steps = np.frombuffer(b"".join([record.steps for record in records]), STEP)
-    prompt_images = np.frombuffer(b"".join([record.prompt_images for record in records]), PROMPT_IMAGE)
-    entries = [record.entry for record in records]
-    counts = np.array([entry.num_images for entry in entries])
-    return EpisodeBatch(
-        [record.task for record in records],
-        [entry.seed for entry in entries],
-        np.array([entry.end_effector for entry in entries], np.int64),
-        np.array([entry.num_steps for entry in entries]),
-        PreprocessedPrompts(
-            [record.text for record in records],
-            np.array([entry.num_prompt_images for entry in entries]),
-            object_table(b"".join([record.prompt_objects for record in records])),
-            prompt_images["num_objects"],
-            prompt_images["is_scene"],
-        ),
-        object_table(b"".join([record.objects for record in records])),
-        steps["objects_per_step"],
-        steps["pick_ids"],
-        steps["place_ids"],
-        FalsePositives(steps["false_positive_crop_index"], steps["false_positive_boxes"]),
-        steps["actions"],
-        images,
-        counts,
-        np.cumsum(counts) - counts,
-    )
-
-
-def object_table(content: memoryview | bytes) -> ObjectTable:
-    """Return the objects of a stored table, without a copy."""
-    rows = np.frombuffer(content, OBJECT)
+def object_table(rows: np.ndarray) -> ObjectTable:
+    """Return rows of `OBJECT` as a table, without a copy."""
     return ObjectTable(rows["ids"], rows["crop_index"], rows["boxes"], rows["grasps"])
+
+
+def _fits(index: np.ndarray) -> bool:
+    """Tell whether the tables of each record lie within it; compiled loops read them unchecked."""
+    counts = index["num_prompt_objects"], index["num_objects"], index["num_final_objects"]
+    counts = *counts, index["num_steps"], index["num_prompt_images"]
+    dtypes = OBJECT, OBJECT, OBJECT, STEP, PROMPT_IMAGE
+    num_bytes = sum(
+        dtype.itemsize * count.astype(np.int64) for dtype, count in zip(dtypes, counts, strict=True)
+    )
+    has_room = index["start"] + num_bytes <= index["images_start"]
+    return bool(all((count >= 0).all() for count in counts) and np.all(has_room))
 
 
 def _tables_of(episode: PreprocessedEpisode) -> bytes:
