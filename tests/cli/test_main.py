@@ -146,6 +146,17 @@ def test_too_little_address_space_is_one_line(verb: str) -> None:
     )
 
 
+@pytest.mark.parametrize(("verb", "last"), [("serve", "goodbye."), ("train", "resumes."), ("tasks", "ed.")])
+def test_an_interrupted_verb_says_what_that_means(
+    verb: str, last: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = SimpleNamespace(run=fail_with(KeyboardInterrupt()))
+    monkeypatch.setattr(importlib, "import_module", lambda name: module)
+    assert main([verb]) == 130
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(last)
+
+
 def test_what_a_message_quotes_cannot_steer_the_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,9 +8,10 @@ import pytest
 
 from lock_holders import holding
 from openvima.cli.main import main
-from openvima.data import Demonstration, generate
+from openvima.data import Dataset, Demonstration, generate
 from openvima.data.encoding import ShardInfo
 from openvima.data.lerobot import LerobotConfig, export_lerobot
+from openvima.data.object_cache.cache import open_object_cache
 from openvima.data.subsets import MergeConfig, Splits, SubsetConfig, merge, sample, split
 from openvima.data.verification import VerifyConfig, repair, verify
 from openvima.errors import FolderLockedError
@@ -48,6 +49,19 @@ def test_a_second_writer_is_refused_and_changes_nothing(source: Path, tmp_path: 
         with pytest.raises(FolderLockedError):
             repair(source, NO_REPLAY)
         assert verify(source, NO_REPLAY).is_clean  # reading needs no lock
+
+
+def test_a_second_process_that_preprocesses_is_refused(source: Path, capsys) -> None:
+    dataset = Dataset(source)
+    cache = source / "object_cache" / open_object_cache(dataset).folder.name
+    before = contents(cache)
+    for file in cache.iterdir():
+        file.unlink()
+    with holding(cache) as process:
+        assert main(["data", "preprocess", str(source)]) == 1
+        assert f"written to by process {process.pid}" in capsys.readouterr().err
+    assert open_object_cache(dataset, timeout_s=60.0).folder == cache
+    assert contents(cache) == before
 
 
 def test_the_command_ends_with_one_line_and_status_1(source: Path, tmp_path: Path, capsys) -> None:

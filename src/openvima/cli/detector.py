@@ -1,6 +1,7 @@
 """Train, evaluate, visualise and convert the detector, which finds objects in pixels."""
 
 import json
+import shlex
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -37,7 +38,8 @@ def train(config: Training) -> int:
 
     with progress_bar("training") as report:
         folder = train_detector(config, report)
-    print(f"`openvima detector evaluate {folder}` scores it on novel objects.", file=sys.stderr)
+    hint = f"`openvima detector evaluate {shlex.quote(str(folder))}` scores it on novel objects."
+    print(hint, file=sys.stderr)
     print(folder)
     return 0
 

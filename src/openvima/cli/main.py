@@ -40,6 +40,11 @@ _MEMORY_REMEDIES = {
     "quickstart": "lower --workers",
     "data": "lower --workers",
 }
+_RESUMES = "interrupted; complete files were kept, and the same command resumes."
+_INTERRUPTED = {
+    **dict.fromkeys(("generate", "data", "train", "detector", "evaluate", "quickstart"), _RESUMES),
+    "serve": "the policy is no longer served; goodbye.",
+}
 # Least address space of the verbs that simulate or train, in 2**20 bytes.
 _LEAST_MB = dict.fromkeys(("demo", "generate", "train", "detector", "evaluate", "quickstart"), 1000)
 
@@ -97,7 +102,7 @@ def _run(verb: str, rest: list[str]) -> int:
         sys.stdout.flush()  # while a full disk can still be reported
         return status
     except KeyboardInterrupt:
-        return _fail("interrupted; complete files were kept, and the same command resumes.", 130)
+        return _fail(_INTERRUPTED.get(verb, "interrupted."), 130)
     except BrokenPipeError:  # the reader of our output, such as `head`, exited
         sys.stderr.close()
         return 1

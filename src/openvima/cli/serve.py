@@ -76,9 +76,5 @@ def main(
         },
     }
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
-    try:
-        serve(loaded, config, about=about, ready=lambda url: print(url, flush=True))
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
+    serve(loaded, config, about=about, ready=lambda url: print(url, flush=True))
     return 0

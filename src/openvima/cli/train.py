@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -79,7 +80,8 @@ def run(words: Sequence[str]) -> int:
     if not is_first:
         return 0
     if ":" not in config.preset:
-        print(f"`openvima evaluate --policy {folder} --out results` scores it.", file=sys.stderr)
+        hint = f"`openvima evaluate --policy {shlex.quote(str(folder))} --out results` scores it."
+        print(hint, file=sys.stderr)
     print(folder)
     return 0
 

@@ -97,6 +97,7 @@ def detected_object_cache(
     folder: Path | None = None,
     workers: int = 1,
     report: Report | None = None,
+    timeout_s: float = 0.0,
 ) -> ObjectCache:
     """Open the object cache of a detector and fill in missing files.
 
@@ -108,10 +109,12 @@ def detected_object_cache(
         folder: As in `open_object_cache`.
         workers: As in `open_object_cache`.
         report: As in `open_object_cache`.
+        timeout_s: As in `open_object_cache`.
 
     Raises:
         ConfigError: The detector returns something else than objects.
         DatasetError: The folder is not writable.
+        FolderLockedError: Another process writes the cache.
     """
 
     def say(done: int, total: int, note: str) -> None:
@@ -119,7 +122,9 @@ def detected_object_cache(
             report(done, total, "detecting objects")
 
     with _one_thread():
-        return open_object_cache(dataset, folder=folder, boxes=boxes, workers=workers, report=say)
+        return open_object_cache(
+            dataset, folder=folder, boxes=boxes, workers=workers, report=say, timeout_s=timeout_s
+        )
 
 
 @dataclass(frozen=True, slots=True)

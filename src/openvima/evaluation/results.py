@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -208,7 +209,8 @@ class Results:
         """
         path = path / FILE_NAME if path.is_dir() else path
         if not path.is_file():
-            raise DatasetError(f"there is no {path}; `openvima evaluate --out {path.parent}` writes one.")
+            out = shlex.quote(str(path.parent))
+            raise DatasetError(f"there is no {path}; `openvima evaluate --out {out}` writes one.")
         try:
             content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
             if content.get("schema") != SCHEMA:

@@ -1,5 +1,6 @@
 """Training a policy: contrastive pretraining, then behaviour cloning."""
 
+import math
 from functools import cached_property
 from pathlib import Path
 
@@ -151,15 +152,22 @@ class _Stages:
     def _caches(self) -> list[ObjectCache]:
         """Object caches of true boxes, of detected ones, or both; the first process builds missing ones."""
         prob, folder = self.config.loader.detected_prob or 0.0, self.config.object_cache
+        timeout_s = math.inf  # another training may write the cache now
         caches = []
         if not self.parallel.is_first:
             self.parallel.wait()
         if prob < 1:
             kind = self.learner.input_kind
-            caches.append(open_object_cache(self.dataset, kind, folder=folder, report=self._say))
+            caches.append(
+                open_object_cache(self.dataset, kind, folder=folder, report=self._say, timeout_s=timeout_s)
+            )
         if prob > 0:
             assert self.boxes is not None  # `resolved` has checked it
-            caches.append(detected_object_cache(self.dataset, self.boxes, folder=folder, report=self._say))
+            caches.append(
+                detected_object_cache(
+                    self.dataset, self.boxes, folder=folder, report=self._say, timeout_s=timeout_s
+                )
+            )
         if self.parallel.is_first:
             self.parallel.wait()
         return caches

@@ -10,7 +10,6 @@ from typing import Any, overload
 import numpy as np
 import pyarrow as pa
 
-from openvima.atomic_io import remove_stale
 from openvima.data.checksums import Envelope, spans_of
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import (
@@ -25,6 +24,7 @@ from openvima.data.object_cache.joined_records import read_records
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
+from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
@@ -171,6 +171,7 @@ def open_object_cache(
     boxes: Boxes | None = None,
     workers: int = 1,
     report: Report | None = None,
+    timeout_s: float = 0.0,
 ) -> ObjectCache:
     """Open the object cache of a data set; write what is missing, or older than the demonstrations.
 
@@ -181,14 +182,28 @@ def open_object_cache(
         boxes: Extractor of the objects; None takes the segmentation. Each has a folder of its own.
         workers: Number of processes.
         report: Called with episodes done, episodes in all, and a note.
+        timeout_s: How long to wait for another process that writes the cache.
 
     Raises:
         DatasetError: There is no such kind, it has no use for boxes, or the folder cannot be written to.
+        FolderLockedError: Another process writes the cache.
         ShardError: A shard is damaged.
     """
-    name = boxes.name if boxes else ""
-    target = _cache_folder(dataset, kind, folder, name)
-    work = [
+    target = _cache_folder(dataset, kind, folder, boxes.name if boxes else "")
+    if _missing(dataset, kind, target, boxes):
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatasetError(
+                f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
+            ) from None
+        with folder_lock(target, timeout_s=timeout_s):
+            _write_missing(_missing(dataset, kind, target, boxes), workers, report)
+    return ObjectCache(dataset, kind, folder, boxes.name if boxes else "")
+
+
+def _missing(dataset: Dataset, kind: InputKind, target: Path, boxes: Boxes | None) -> list[_Work]:
+    return [
         _Work(
             dataset.path / source.name,
             Envelope.from_entry(dataset.manifest["shards"][source.name]),
@@ -198,29 +213,23 @@ def open_object_cache(
             boxes,
         )
         for source in sources(dataset)
-        if _made(target, source, kind, name) is None
+        if _made(target, source, kind, boxes.name if boxes else "") is None
     ]
-    if work:
-        try:
-            target.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DatasetError(
-                f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
-            ) from None
-        remove_stale(target)
-        total = sum(item.source.index.num_rows for item in work)
-        work.sort(key=lambda item: -item.source.index.num_rows)
 
-        def say(done: int) -> None:
-            if report is not None:
-                report(done, total, "")
 
-        try:
-            for _ in imap_unordered(_write, work, workers, report=say):
-                pass  # the result of a job is its file
-        finally:
-            _extractor.cache_clear()  # where it was made here
-    return ObjectCache(dataset, kind, folder, name)
+def _write_missing(work: list[_Work], workers: int, report: Report | None) -> None:
+    total = sum(item.source.index.num_rows for item in work)
+    work.sort(key=lambda item: -item.source.index.num_rows)
+
+    def say(done: int) -> None:
+        if report is not None:
+            report(done, total, "")
+
+    try:
+        for _ in imap_unordered(_write, work, workers, report=say):
+            pass  # the result of a job is its file
+    finally:
+        _extractor.cache_clear()  # where it was made here
 
 
 def sources(dataset: Dataset) -> list[Source]:

@@ -1,5 +1,6 @@
 """Writing the shards of a data set that is made of others."""
 
+import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -151,7 +152,7 @@ def _copy(shard: CopiedShard) -> None:
     if fingerprint(shard.path)["sha256"] != shard.sha256:
         raise ShardError(
             f"{shard.original} is damaged: its checksum is not that of the manifest. "
-            f"`openvima data verify {shard.original.parent}` says more."
+            f"`openvima data verify {shlex.quote(str(shard.original.parent))}` says more."
         )
 
 
