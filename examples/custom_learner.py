@@ -1,26 +1,21 @@
 """A network of your own, trained by `openvima train` and scored like any other.
 
     openvima generate --tasks visual_manipulation --episodes 200 --out demos
-    PYTHONPATH=examples openvima train --data demos --preset custom_learner:make --out run
-    PYTHONPATH=examples python examples/custom_learner.py run
+    openvima train --data demos --preset examples/custom_learner.py:make --out run
+    openvima evaluate --policy run --trust-code --tasks visual_manipulation --levels L1,L3 --episodes 20
 
 The training loop provides recipes, exact resuming, validation, multi-process training and mixed precision. A
-learner needs two methods: `collator` makes batches of demonstrations, `forward` returns the loss. This one
-embeds object crops, picks the object most similar to the first prompt image, and places it on the object
-most similar to the last one.
+learner needs three methods: `collator` makes batches of demonstrations, `forward` returns the loss, `policy`
+returns the policy that acts with the weights. This one embeds object crops, picks the object most similar to
+the first prompt image, and places it on the object most similar to the last one.
 """
-
-import sys
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from openvima.evaluation import score
 from openvima.perception.objects import observe, observe_prompt_image
-from openvima.policies import RandomPolicy
 from openvima.policies.processor import Processor
-from openvima.policies.sources import checkpoint_folder
 from openvima.scene import Action
 from openvima.training.learner import Learner, PolicyCollate
 
@@ -58,6 +53,10 @@ class Matcher(Learner):
             metrics[f"{name}_accuracy"] = (scores.argmax(-1) == slots[slots >= 0]).float().mean()
         return sum(losses), metrics
 
+    def policy(self):
+        """Return the policy that `openvima evaluate` scores."""
+        return MatcherPolicy(self)
+
     def embed_objects(self, images, crop_index):
         """Embed objects from their crops in both views: crop indices (..., 2) to (..., 64)."""
         crops = images[crop_index].flatten(-4, -3).float() / 255  # views as channels
@@ -67,10 +66,8 @@ class Matcher(Learner):
 class MatcherPolicy:
     """The trained network as a policy."""
 
-    def __init__(self, run):
-        self.network = Matcher()
-        self.network.read(checkpoint_folder(run))
-        self.network.eval()
+    def __init__(self, network):
+        self.network = network
 
     def reset(self, prompts):
         """Start a batch of episodes."""
@@ -96,14 +93,5 @@ class MatcherPolicy:
 
 
 def make():
-    """Entry point of `--preset custom_learner:make`."""
+    """Entry point of `--preset examples/custom_learner.py:make`."""
     return Matcher()
-
-
-if __name__ == "__main__":
-    from pathlib import Path
-
-    policies = {"matcher": MatcherPolicy(Path(sys.argv[1])), "random": RandomPolicy(seed=0)}
-    for row in score(policies, tasks=("visual_manipulation",), levels=("L1", "L3"), episodes=20).rows:
-        low, high = (100 * end for end in row.interval)
-        print(f"{row.policy:10} {row.task:20} {row.level} {100 * row.rate:4.0f} ({low:.0f}–{high:.0f})")

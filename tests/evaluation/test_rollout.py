@@ -2,11 +2,9 @@
 
 from types import SimpleNamespace
 
-import pytest
-
-from openvima.errors import ActionError, OracleError, PolicyError
+from openvima.errors import ActionError, OracleError
+from openvima.evaluation.results import BAD_ACTION
 from openvima.evaluation.rollout import (
-    BAD_ACTION,
     NO_ORACLE_ACTION,
     NOTHING_PICKED,
     OUT_OF_STEPS,
@@ -123,20 +121,6 @@ def test_an_impossible_action_fails_its_episode_alone():
 def test_an_oracle_without_an_action_fails_the_episode():
     (outcome,) = play([Env({})], [0], RolloutPolicy(OracleError("object 5 cannot be seen")))
     assert (outcome.kind, outcome.reason) == (NO_ORACLE_ACTION, "object 5 cannot be seen")
-
-
-def test_a_policy_that_leaves_out_a_running_episode_is_an_error():
-    with pytest.raises(PolicyError, match="no action for seed 7"):
-        play([Env({})], [7], RolloutPolicy(None))
-
-
-def test_a_policy_with_too_few_actions_is_an_error():
-    class Short(RolloutPolicy):
-        def decide(self, observations):
-            return ["go"]
-
-    with pytest.raises(PolicyError, match="1 actions for 2"):
-        play([Env({}), Env({})], [0, 1], Short())
 
 
 def test_policies_get_prompts_and_observations():

@@ -1,7 +1,6 @@
 """Custom learners in the training loop; rollouts, TensorBoard, compilation."""
 
 import json
-import runpy
 import shutil
 import sys
 from importlib.util import find_spec
@@ -13,7 +12,7 @@ torch = pytest.importorskip("torch")
 
 from openvima.cli.main import main  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
-from openvima.evaluation import score  # noqa: E402
+from openvima.evaluation import Results  # noqa: E402
 from openvima.evaluation.online_eval import OnlineEval  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.learner import Learner, make_learner  # noqa: E402
@@ -29,7 +28,7 @@ def example(monkeypatch) -> str:
     sys.modules.pop("custom_learner", None)
 
 
-def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, tmp_path, capsys) -> None:
+def test_the_example_of_a_learner_is_trained_resumed_and_scored(data, tmp_path, capsys, monkeypatch) -> None:
     out = tmp_path / "run"
     words = [
         "train",
@@ -38,7 +37,7 @@ def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, t
         "--out",
         out,
         "--preset",
-        example,
+        f"{EXAMPLE}:make",
         "--loader.batch-size",
         8,
         "--schedule.steps",
@@ -55,9 +54,21 @@ def test_the_example_of_a_learner_is_trained_resumed_and_scored(example, data, t
         shutil.rmtree(out)
     assert main([str(word) for word in words]) == 0
     assert {path.name: path.read_bytes() for path in out.rglob("model.safetensors")} == whole
-    policy = runpy.run_path(str(EXAMPLE))["MatcherPolicy"](out)
-    row = score({"mine": policy}, tasks=("visual_manipulation",), levels=("L1",), episodes=2).rows[0]
-    assert row.episodes == 2
+    words = [
+        *("evaluate", "--policy", str(out), "--tasks", "visual_manipulation", "--levels", "L1"),
+        *("--episodes", "2", "--no-report", "--out", str(tmp_path / "results")),
+    ]
+    capsys.readouterr()
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert str(out / "config.yaml") in said and "--trust-code" in said and "Nothing was executed" in said
+    monkeypatch.chdir(tmp_path)  # the run folder names its code by an absolute path
+    assert main([*words, "--trust-code", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["episodes"] == 2
+    (record,) = Results.read(tmp_path / "results").policies.values()
+    assert (record["kind"], record["code"]["source"]) == ("run", "custom_learner.py:make")
+    checkpoint = out / "checkpoints" / (out / "checkpoints" / "best.txt").read_text().strip()
+    assert OnlineEval(("rotate",), episodes=1)(checkpoint)["success"] in (0, 1)
     assert len(EXAMPLE.read_text().splitlines()) <= 120
     capsys.readouterr()
 

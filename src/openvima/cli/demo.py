@@ -19,6 +19,7 @@ def main(
     prompts: str = "multimodal",
     device: str = "cpu",
     boxes: str | None = None,
+    trust_code: bool = False,
 ) -> int:
     """Record one episode: the prompt above, the table and the arm below.
 
@@ -30,8 +31,8 @@ def main(
         seed: Number of the episode.
         level: train, L1, L2, L3 or L4; by default the task's first.
         policy: oracle, openvima-small (bundled), random, untrained, a preset, the
-            folder of a training run, a published file, an id on the Hugging Face Hub, or a policy server
-            (ws://HOST:PORT).
+            folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
+            a published file, an id on the Hugging Face Hub, or a policy server (ws://HOST:PORT).
         assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
@@ -40,6 +41,7 @@ def main(
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
+        trust_code: Run the code that a run folder names, as that of a learner of your own does.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -58,7 +60,7 @@ def main(
     from openvima.evaluation.rollout_policies import load_rollout_policy
     from openvima.evaluation.sources import PolicySource
 
-    PolicySource(policy, policy).check()  # before a scene is built
+    PolicySource(policy, policy, trust_code).check()  # before a scene is built
     env_config = EnvConfig(assets, compat, difficulty, prompts)
     batch = Batch(
         policy,
@@ -70,6 +72,7 @@ def main(
         env_config=env_config,
         device=device,
         boxes=boxes or "",
+        trust_code=trust_code,
     )
     env = env_config.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"

@@ -41,6 +41,7 @@ def main(
     record_video: str = "",
     report: bool = True,
     force: bool = False,
+    trust_code: bool = False,
     device: str = "cpu",
     precision: Literal["float64", "float32", "bfloat16"] | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -54,8 +55,9 @@ def main(
 
     Args:
         policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
-            presets, folders of training runs, published files, ids on the Hugging Face Hub and policy servers
-            (ws://HOST:PORT, see `openvima serve`), with commas in between; NAME=FOLDER and NAME=ws://… give
+            presets, folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of
+            your own, published files, ids on the Hugging Face Hub and policy servers (ws://HOST:PORT, see
+            `openvima serve`), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give
             another name.
         tasks: Names of tasks with commas in between, or all. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
@@ -83,6 +85,8 @@ def main(
             TASK/LEVEL/SEED.
         report: Whether to record videos and write report.html.
         force: Overwrite the results of another evaluation in that folder.
+        trust_code: Run the code that run folders name, as those of learners of your own do. Code named on the
+            command line needs no such trust.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
             such episodes are listed as near_ties.
@@ -117,6 +121,7 @@ def main(
         boxes=boxes,
         engine=engine,
         address=address,
+        trust_code=trust_code,
     )
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
@@ -128,6 +133,8 @@ def main(
         print(json.dumps(json.loads(path.read_text(encoding="utf-8"))["rows"]))
     else:
         print_results(results)
+    for invalid in results.invalid_actions():
+        print(f"Warning: {invalid}", file=sys.stderr)
     if num_near := sum(len(row.near_ties) for row in results.rows):
         print(
             f"Rounding may have decided {num_near} episodes; each row lists its own as near_ties.",

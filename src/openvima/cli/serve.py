@@ -21,6 +21,7 @@ def main(
     max_episodes: int = 64,
     max_message_mb: int = 128,
     idle_s: float = 600.0,
+    trust_code: bool = False,
 ) -> int:
     """Serve a policy until Ctrl-C; `openvima evaluate --policy ws://HOST:PORT` scores it.
 
@@ -30,8 +31,9 @@ def main(
     Example: openvima serve runs/first --port 8000
 
     Args:
-        policy: openvima-small (bundled), the folder of a training run, a published
-            file, an id on the Hugging Face Hub, a preset, random or untrained.
+        policy: openvima-small (bundled), the folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION
+            that makes a policy of your own, a published file, an id on the Hugging Face Hub, a preset,
+            random or untrained.
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token.
         token: Word that clients must know; by default that of the environment variable OPENVIMA_SERVE_TOKEN,
@@ -44,6 +46,7 @@ def main(
         max_episodes: Largest batch of episodes.
         max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
         idle_s: Seconds after which a client is dropped that sends nothing.
+        trust_code: Run the code that a run folder names, as that of a learner of your own does.
 
     Returns:
         Exit status.
@@ -51,7 +54,8 @@ def main(
     from openvima.evaluation.sources import policy_sources
     from openvima.evaluation.versions import versions
     from openvima.policies import load_policy
-    from openvima.serving import ServerConfig, serve
+    from openvima.serving import serve
+    from openvima.serving.config import ServerConfig
     from openvima.serving.packing import require_extra
     from openvima.serving.protocol import TOKEN_VARIABLE
 
@@ -66,8 +70,9 @@ def main(
         idle_s=idle_s,
         num_threads=threads,
     )
-    (source,) = policy_sources([f"{name}={policy}" if name else policy])
-    loaded = load_policy(policy, device=device)
+    (source,) = policy_sources([f"{name}={policy}" if name else policy], trust_code=trust_code)
+    source.check()
+    loaded = load_policy(policy, device=device, trust_code=trust_code)
     found = versions(with_torch=source.kind != "random")
     about = {
         "policy": {"name": source.name, **source.record(), "device": device},

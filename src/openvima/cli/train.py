@@ -79,9 +79,9 @@ def run(words: Sequence[str]) -> int:
         folder = train(config, report, _rollout(config) if config.rollout.every else None)
     if not is_first:
         return 0
-    if ":" not in config.preset:
-        hint = f"`openvima evaluate --policy {shlex.quote(str(folder))} --out results` scores it."
-        print(hint, file=sys.stderr)
+    trust = " --trust-code" if ":" in config.preset else ""
+    hint = f"`openvima evaluate --policy {shlex.quote(str(folder))}{trust} --out results` scores it."
+    print(hint, file=sys.stderr)
     print(folder)
     return 0
 

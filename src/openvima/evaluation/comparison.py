@@ -7,11 +7,11 @@ from typing import Literal
 
 from openvima.errors import ConfigError, UnknownPolicyError, unknown_name
 from openvima.evaluation.results import Results, Row
+from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
 
 Verdict = Literal["a", "b", "unsure", "noise"]
 ABLATION_SEPARATOR = ":"  # "mine:no_prompt" is the policy `mine` under the ablation `no_prompt`
-_LEARNED = ("run", "remote")
 _FALSE_ALARMS = 0.05
 _MOST_PAIRS = 6  # that are compared unasked
 
@@ -154,7 +154,7 @@ def compare_pairs(results: Results, pairs: Sequence[tuple[str, str]]) -> list[Co
 def default_pairs(results: Results) -> list[tuple[str, str]]:
     """What is worth comparing unasked: the first learned policy with all others but the oracle."""
     kinds = {name: results.policies.get(name, {}).get("kind", "run") for name in results.policy_names()}
-    learned = [name for name, kind in kinds.items() if kind in _LEARNED]
+    learned = [name for name, kind in kinds.items() if kind in TRAINED_KINDS]
     others = [name for name, kind in kinds.items() if name not in learned[:1] and kind != "oracle"]
     pairs = [(learned[0], other) for other in others] if learned else []
     return [pair for pair in pairs if can_be_compared(results, *pair)][:_MOST_PAIRS]

@@ -22,6 +22,7 @@ from openvima.policies.bundled import BUNDLED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.sampling import check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
+from openvima.user_code import with_absolute_path
 
 REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound
 DEFAULT_EPISODES = 200  # as in the published tables
@@ -37,9 +38,9 @@ class EvaluationConfig:
 
     Args:
         policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
-            preset, a run folder, a published file, an id on the Hugging Face Hub; or the address of a policy
-            server such as "ws://127.0.0.1:8000". A folder or server can be given a name as "name=path", by
-            default it has its own.
+            preset, a run folder, a published file, an id on the Hugging Face Hub, "FILE.py:FUNCTION" or
+            "MODULE:FUNCTION"; or the address of a policy server such as "ws://127.0.0.1:8000". "name=source"
+            gives a name for the results; by default it is that of the folder, file or server.
         tasks: Names of tasks, or ("all",) for every task that the level holds, with text
             prompts every one that has a text form.
         levels: From "train", "L1", "L2", "L3", "L4".
@@ -63,6 +64,7 @@ class EvaluationConfig:
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
         engine: "processes" of this machine, or "ray".
         address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
+        trust_code: Run the code that run folders name, as those of learners of your own do.
 
     Raises:
         ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
@@ -84,6 +86,7 @@ class EvaluationConfig:
     boxes: str | None = None
     engine: Engine = "processes"
     address: str | None = None
+    trust_code: bool = False
 
     def __post_init__(self) -> None:
         problems = [
@@ -129,21 +132,21 @@ class EvaluationConfig:
         Raises:
             ConfigError: As for `policy_sources`.
         """
-        given = policy_sources(self.policies)
+        given = policy_sources(self.policies, trust_code=self.trust_code)
         asked = REFERENCE_POLICIES if "all" in self.ablations else self.ablations
         there = {source.source for source in given}
         added = [name for name in REFERENCE_POLICIES if name in asked and name not in there]
-        return policy_sources((*self.policies, *added)) if added else given
+        return (*given, *policy_sources(added))
 
     def ablations_of(self, source: PolicySource) -> tuple[str, ...]:
         """Return the input ablations of a policy.
 
-        Oracle and random policy read no prompts, and a policy server extracts objects itself.
+        Oracle and random policy read no prompts; policy servers and users' code extract objects themselves.
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
         asked = {*self.ablations, *(ABLATIONS if "all" in self.ablations else ())}
-        usable = self.boxes is not None and source.kind != "remote"
+        usable = self.boxes is not None and source.kind not in ("code", "remote") and not source.learner
         names = (name for name in (*ABLATIONS, IN_CONTEXT) if name in asked)
         return tuple(name for name in names if name != DETECTED_BOXES or usable)
 
@@ -181,6 +184,7 @@ class Batch:
         ablation: Input ablation; empty for none.
         precision: As in `EvaluationConfig`; empty for the policy's own.
         boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
+        trust_code: As in `EvaluationConfig`.
     """
 
     policy: str
@@ -194,6 +198,7 @@ class Batch:
     ablation: str = ""
     precision: str = ""
     boxes: str = ""
+    trust_code: bool = False
 
     @property
     def seeds(self) -> range:
@@ -206,22 +211,22 @@ class Batch:
         Args:
             fingerprint: Text that stands for the policy's weights, wherever they lie, and the versions.
         """
-        content = json.dumps([{**asdict(self), "source": ""}, fingerprint], sort_keys=True)
+        settings = {**asdict(self), "source": "", "trust_code": False}
+        content = json.dumps([settings, fingerprint], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:24]
 
     def with_whole_paths(self) -> "Batch":
         """Return the batch for a process with another working directory."""
         source, assets, boxes = self.source, self.env_config.assets, self.boxes
-        is_path = PolicySource(self.policy, source).kind == "run" and source not in BUNDLED
-        if is_path and Path(source).exists():
+        kind = PolicySource(self.policy, source).kind
+        if kind == "code":
+            source = with_absolute_path(source)
+        elif kind == "run" and source not in BUNDLED and Path(source).exists():
             source = str(Path(source).absolute())
         if assets not in ASSET_PACKS:
             assets = str(Path(assets).expanduser().absolute())
         name, is_trained, folder = boxes.partition("=")
-        if is_trained:
-            boxes = f"{name}={Path(folder).absolute()}"
-        elif ".py:" in boxes:
-            boxes = str(Path(boxes).absolute())
+        boxes = f"{name}={Path(folder).absolute()}" if is_trained else with_absolute_path(boxes)
         return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 
@@ -290,6 +295,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             ablation=ablation,
             precision=config.precision or "",
             boxes=(config.boxes or "") if ablation == DETECTED_BOXES else "",
+            trust_code=config.trust_code,
         )
         for source, ablation in played
         for task, level in cells(config)

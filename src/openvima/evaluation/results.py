@@ -16,6 +16,7 @@ from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_inter
 
 SCHEMA = 1
 FILE_NAME = "results.json"
+BAD_ACTION = "invalid action"  # kind of failure
 # What replaying the actions cannot prove.
 DECLARED = "who acted (policies) and what they observed (ablation, boxes, device, precision, near_ties)"
 
@@ -128,6 +129,27 @@ class LevelMean:
 
 
 @dataclass(frozen=True, slots=True)
+class InvalidActions:
+    """Episodes of one policy that ended by an invalid action, under any ablation.
+
+    Args:
+        policy: Name of the policy.
+        invalid: Number of such episodes.
+        episodes: Number of all its episodes.
+        first: Task, level and seed of the first one, and what was wrong.
+    """
+
+    policy: str
+    invalid: int
+    episodes: int
+    first: str
+
+    def __str__(self) -> str:
+        count = f"{self.invalid} of {self.episodes} episodes of {self.policy}"
+        return f"{count} ended by an invalid action; {self.first}"
+
+
+@dataclass(frozen=True, slots=True)
 class Results:
     """A finished evaluation.
 
@@ -181,12 +203,27 @@ class Results:
         """The same means by policy, ablation and level; the ablation is empty for the plain score."""
         return {(mean.policy, mean.ablation, mean.level): mean for mean in self.level_means()}
 
+    def invalid_actions(self) -> list[InvalidActions]:
+        """Count invalid actions by policy, for the policies that have any."""
+        found = []
+        for policy in self.policy_names():
+            rows = [row for row in self.rows if row.policy == policy]
+            invalid = [(r, o) for r in rows for o in r.outcomes if o.kind == BAD_ACTION]
+            if invalid:
+                row, outcome = invalid[0]
+                first = f"first in {row.task}, {row.level}, seed {outcome.seed}: {outcome.reason}"
+                episodes = sum(row.episodes for row in rows)
+                found.append(InvalidActions(policy, len(invalid), episodes, first))
+        return found
+
     def to_json(self) -> str:
         """Return the text of `results.json`; equal results give equal bytes."""
+        invalid = self.invalid_actions()
         content = {
             "schema": SCHEMA,
             "rows": [_row_record(row) for row in self.rows],
             "levels": [_level_record(mean) for mean in self.level_means()],
+            **({"invalid_actions": [asdict(found) for found in invalid]} if invalid else {}),
             "policies": self.policies,
             "config": self.config,
             "versions": self.versions,

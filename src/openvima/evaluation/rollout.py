@@ -4,15 +4,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import ActionError, OracleError, PolicyError
-from openvima.evaluation.results import EpisodeOutcome, failure_kind
+from openvima.errors import ActionError, OracleError
+from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
 from openvima.scene.goal import object_of
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
 WRONG_PICKED = "only wrong objects were picked up within the step limit"
 OUT_OF_STEPS = "not done within the step limit"
-BAD_ACTION = "invalid action"
 NO_ORACLE_ACTION = "the oracle has no action"
 
 
@@ -32,8 +31,7 @@ class _EpisodeSlot:
         """Take one step, unless there is no usable action; then the episode has failed."""
         if isinstance(decision, OracleError):
             return self._end(str(decision), NO_ORACLE_ACTION)
-        if decision is None:
-            raise PolicyError(f"the policy gave no action for seed {self.seed}, whose episode is not over.")
+        assert decision is not None  # rollout policies have checked it
         try:
             self.observation, _, terminated, truncated, info = self.env.step(decision)
         except ActionError as error:
@@ -106,8 +104,6 @@ def play(
     policy.begin(envs)
     while any(slot.outcome is None for slot in slots):
         decisions = policy.decide([slot.observation for slot in slots])
-        if len(decisions) != len(slots):
-            raise PolicyError(f"the policy gave {len(decisions)} actions for {len(slots)} observations.")
         near_ties = policy.near_ties() or [False] * len(slots)
         for slot, decision, is_near_tie in zip(slots, decisions, near_ties, strict=True):
             if slot.outcome is None:

@@ -1,5 +1,6 @@
 """Rollout policies: the oracle, which reads the environment, and policies, which read observations."""
 
+import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -7,14 +8,18 @@ from typing import Any, Protocol
 
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import OracleError
+from openvima.errors import OpenVimaError, OracleError, PolicyError
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.policies.own_code import checked_policy
+from openvima.policies.sources import is_own_code
 from openvima.scene import Action
 from openvima.serving.client import RemotePolicy
 from openvima.serving.protocol import is_remote
+from openvima.user_code import described
 
+_MAX_SEEDS = 16  # that an error lists
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Decision = Mapping[str, Any] | Action | OracleError | None
 
@@ -64,10 +69,19 @@ class PromptedRolloutPolicy:
     Args:
         policy: Follows the `Policy` protocol of `openvima.policies`.
         ablation: Input ablation; empty for none.
+        name: Name of the policy, for errors.
     """
 
-    def __init__(self, policy: Any, ablation: str = "") -> None:  # Any: third parties need no base class
-        self._policy = policy
+    def __init__(
+        self,
+        policy: Any,  # Any: third parties need no base class
+        ablation: str = "",
+        *,
+        name: str = "policy",
+    ) -> None:
+        self._policy = checked_policy(policy, f"{name} is")
+        self._name = name
+        self._envs: Sequence[TabletopEnv] = ()
         self._ablation = ablation
         self._inputs: list[AblatedInput] = []
 
@@ -77,14 +91,53 @@ class PromptedRolloutPolicy:
         return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Reset the policy with the prompts."""
+        """Reset the policy with the prompts.
+
+        Raises:
+            PolicyError: The policy raised another exception than those of this package.
+        """
+        self._envs = envs
         self._inputs = [ablate(env, self._ablation) for env in envs]
-        self._policy.reset([seen.prompt for seen in self._inputs])
+        with self._named_errors(envs):
+            self._policy.reset([seen.prompt for seen in self._inputs])
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
-        """Let the policy act."""
+        """Let the policy act.
+
+        Raises:
+            PolicyError: As for `begin`, or the policy gave something else than one action for each episode.
+        """
+        running = [env for env, seen in zip(self._envs, observations, strict=True) if seen is not None]
         pairs = zip(self._inputs, observations, strict=True)
-        return self._policy.act([None if image is None else seen.observation(image) for seen, image in pairs])
+        with self._named_errors(running):
+            actions = self._policy.act(
+                [None if image is None else seen.observation(image) for seen, image in pairs]
+            )
+        if not isinstance(actions, Sequence):
+            raise PolicyError(
+                f"{self._name} gave a {type(actions).__name__}; act must return a list with an action for "
+                "each observation."
+            )
+        if len(actions) != len(observations):
+            raise PolicyError(
+                f"{self._name} gave {len(actions)} actions for {len(observations)} observations."
+            )
+        for env, seen, action in zip(self._envs, observations, actions, strict=True):
+            if action is None and seen is not None:
+                raise PolicyError(
+                    f"{self._name} gave no action for {_episodes([env])}, whose episode is not over."
+                )
+        return actions
+
+    @contextmanager
+    def _named_errors(self, envs: Sequence[TabletopEnv]) -> Iterator[None]:
+        """Name policy, task and seeds where the policy raises."""
+        try:
+            yield
+        except OpenVimaError:
+            raise
+        except Exception as error:
+            raise PolicyError(f"{self._name} raised {described(error)}, in {_episodes(envs)}.") from error
 
     def near_ties(self) -> Sequence[bool]:
         """Return those of the policy, if it reports any, as `NetworkPolicy` does."""
@@ -107,14 +160,17 @@ def load_rollout_policy(batch: Batch, fingerprint: str = "") -> RolloutPolicy:
     """
     if batch.source == ORACLE:
         return OracleRolloutPolicy()
-    policy = _load_policy(batch.source, fingerprint, batch.device, batch.precision, batch.boxes)
-    return PromptedRolloutPolicy(policy, batch.ablation)
+    policy = _load_policy(
+        batch.source, fingerprint, batch.device, batch.precision, batch.boxes, batch.trust_code
+    )
+    return PromptedRolloutPolicy(policy, batch.ablation, name=batch.policy)
 
 
 @contextmanager
 def one_thread(batch: Batch) -> Iterator[None]:
     """Keep torch to one thread: sums in another order would change the last bits of what a network gives."""
-    if batch.source in (ORACLE, RANDOM) or is_remote(batch.source):  # no network, or not here
+    without_torch = is_own_code(batch.source) and importlib.util.find_spec("torch") is None
+    if batch.source in (ORACLE, RANDOM) or is_remote(batch.source) or without_torch:  # no network here
         yield
         return
     from openvima.policies.base import require_torch
@@ -128,14 +184,14 @@ def one_thread(batch: Batch) -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _load_policy(
-    source: str, fingerprint: str, device: str, precision: str, boxes: str
+    source: str, fingerprint: str, device: str, precision: str, boxes: str, trust_code: bool
 ) -> Any:  # Any: see `PromptedRolloutPolicy`
     from openvima.policies import load_policy
 
     if is_remote(source):
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
         return RemotePolicy(source)
-    options: dict[str, Any] = {"device": device}  # Any: of several kinds
+    options: dict[str, Any] = {"device": device, "trust_code": trust_code}  # Any: of several kinds
     if precision:
         import torch
 
@@ -143,6 +199,13 @@ def _load_policy(
     if boxes:
         options["extractor"] = plugged_extractor(boxes)
     return load_policy(source, **options)
+
+
+def _episodes(envs: Sequence[TabletopEnv]) -> str:
+    """Name the episodes of a batch, which have one task and level."""
+    seeds = [str(env.episode.seed) for env in envs]
+    shown = ", ".join(seeds[:_MAX_SEEDS]) + ", …" * (len(seeds) > _MAX_SEEDS)
+    return f"{envs[0].task}, {envs[0].level}, seed{'s' * (len(seeds) > 1)} {shown}"
 
 
 def _oracle(env: TabletopEnv) -> Action | OracleError:

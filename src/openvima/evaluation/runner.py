@@ -20,6 +20,7 @@ from openvima.evaluation.versions import versions
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import require_torch
+from openvima.policies.loading import load_policy
 from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
@@ -106,7 +107,9 @@ def prepare(config: EvaluationConfig) -> PreparedEvaluation:
         extractor_maker(config.boxes)
     batches = plan(config)
     policies = {source.name: source.record() for source in config.sources}
-    found = versions(with_torch=any(what["kind"] in ("run", "untrained") for what in policies.values()))
+    found = versions(
+        with_torch=any(what["kind"] in ("run", "untrained", "code") for what in policies.values())
+    )
     return PreparedEvaluation(config, tuple(batches), policies, found)
 
 
@@ -137,7 +140,9 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
 def _check_weights(config: EvaluationConfig) -> None:
     """Load each network once, so that a damaged one is named before episodes of the others."""
     for source in config.sources:
-        if source.kind == "run":
+        if source.learner:
+            load_policy(source.source, trust_code=config.trust_code)
+        elif source.kind == "run":
             require_torch(f"policy {source.name!r}")
             from openvima.policies.checkpoint import load_network
 

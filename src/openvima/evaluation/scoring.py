@@ -9,6 +9,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rollout_policy
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
+from openvima.policies.own_code import parameters_hash
 
 
 def score(
@@ -40,7 +41,7 @@ def score(
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: There is no episode.
-        PolicyError: A policy left out an episode that is not over.
+        PolicyError: A policy lacks a method, raises, or gives something else than an action for each episode.
 
     Example:
         >>> from openvima.policies import RandomPolicy
@@ -62,11 +63,18 @@ def score(
         envs = [batch.env_config.make(batch.task, batch.level, domain="eval") for _ in batch.seeds]
         given = policies.get(batch.policy)
         rollout_policy = (
-            load_rollout_policy(batch) if given is None else PromptedRolloutPolicy(given, batch.ablation)
+            load_rollout_policy(batch)
+            if given is None
+            else PromptedRolloutPolicy(given, batch.ablation, name=batch.policy)
         )
         outcomes[batch] = tuple(play(envs, batch.seeds, rollout_policy))
     kinds = {
-        source.name: {"kind": "object"} if source.name in policies else source.record()
+        source.name: _record(policies[source.name]) if source.name in policies else source.record()
         for source in config.sources
     }
     return Results(rows_of(batches, outcomes), config.record(), versions(with_torch=True), kinds)
+
+
+def _record(policy: Policy) -> dict[str, str]:
+    weights = parameters_hash(policy)
+    return {"kind": "object"} | ({} if weights is None else {"weights_sha256": weights})

@@ -11,14 +11,17 @@ from urllib.parse import urlsplit
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import open_regular
 from openvima.policies.bundled import BUNDLED
+from openvima.policies.own_code import LearnerCode, learner_code, parameters_hash, policy_of_code
 from openvima.policies.presets import PRESETS
-from openvima.policies.sources import find_checkpoint, is_policy_source, unknown_policy
+from openvima.policies.sources import find_checkpoint, is_own_code, is_policy_source, unknown_policy
 from openvima.serving.client import describe
 from openvima.serving.protocol import check_address, is_remote
+from openvima.user_code import load_function, source_hash, without_folder
 
 ORACLE = "oracle"
 RANDOM = "random"
 NAMED_POLICIES = (ORACLE, RANDOM, "untrained")
+TRAINED_KINDS = ("run", "code", "remote")  # see `PolicySource.kind`
 _WEIGHTS = (".safetensors", ".ckpt", ".pt")
 
 
@@ -30,36 +33,59 @@ class PolicySource:
         name: Name in the results.
         source: "oracle", "random", "untrained", the name of a preset or of a bundled checkpoint,
             what else `load_policy` takes, or the address of a policy server.
+        trust_code: Whether to run the code that a run folder names.
     """
 
     name: str
     source: str
+    trust_code: bool = False
 
     @property
     def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset), "remote" or "run" (all else)."""
+        """What it is: "oracle", "random", "untrained" (also for a preset), "remote", "code" or "run".
+
+        "code" is a function that makes a policy; "run" is all else.
+        """
         if is_remote(self.source):
             return "remote"
         if self.source in PRESETS:
             return "untrained"
-        return self.source if self.source in NAMED_POLICIES else "run"
+        if self.source in NAMED_POLICIES:
+            return self.source
+        return "code" if is_own_code(self.source) else "run"
+
+    @property
+    def learner(self) -> LearnerCode | None:
+        """The code of a learner of the user's own, if it is the run folder of one."""
+        return learner_code(self.source) if self.kind == "run" and self.source not in BUNDLED else None
 
     def check(self) -> None:
-        """Check the name before any work is done for it; nothing is loaded, hashed or connected to.
+        """Check the name before any work is done for it: no weights are loaded, no server is asked.
 
         Raises:
-            ConfigError: It looks like the address of a server and cannot be one.
+            ConfigError: It looks like the address of a server and cannot be one, there is no such function,
+                or a run folder names code, which is not trusted.
             UnknownPolicyError: There is no such path, and it is not like an id on the Hub.
         """
         if self.kind == "remote":
             check_address(self.source)
+        elif self.kind == "code":
+            load_function(self.source, what="policy")
+        elif code := self.learner:
+            code.check(trusted=self.trust_code)
         elif self.kind == "run" and not is_policy_source(self.source):
             raise UnknownPolicyError(unknown_policy(self.source, NAMED_POLICIES))
 
     def record(self) -> dict[str, Any]:  # Any: plain values
-        """What the policy is; for a trained one with a hash of its weights, for a remote one what it says.
+        """What the policy is.
+
+        Returns:
+            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights;
+            for a function its name without folders, "sha256" of its source file and, if the policy offers
+            weights, "weights_sha256". Files that the source file imports are not hashed.
 
         Raises:
+            ConfigError: As for `check`, or a function raises.
             UnknownPolicyError: As for `check`.
             CheckpointError: The run folder, or the package, holds no weights.
             PolicyError: A folder here is named like a bundled checkpoint and holds a checkpoint, too.
@@ -68,14 +94,25 @@ class PolicySource:
         self.check()
         if self.kind == "remote":
             return {"kind": "remote", "metadata": describe(self.source)}
+        if self.kind == "code":
+            weights = parameters_hash(policy_of_code(self.source))
+            what = {"kind": "code", **_code_record(self.source)}
+            return what if weights is None else {**what, "weights_sha256": weights}
+        if code := self.learner:
+            weights = weights_hash(self.source)
+            return {"kind": "run", "sha256": weights, "code": _code_record(code.source)}
         if self.kind == "run":
             where = {"bundled": self.source} if self.source in BUNDLED else {}
             return {"kind": "run", **where, "sha256": weights_hash(self.source)}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
 
-def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
+def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tuple[PolicySource, ...]:
     """Read policies as given on the command line.
+
+    Args:
+        policies: Sources, or NAME=SOURCE.
+        trust_code: As in `PolicySource`.
 
     Raises:
         ConfigError: Two policies have the same name, a name is not fit for file names, or an address without
@@ -84,7 +121,9 @@ def policy_sources(policies: Sequence[str]) -> tuple[PolicySource, ...]:
     sources = []
     for given in policies:
         name, equals, source = ("", "", given) if is_remote(given) else given.partition("=")
-        sources.append(PolicySource(name, source) if equals else PolicySource(_default_name(given), given))
+        if not equals:
+            name, source = _default_name(given), given
+        sources.append(PolicySource(name, source, trust_code))
     if unfinished := [source.name for source in sources if not source.source]:
         raise ConfigError(f"policy {unfinished[0]!r} has no folder; name it as {unfinished[0]}=PATH.")
     names = [source.name for source in sources]
@@ -117,5 +156,13 @@ def weights_hash(source: str | Path) -> str:
 def _default_name(source: str) -> str:
     if is_remote(source):
         check_address(source)
-        return re.sub(r"[^\w.-]+", "-", urlsplit(source).netloc).strip("-")
-    return source if source in NAMED_POLICIES else Path(source).name
+        name = urlsplit(source).netloc
+    elif is_own_code(source):
+        name = Path(source.rpartition(":")[0]).name.removesuffix(".py")
+    else:
+        name = Path(source).name
+    return re.sub(r"[^\w.+-]+", "-", name).strip("-")
+
+
+def _code_record(source: str) -> dict[str, str]:
+    return {"source": without_folder(source), "sha256": source_hash(source, what="policy")}

@@ -1,24 +1,34 @@
 """Loading policies by name, from a folder or from the Hugging Face Hub."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from openvima.errors import PolicyError, UnknownPolicyError
+from openvima.errors import ConfigError, PolicyError, UnknownPolicyError
 from openvima.policies.base import Policy, RandomPolicy, require_torch
+from openvima.policies.own_code import learner_code, policy_of_code, policy_of_run
 from openvima.policies.presets import PRESETS
-from openvima.policies.sources import is_policy_source, unknown_policy
+from openvima.policies.sources import is_own_code, is_policy_source, unknown_policy
 
 
-def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  # Any: of several kinds
+def load_policy(
+    name_or_run: str,
+    *,
+    seed: int = 0,
+    trust_code: bool = False,
+    **options: Any,  # Any: of several kinds
+) -> Policy:
     """Load a policy by name, from a folder or file, or from the Hugging Face Hub.
 
     Args:
         name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; "openvima-small", the
             bundled checkpoint; a run folder of `openvima train`, of which the best checkpoint is loaded; a
-            checkpoint folder; a published `.ckpt` file; or a Hub id such as "owner/policy".
+            checkpoint folder; a published `.ckpt` file; a Hub id such as "owner/policy"; or
+            "MODULE:FUNCTION" or "FILE.py:FUNCTION", a function without arguments that returns a policy.
         seed: Seed of the random policy and of fresh weights.
+        trust_code: Whether to run the code that the run folder of a learner of your own names.
         **options: Options of `NetworkPolicy`, such as `tokenizer`, `device` or `dtype`. The random policy
-            ignores them.
+            and policies of functions ignore them; a learner of your own takes `device` alone.
 
     Returns:
         The policy, ready for `reset`.
@@ -26,8 +36,11 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
     Raises:
         UnknownPolicyError: It is neither a known name, nor a path, nor a possible Hub id.
         CheckpointError: The folder or file holds no readable checkpoint, or the download failed.
-        PolicyError: The policy needs the T5 tokenizer, which is neither stored nor given; or a local folder
-            has the name of a preset, or holds a checkpoint and has the name of a bundled one.
+        ConfigError: There is no such function, or it raises; the run folder names code, which is not trusted;
+            or an extractor is given to a policy of your own.
+        PolicyError: A function returns something else than a policy; the policy needs the T5 tokenizer,
+            which is neither stored nor given; or a local folder has the name of a preset, or holds a
+            checkpoint and has the name of a bundled one.
         MissingExtraError: The policy needs torch, or the Hub's client, which is not installed.
     """
     if name_or_run == "random":
@@ -45,9 +58,21 @@ def load_policy(name_or_run: str, *, seed: int = 0, **options: Any) -> Policy:  
 
         config = preset("nano" if name_or_run == "untrained" else name_or_run)
         return NetworkPolicy(build_network(config, seed=seed), **options)
+    if is_own_code(name_or_run):
+        _check_extractor(name_or_run, options)
+        return policy_of_code(name_or_run)
     if not is_policy_source(name_or_run):
         raise UnknownPolicyError(unknown_policy(name_or_run, ("random", "untrained")))
+    if code := learner_code(name_or_run):
+        code.check(trusted=trust_code)
+        _check_extractor(name_or_run, options)
+        return policy_of_run(name_or_run, code, device=options.get("device", "cpu"))
     require_torch(f"the policy in {name_or_run}")
     from openvima.policies.inference import NetworkPolicy
 
     return NetworkPolicy.from_pretrained(name_or_run, **options)
+
+
+def _check_extractor(source: str, options: Mapping[str, Any]) -> None:  # Any: see `load_policy`
+    if options.get("extractor") is not None:
+        raise ConfigError(f"{source} extracts objects itself; leave the detector out.")

@@ -16,11 +16,17 @@ from openvima.policies.file_names import (
 )
 from openvima.policies.hub import fetch_from_hub, is_hub_id
 from openvima.policies.presets import PRESETS
+from openvima.user_code import is_code
 
 
 def is_policy_source(text: str) -> bool:
     """Whether a text names a bundled checkpoint, an existing path or a repository on the Hub."""
     return text in BUNDLED or Path(text).exists() or is_hub_id(text)
+
+
+def is_own_code(text: str) -> bool:
+    """Whether a text names a function that makes a policy, and no existing path."""
+    return is_code(text) and not Path(text).exists()
 
 
 def unknown_policy(name: str, others: Sequence[str]) -> str:
@@ -33,7 +39,7 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
     named = (*others, *BUNDLED)
     hint = (
         f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
-        "run, a published .ckpt file, or an id owner/name on the Hugging Face Hub."
+        "run, a published .ckpt file, an id owner/name on the Hugging Face Hub, or FILE.py:FUNCTION."
     )
     return unknown_name("policy", name, (*named, *PRESETS), hint)
 

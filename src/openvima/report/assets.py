@@ -11,7 +11,7 @@ from openvima.errors import ConfigError, MissingExtraError
 from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
-from openvima.evaluation.sources import PolicySource
+from openvima.evaluation.sources import ORACLE, TRAINED_KINDS, PolicySource
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import BUNDLED
@@ -150,13 +150,13 @@ def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Re
     """
     sources, requested = config.sources, requested_episodes(config, videos)
     jobs = []
-    for source in [source for source in sources if source.kind in ("run", "remote", "oracle")] or sources:
+    for source in [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or sources:
         for task in results.tasks():
             levels = (results.row(source.name, task, level) for level in results.levels())
             row = next((row for row in levels if row is not None), None)
             if row is not None:
                 seeds = [outcome.seed for outcome in row.outcomes if outcome.success][: videos.per_task]
-                if source.kind != "oracle":
+                if source.kind != ORACLE:
                     failed = (outcome.seed for outcome in row.outcomes if not outcome.success)
                     seeds += list(failed)[: videos.per_task]
                 jobs += [_job(config, results, source, row, seed) for seed in seeds]
@@ -225,5 +225,6 @@ def _job(config: EvaluationConfig, results: Results, source: PolicySource, row: 
         config.env_config,
         device=config.device,
         precision=config.precision or "",
+        trust_code=config.trust_code,
     )
     return Job(batch, str(results.policies.get(source.name)))

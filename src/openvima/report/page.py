@@ -128,6 +128,6 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
 def _policy_word(name: str, what: Mapping[str, Any]) -> str:  # Any: plain values
     """Name a policy for `--policy`, with a placeholder for the path of its weights."""
     kind = what.get("kind")
-    named = what.get("preset") or what.get("bundled")
+    named = what.get("preset") or what.get("bundled") or what.get("source")
     source = named or (kind if kind in NAMED_POLICIES else _PLACES.get(str(kind), name))
     return name if name == source else f"{name}={source}"

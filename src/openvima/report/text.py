@@ -2,6 +2,7 @@
 
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results
+from openvima.evaluation.sources import TRAINED_KINDS
 
 LEVEL_NAMES = {
     "train": "As in training",
@@ -22,6 +23,7 @@ _ROLES = {
     "random": "Random actions: the lower bound.",
     "untrained": "A network with random weights.",
     "run": "Trained policy: observes the prompt and two camera images.",
+    "code": "Policy of the user's own code: observes the prompt and two camera images.",
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
 _ABLATION_DESCRIPTIONS = {
@@ -138,7 +140,7 @@ def headline(results: Results) -> str:
     """The finding in one line: what the trained policy, or else the first one, reaches on its first level."""
     played = results.level_means()
     means = [mean for mean in played if not mean.ablation] or played
-    trained = [m for m in means if results.policies.get(m.policy, {}).get("kind") in ("run", "remote")]
+    trained = [m for m in means if results.policies.get(m.policy, {}).get("kind") in TRAINED_KINDS]
     first = (trained or means)[0]
     tasks = counted(len(first.tasks), "task")
     return f"{first.policy} solves {percent(first.mean)} of {first.level} episodes ({tasks})"

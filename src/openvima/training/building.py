@@ -25,6 +25,7 @@ from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingC
 from openvima.training.learner import Learner, PolicyLearner, make_learner
 from openvima.training.schedule import step_seed
 from openvima.training.validation import flattened
+from openvima.user_code import with_absolute_path
 
 # Settings that only networks of this package have.
 _OF_PRESETS = ("t5", "autoregressive", "visual_residual")
@@ -90,7 +91,8 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
     }
     if unknown := [name for name, value in given.items() if value]:
         raise ConfigError(f"a learner of your own does not know {' or '.join(unknown)}; leave it out.")
-    return replace(config, pretraining=replace(config.pretraining, steps=0))
+    preset = with_absolute_path(config.preset)  # the run folder names it to evaluations in other folders
+    return replace(config, preset=preset, pretraining=replace(config.pretraining, steps=0))
 
 
 def _sizes(config: TrainingConfig) -> PolicyConfig:

@@ -12,6 +12,7 @@ from torch import nn
 from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.errors import CheckpointError, ConfigError
 from openvima.perception.preprocessing import InputKind
+from openvima.policies.base import Policy
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
@@ -29,7 +30,7 @@ Collate = Callable[[Sequence[Example], Sequence[np.random.Generator] | None], An
 
 
 class Learner(nn.Module):
-    """Base class of trained modules; your own needs `collator` and `forward`.
+    """Base class of trained modules; your own needs `collator`, `forward` and, for evaluation, `policy`.
 
     Attributes:
         input_kind: "objects" or "frames".
@@ -51,6 +52,19 @@ class Learner(nn.Module):
     def forward(self, batch: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:  # Any: its own batch
         """Return the loss and metrics by name, means over all steps of the batch."""
         raise NotImplementedError
+
+    def policy(self) -> Policy:
+        """Return the trained module as a policy, which `openvima evaluate --policy RUN` scores.
+
+        It is called in evaluation mode, with the weights of a checkpoint.
+
+        Raises:
+            ConfigError: The class does not have this method of its own.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} has no method policy, which returns a policy with its weights; add one "
+            "to evaluate the run."
+        )
 
     def write(self, folder: Path, weights: Mapping[str, torch.Tensor]) -> None:
         """Write a checkpoint.

@@ -1,0 +1,166 @@
+"""Policies of users' code on the command line: named, scored, recorded, and what goes wrong with them."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima import user_code
+from openvima.cli.main import main
+from openvima.errors import ConfigError, PolicyError
+from openvima.evaluation import EvaluationConfig, Results, evaluate, score
+from openvima.evaluation.config import Batch
+from openvima.evaluation.sources import policy_sources
+from openvima.policies import RandomPolicy, load_policy
+from openvima.policies.own_code import parameters_hash
+
+CODE = """
+from openvima.policies import RandomPolicy
+
+class Mine(RandomPolicy):
+    weights_hash = "first weights"
+
+    def act(self, observations):
+        return self.edited(super().act(observations))
+
+    def edited(self, actions):
+        return actions
+
+def make():
+    return Mine(seed=3)
+"""
+CELLS = {"tasks": ("rotate",), "levels": ("L1",), "episodes": 2}
+
+
+@pytest.fixture(autouse=True)
+def _restored(monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(user_code, "_loaded", {})
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my policies.py").write_text(CODE)
+    return Path("my policies.py")
+
+
+def edited(body: str) -> str:
+    return CODE.replace("        return actions", f"        {body}")
+
+
+def test_a_function_of_a_file_is_scored_from_the_command_line(file, capsys):
+    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--no-report", "--out", "results"]
+    assert main(["evaluate", "--policy", "my policies.py:make,other=./my policies.py:Mine", *words]) == 0
+    results = Results.read(Path("results"))
+    record = results.policies["my-policies"]
+    assert (record["kind"], record["source"]) == ("code", "my policies.py:make")
+    assert record["weights_sha256"] == "first weights"
+    assert len(record["sha256"]) == 64
+    assert results.policies["other"]["source"] == "my policies.py:Mine"
+    assert str(file.absolute().parent) not in Path("results", "results.json").read_text()
+    same = score({"mine": RandomPolicy(seed=3)}, **CELLS)
+    assert results.row("my-policies", "rotate", "L1").outcomes == same.rows[0].outcomes
+    file.write_text(CODE + "\n")
+    assert main(["evaluate", "--policy", "my policies.py:make", *words]) == 2
+    assert "holds another evaluation" in capsys.readouterr().err
+
+
+def test_invalid_actions_are_counted_and_the_first_is_shown(file, capsys):
+    file.write_text(
+        edited("return [a and {**a, 'pose0_position': a['pose0_position'] + 9} for a in actions]")
+    )
+    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "2", "--ablations", "no_prompt"]
+    assert main(["evaluate", "--policy", "bad=my policies.py:make,random", *words, "--no-report"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "4 of 4 episodes of bad ended by an invalid action; first in rotate, L1, seed 0: pose0_pos" in said
+    assert "episodes of random" not in said
+    (found,) = json.loads(Path("evaluation/results.json").read_text())["invalid_actions"]
+    assert (found["policy"], found["invalid"], found["episodes"]) == ("bad", 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (
+            "return 1 / 0",
+            r"mine raised ZeroDivisionError: .* \(my policies.py, line 11\), in rotate, L1, seeds 0, 1",
+        ),
+        ("return actions[0]", "mine gave a dict; act must return a list with an action for each observation"),
+        ("return actions[:1]", "mine gave 1 actions for 2 observations"),
+        (
+            "return [actions[0], None]",
+            "mine gave no action for rotate, L1, seed 1, whose episode is not over",
+        ),
+    ],
+)
+def test_what_a_policy_does_wrong_is_named_with_task_and_seeds(body, message, file):
+    file.write_text(edited(body))
+    with pytest.raises(PolicyError, match=message):
+        evaluate(EvaluationConfig((f"mine={file}:make",), **CELLS))
+
+
+def test_exhausted_memory_is_no_error_of_the_policy(file, capsys):
+    file.write_text(edited("raise RuntimeError('cannot allocate memory')"))
+    words = ["--tasks", "rotate", "--levels", "L1", "--episodes", "1", "--no-report"]
+    assert main(["evaluate", "--policy", f"{file}:make", *words]) == 1
+    assert "out of memory while working on" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("return None", "make returned a NoneType without reset and act; a policy has the methods reset"),
+        ("return Mine", r"make returned the class Mine, not an object of it; return Mine\(\)"),
+        ("Mine.act = lambda self: None; return Mine()", r"whose act cannot be called as act\(observations\)"),
+        ("Mine.act = 3; return Mine()", "returned a Mine without act;"),
+        ("Mine.weights_hash = 3; return Mine()", "weights_hash of Mine is a int; give a text"),
+    ],
+)
+def test_what_is_no_policy_is_named_before_anything_is_played(body, message, file):
+    file.write_text(CODE.replace("return Mine(seed=3)", body))
+    with pytest.raises(PolicyError, match=message):
+        evaluate(EvaluationConfig((f"{file}:make",), **CELLS))
+    assert not Path("evaluation", "parts").exists()
+
+
+def test_code_that_cannot_be_loaded_is_wrong_usage_of_each_verb(file, capsys):
+    for words in (["evaluate", "--policy", "none.py:make"], ["demo", "rotate", "--policy", "none.py:make"]):
+        assert main(words) == 2
+        assert "policy names 'none.py', and there is no such Python file" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="extracts objects itself"):
+        load_policy(f"{file}:make", extractor=object())
+
+
+def test_paths_of_files_are_absolute_for_processes_in_other_folders(file):
+    (source,) = policy_sources((f"{file}:make",))
+    batch = Batch(source.name, source.source, "rotate", "L1", 0, 2)
+    moved = batch.with_whole_paths()
+    assert moved.source == f"{file.absolute()}:make"
+    assert moved.key("") == batch.key("")
+
+
+def test_weights_of_torch_modules_are_hashed_by_value():
+    torch = pytest.importorskip("torch")
+
+    class Held:
+        def __init__(self, value):
+            self.network = torch.nn.Linear(2, 1, dtype=torch.bfloat16)
+            torch.nn.init.constant_(self.network.weight, value)
+            torch.nn.init.zeros_(self.network.bias)
+            self.scale = np.ones(2)
+
+    assert parameters_hash(Held(1)) == parameters_hash(Held(1)) != parameters_hash(Held(2))
+    assert parameters_hash(Held(1).network) is not None
+    assert parameters_hash(RandomPolicy()) is None
+
+
+@pytest.mark.slow
+def test_ray_workers_load_the_same_code(file):
+    pytest.importorskip("ray")
+    config = EvaluationConfig((f"mine={file}:make",), **CELLS, batch=1, out=Path("one"))
+    one = evaluate(config).read_bytes()
+    assert evaluate(replace(config, workers=2, engine="ray", out=Path("ray"))).read_bytes() == one
