@@ -14,14 +14,16 @@ from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
 TORCH_MB = 1300
+POLICIES_THAT_EXPLAIN = "Those that do: nano, nano-bins, small, openvima-small and vima-*, trained or not."
 
 
 class Policy(Protocol):
     """Anything that maps prompt and history to actions, for several episodes at once.
 
-    Optional attributes: `modalities` names what observations hold, as `TabletopEnv` takes it; evaluations
-    provide that. Policy servers read two more: `new_session()` returns a policy with episodes of its own, and
-    `prompt_limits` is the `PromptLimits` of the policy.
+    Optional: `modalities` names what observations hold, as `TabletopEnv` takes it; evaluations provide that.
+    `explain()`, called after `act`, returns an `openvima.policies.explanation.Explanation` for each episode,
+    None for those that have ended; `openvima demo --explain` draws them. Policy servers read two more:
+    `new_session()` returns a policy with episodes of its own, and `prompt_limits` is its `PromptLimits`.
     """
 
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:

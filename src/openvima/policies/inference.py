@@ -12,9 +12,11 @@ import torch
 from openvima.errors import PolicyError
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.objects import ObjectExtractor
-from openvima.policies.base import Policy, prompt_hash
+from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash
+from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
+from openvima.policies.explanation import Explanation
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import PROMPT_LIMITS, Processor
@@ -72,6 +74,33 @@ class _Episodes:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _StepInputs:
+    """What a step is decoded from: arguments of `decode_step`; slots and features as in `_Episodes`."""
+
+    history: HistoryBatch
+    features_KF: torch.Tensor
+    previous_B1C: torch.Tensor
+    has_previous_B1: torch.Tensor
+    num_slots: tuple[int, ...]
+    features: Mapping[bytes, torch.Tensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LastStep:
+    """What `explain` needs to decode the last step once more.
+
+    Args:
+        episodes: The episodes that acted, as they were before.
+        observations: Their observations.
+        choices: Class indices that were decoded, (B, 1) each, in order.
+    """
+
+    episodes: _Episodes
+    observations: tuple[Mapping, ...]
+    choices: tuple[torch.Tensor, ...]
+
+
 class NetworkPolicy(Policy):
     """Runs a network on a batch of episodes; an episode's actions do not depend on the rest of the batch.
 
@@ -127,7 +156,9 @@ class NetworkPolicy(Policy):
         self._seed = generator.initial_seed() if generator else 0
         self._is_bounded = False  # batches of one's own may be as large as the memory allows
         self._num_prompts = 0
+        self._prompts: tuple[RenderedPrompt, ...] = ()
         self._episodes: _Episodes | None = None
+        self._last_step: _LastStep | None = None
 
     @torch.inference_mode()
     def reset(self, prompts: Sequence[RenderedPrompt]) -> None:
@@ -160,7 +191,7 @@ class NetworkPolicy(Policy):
             margins_B=None,
             features=features,
         )
-        self._num_prompts = len(prompts)
+        self._num_prompts, self._prompts, self._last_step = len(prompts), tuple(prompts), None
 
     @torch.inference_mode()
     def act(self, observations: Sequence[Mapping | None]) -> list[dict[str, np.ndarray] | None]:
@@ -192,20 +223,76 @@ class NetworkPolicy(Policy):
             )
         episodes = self._episodes.select(list(running))
         actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
+        choices: list[torch.Tensor] = []
+        last_step = _LastStep(episodes, tuple(running.values()), ())
         if running:
-            episodes = self._step(episodes, list(running.values()))
+            episodes = self._step(episodes, list(running.values()), choices)
             assert episodes.actions_BC is not None
             arrays_BC = episodes.actions_BC.cpu().numpy()
             for index, array_C in zip(running, arrays_BC, strict=True):
                 actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
         self._episodes = episodes
+        if self.network.explains and not self._is_bounded:  # the caches before a step take memory
+            self._last_step = replace(last_step, choices=tuple(choices))
         return actions
+
+    @torch.inference_mode()
+    def explain(self) -> list[Explanation | None]:
+        """Explain the last actions. The step is decoded once more; nothing changes.
+
+        Returns:
+            For each episode what was considered; None for those that have ended.
+
+        Raises:
+            PolicyError: There is no last action, or the network has no explanations.
+        """
+        if not self.network.explains:
+            kind = type(self.network).__name__
+            raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
+        if self._last_step is None or self._episodes is None:
+            raise PolicyError(
+                "there is no action to explain; call act first. Sessions of a server keep none."
+            )
+        explanations: list[Explanation | None] = [None] * self._num_prompts
+        last = self._last_step
+        if not last.observations:
+            return explanations
+        from openvima.policies.explaining import explain_row
+
+        assert self._episodes.actions_BC is not None
+        step = self._step_inputs(last.episodes, last.observations)
+        trace = self.network.explain_step(
+            last.episodes.prompt,
+            last.episodes.state,
+            step.history,
+            step.features_KF,
+            step.previous_B1C,
+            step.has_previous_B1,
+            last.choices,
+        )
+        actions_BC = self._episodes.actions_BC.cpu().numpy()
+        for row, index in enumerate(last.episodes.indices):
+            explanations[index] = explain_row(
+                trace,
+                row,
+                {key: actions_BC[row, part].copy() for key, part in ACTION_PARTS.items()},
+                self._prompts[index],
+                last.observations[row],
+                self.processor,
+                temperature=self._temperature,
+                follow_coreference=getattr(self.network.config, "coreference", False),
+            )
+        return explanations
 
     def new_session(self) -> "NetworkPolicy":
         """Return a policy for one client: it shares the network and has its own, bounded batches."""
         other = copy(self)
         other._is_bounded = True
-        other._num_prompts, other._episodes = 0, None  # never changed in place, so nothing else is shared
+        other._num_prompts, other._episodes, other._last_step = (
+            0,
+            None,
+            None,
+        )  # never changed in place, so nothing else is shared
         return other
 
     @property
@@ -253,41 +340,54 @@ class NetworkPolicy(Policy):
         """
         save_checkpoint(self.network, folder, self.processor.tokenizer, dtype=dtype)
 
-    def _step(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _Episodes:
-        """Decode one action for every running episode."""
+    def _step(
+        self, episodes: _Episodes, observations: Sequence[Mapping], choices: list[torch.Tensor]
+    ) -> _Episodes:
+        """Decode one action for every running episode, and append the classes that were chosen."""
         cached = getattr(episodes.state, "cache", episodes.state).mask_BS
         if self._is_bounded and cached.numel() > MAX_CACHED_TOKENS:
             raise PolicyError(
                 f"the histories of {len(cached)} episodes have {cached.shape[1]} tokens each, padded; this "
                 f"policy takes {MAX_CACHED_TOKENS:,} in all. Act in fewer episodes (--batch) or steps."
             )
-        batch, stack = self.processor.encode_observations(
-            [[observation] for observation in observations], episodes.num_slots
-        )
-        features_KF, features = self._encode(stack, episodes.features)
-        history = batch.to(self.device)
-        has_previous_B1 = torch.full_like(history.steps_BT, episodes.actions_BC is not None)
-        previous_BC = episodes.actions_BC
-        if previous_BC is None:
-            previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)
+        step = self._step_inputs(episodes, observations)
         strategy = sampling(episodes.generators, self._temperature) if self._temperature else greedy
         margins: list[torch.Tensor] = []
         actions_B1C, state = self.network.decode_step(
             episodes.prompt,
             episodes.state,
-            history,
-            features_KF,
-            previous_BC[:, None],
-            has_previous_B1,
-            _recording_margins(strategy, margins),
+            step.history,
+            step.features_KF,
+            step.previous_B1C,
+            step.has_previous_B1,
+            _recording(strategy, margins, choices),
         )
         return replace(
             episodes,
-            num_slots=tuple(batch.num_slots_BT[:, 0].tolist()),
+            num_slots=step.num_slots,
             state=state,
             actions_BC=actions_B1C[:, 0].to(torch.float32),  # the history holds actions as returned
             margins_B=torch.stack(margins).amin(0) if margins else None,
-            features=features,
+            features=step.features,
+        )
+
+    def _step_inputs(self, episodes: _Episodes, observations: Sequence[Mapping]) -> _StepInputs:
+        """Encode observations and previous actions."""
+        batch, stack = self.processor.encode_observations(
+            [[observation] for observation in observations], episodes.num_slots
+        )
+        features_KF, features = self._encode(stack, episodes.features)
+        history = batch.to(self.device)
+        previous_BC = episodes.actions_BC
+        if previous_BC is None:
+            previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)
+        return _StepInputs(
+            history,
+            features_KF,
+            previous_BC[:, None],
+            torch.full_like(history.steps_BT, episodes.actions_BC is not None),
+            tuple(batch.num_slots_BT[:, 0].tolist()),
+            features,
         )
 
     def _encode(
@@ -309,13 +409,16 @@ class NetworkPolicy(Policy):
         return features, dict(zip(keys, features, strict=True))
 
 
-def _recording_margins(strategy: DecodingStrategy, margins: list[torch.Tensor]) -> DecodingStrategy:
-    """Wrap a strategy to record the difference of the two best logits of each row, shape (B,)."""
+def _recording(
+    strategy: DecodingStrategy, margins: list[torch.Tensor], choices: list[torch.Tensor]
+) -> DecodingStrategy:
+    """Wrap a strategy to record the difference of the two best logits of each row, (B,), and its choices."""
 
     def recorded(logits: torch.Tensor) -> torch.Tensor:
         if logits.shape[-1] > 1:
             best, second = logits.topk(2).values.unbind(-1)
             margins.append((best - second).flatten(1).amin(1))
-        return strategy(logits)
+        choices.append(strategy(logits))
+        return choices[-1]
 
     return recorded

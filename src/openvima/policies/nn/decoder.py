@@ -293,12 +293,25 @@ class CrossBlock(nn.Module):
         self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
     ) -> torch.Tensor:
         """Map unpadded tokens to the same shape; `bias_B11P` masks the prompt."""
-        query_BLD = unpadder.pad(self.query(self.norm_attention(x_ND)))
-        query = query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
-        mixed = F.scaled_dot_product_attention(query, *prompt, attn_mask=bias_B11P)
+        mixed = F.scaled_dot_product_attention(self._queries(x_ND, unpadder), *prompt, attn_mask=bias_B11P)
         attended = self.attention_out(unpadder.unpad(mixed.transpose(1, 2).flatten(2))) + x_ND
         hidden = F.gelu(self.widen(self.norm_feed_forward(attended))) * self.gate(attended)
         return self.narrow(hidden) + attended
+
+    def last_attention(
+        self, x_ND: torch.Tensor, unpadder: Unpadder, prompt: KeysValues, bias_B11P: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the weights with which `forward` attends from the last token of each row, (B, H, P)."""
+        query_BHLK = self._queries(x_ND, unpadder)
+        last_B = unpadder.pad(torch.ones_like(x_ND[..., 0, None]))[..., 0].sum(dim=1).to(torch.int64) - 1
+        query_BHK = query_BHLK[torch.arange(len(last_B), device=last_B.device), :, last_B]
+        scores_BHP = (query_BHK[..., None, :] @ prompt[0].mT).squeeze(-2) * query_BHK.shape[-1] ** -0.5
+        return torch.softmax(scores_BHP + bias_B11P[:, 0], dim=-1)
+
+    def _queries(self, x_ND: torch.Tensor, unpadder: Unpadder) -> torch.Tensor:
+        """Return the queries of unpadded tokens, (B, H, L, K)."""
+        query_BLD = unpadder.pad(self.query(self.norm_attention(x_ND)))
+        return query_BLD.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
 
 class SelfBlock(nn.Module):

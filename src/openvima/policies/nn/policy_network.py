@@ -4,8 +4,9 @@ Shape suffixes: B batch, T steps, L prompt positions, Q tokens of a step, K imag
 features, D width of the decoder, E width of an image token, C components of an action.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -15,10 +16,11 @@ from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
 from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead, ComponentTokens
 from openvima.policies.nn.bins import SCORE, BinsConfig, BinsHead
-from openvima.policies.nn.decoder import CausalDecoder
+from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
 from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.scene import END_EFFECTORS
 
@@ -47,6 +49,7 @@ class PolicyNetwork(nn.Module):
     Attributes:
         config: All sizes.
         score: The metric that selects the best checkpoint, a fraction of 1.
+        explains: Whether `explain_step` is of use.
     """
 
     config: Any  # the config of the model
@@ -56,6 +59,7 @@ class PolicyNetwork(nn.Module):
     end_effectors: nn.Embedding
     observation_out: nn.Linear
     score = SCORE
+    explains = False  # whether there is `explain_step`
 
     @property
     def object_encoder(self) -> ObjectEncoder | None:
@@ -139,6 +143,32 @@ class PolicyNetwork(nn.Module):
         return self.head.decode_step(
             self.decoder, state, observations, previous_BTC, has_previous_BT, strategy
         )
+
+    def explain_step(
+        self,
+        prompt: Any,
+        state: Any,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+        choices: Sequence[torch.Tensor],
+    ) -> StepTrace:
+        """Decode one step as `decode_step` does, with given choices, and return what it computed.
+
+        Here for decoders with cross-attention, whose last layer gives the attention.
+        """
+        replay, weights = Replay(choices), []
+        block = cast(CrossBlock, cast(Decoder, self.decoder).cross_blocks[-1])
+        hook = block.register_forward_pre_hook(
+            lambda _, inputs: weights.append(block.last_attention(*inputs))
+        )
+        try:
+            self.decode_step(prompt, state, history, features_KF, previous_BTC, has_previous_BT, replay)
+        finally:
+            hook.remove()
+        # An autoregressive head goes on with the components of the action.
+        return StepTrace(replay.logits, {"decoder": normalized(weights[0].mean(dim=1), prompt.mask_BL)})
 
     def add_end_effector(self, tokens_BTQE: torch.Tensor, end_effector_BT: torch.Tensor) -> torch.Tensor:
         """Fuse image tokens with the end effector, and map them to the decoder's width, (B, T, Q, D)."""

@@ -6,12 +6,15 @@ prompt shows the object, the other one where it was at the first step.
 Shape suffixes as in `inputs.py`; C candidates, E kinds of them, G geometric features, H prompt queries.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
 from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
 from openvima.policies.pointer.candidates import (
     KINDS,
     NUM_GEOMETRY,
@@ -33,8 +36,8 @@ from openvima.policies.pointer.geometry import (
     rotated,
     yaw_to_bin,
 )
-from openvima.policies.pointer.grounding import TextGrounding, attend
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, at, mask_scores
+from openvima.policies.pointer.grounding import TextGrounding, attention
+from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt, at, mask_scores
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
 
 _ON_TOP_M = 0.04  # scale within which an object is in or on another one
@@ -130,6 +133,22 @@ class CandidatePointerHead(nn.Module):
         held = rotated(grasp - at(inputs.positions_BTN2, pick), yaw)
         return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
 
+    def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
+        """Decode with given choices, and return what was computed; one step."""
+        replay, candidates, mask_BL = Replay(choices), self.candidates(inputs), inputs.prompt.mask_BL
+        self.decode(inputs, replay)
+        weights = {
+            "pick": self.pick.prompt_weights(inputs),
+            "place": self.place.prompt_weights(inputs, choices[0]),
+        }
+        return StepTrace(
+            replay.logits,
+            {name: normalized(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
+            candidates.positions_BTC2[:, 0],
+            candidates.masks_BTC[:, 0],
+            candidates.kinds_C,
+        )
+
     def candidates(self, inputs: HeadInputs) -> PlaceCandidates:
         """Return all place candidates."""
         return PlaceCandidates(inputs, inputs.first_step, inputs.prompt.objects, self.grid(inputs.first_step))
@@ -176,6 +195,12 @@ class PickPointer(ObjectPointer):
         appearance_BTA = self.grounding(inputs.prompt, inputs.query_BTD)
         described_BTN = (inputs.appearance_BTNA @ appearance_BTA[..., None]).squeeze(-1)
         return super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
+
+    def prompt_weights(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return how much of the appearance that is looked for comes from each prompt position, (B, T, L)."""
+        words_BTL = self.grounding.attention(inputs.prompt, inputs.query_BTD)
+        words_BTL = words_BTL * inputs.prompt.text_appearance_BLA.norm(dim=-1)[:, None]
+        return super().prompt_weights(inputs) + self._scale(inputs).sum(dim=-1, keepdim=True) * words_BTL
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return the keys of the objects, geometry included, (B, T, N, D)."""
@@ -282,6 +307,15 @@ class PlacePointer(nn.Module):
         scores_BTN = scores_BTN * F.softplus(self.prompt_scale(context_BTD))[..., :1].detach()
         return mask_scores(scores_BTN, inputs.masks_BTN)
 
+    def prompt_weights(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
+        """Return how much of the appearance that is looked for comes from each prompt position, (B, T, L)."""
+        prompt, context_BTD = inputs.prompt, self._context(inputs, pick_BT)
+        objects_BTL = (
+            self._prompt_attention(prompt, context_BTD) * prompt.appearance_BLA.norm(dim=-1)[:, None]
+        )
+        words_BTL = self.grounding.attention(prompt, context_BTD)
+        return objects_BTL + words_BTL * prompt.text_appearance_BLA.norm(dim=-1)[:, None]
+
     def _context(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Combine the action query, the picked object and the index of the step, (B, T, D)."""
         steps_T = inputs.steps_T.clamp(max=self.step_embedding.num_embeddings - 1)
@@ -292,6 +326,10 @@ class PlacePointer(nn.Module):
     def _prompt_appearance(self, inputs: HeadInputs, context_BTD: torch.Tensor) -> torch.Tensor:
         """Appearance of what the prompt asks for, (B, T, A): from words, and from the attended object."""
         prompt = inputs.prompt
-        query_BTD, key_BLD = self.prompt_query(context_BTD), self.prompt_key(prompt.masked_BLD)
-        attended_BTA = attend(query_BTD, key_BLD, prompt.object_mask_BL, prompt.appearance_BLA)
+        attended_BTA = self._prompt_attention(prompt, context_BTD) @ prompt.appearance_BLA
         return self.grounding(prompt, context_BTD) + attended_BTA
+
+    def _prompt_attention(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
+        """Attention to the objects of the prompt, (B, T, L)."""
+        query_BTD, key_BLD = self.prompt_query(context_BTD), self.prompt_key(prompt.masked_BLD)
+        return attention(query_BTD, key_BLD, prompt.object_mask_BL)

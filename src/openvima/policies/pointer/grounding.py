@@ -23,13 +23,14 @@ class TextGrounding(nn.Module):
 
     def forward(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
         """Return the mean appearance of the attended words at each step, (B, T, A)."""
-        query_BTD, key_BLD = self.query(context_BTD), self.key(prompt.masked_BLD)
-        return attend(query_BTD, key_BLD, prompt.mask_BL, prompt.text_appearance_BLA)
+        return self.attention(prompt, context_BTD) @ prompt.text_appearance_BLA
+
+    def attention(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
+        """Return the weights of the words at each step, (B, T, L)."""
+        return attention(self.query(context_BTD), self.key(prompt.masked_BLD), prompt.mask_BL)
 
 
-def attend(
-    query_BTD: torch.Tensor, key_BLD: torch.Tensor, mask_BL: torch.Tensor, values_BLA: torch.Tensor
-) -> torch.Tensor:
-    """Scaled dot-product attention to positions of the prompt, (B, T, A)."""
+def attention(query_BTD: torch.Tensor, key_BLD: torch.Tensor, mask_BL: torch.Tensor) -> torch.Tensor:
+    """Weights of scaled dot-product attention to positions of the prompt, (B, T, L)."""
     scores_BTL = query_BTD @ key_BLD.mT * query_BTD.shape[-1] ** -0.5
-    return torch.softmax(mask_scores(scores_BTL, mask_BL[:, None]), dim=-1) @ values_BLA
+    return torch.softmax(mask_scores(scores_BTL, mask_BL[:, None]), dim=-1)

@@ -5,6 +5,7 @@ prompts, M objects in one prompt, V views, N objects in view, Q tokens of a step
 features, A width of appearance, D width of the decoder, C components of an action, R bins of rotations.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +20,7 @@ from openvima.policies.nn.history import ObservationTokens, action_segment, deco
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
+from openvima.policies.nn.step_trace import StepTrace
 from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
@@ -69,6 +71,7 @@ class Pointer(PolicyNetwork):
     """
 
     score = "accuracy"
+    explains = True
 
     def __init__(self, config: PointerConfig) -> None:
         super().__init__()
@@ -162,6 +165,20 @@ class Pointer(PolicyNetwork):
         """Decode the actions of the next steps, of which the earlier ones are in the state."""
         inputs, state = self._head_inputs(prompt, state, history, features_KF, previous_BTC, has_previous_BT)
         return self.head.decode(inputs, strategy), state
+
+    def explain_step(
+        self,
+        prompt: PointerPrompt,
+        state: DecodingState,
+        history: HistoryBatch,
+        features_KF: torch.Tensor,
+        previous_BTC: torch.Tensor,
+        has_previous_BT: torch.Tensor,
+        choices: Sequence[torch.Tensor],
+    ) -> StepTrace:
+        """Decode one step with given choices, and return what was computed."""
+        inputs, _ = self._head_inputs(prompt, state, history, features_KF, previous_BTC, has_previous_BT)
+        return self.head.trace(inputs, choices)
 
     def _head_inputs(
         self,

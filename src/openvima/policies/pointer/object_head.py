@@ -3,12 +3,15 @@
 Shape suffixes as in `inputs.py`; H prompt queries.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, masked_mean, nll
 from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.step_trace import Replay, StepTrace, normalized
 from openvima.policies.pointer.config import ObjectHeadConfig
 from openvima.policies.pointer.geometry import (
     OFFSET_UNIT_M,
@@ -78,6 +81,19 @@ class ObjectPointerHead(nn.Module):
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
         return pick_and_place(at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, place) + offset, yaw)
+
+    def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
+        """Decode with given choices, and return what was computed; one step."""
+        replay, mask_BL = Replay(choices), inputs.prompt.mask_BL
+        self.decode(inputs, replay)
+        weights = {"pick": self.pick.prompt_weights(inputs), "place": self.place.prompt_weights(inputs)}
+        return StepTrace(
+            replay.logits,
+            {name: normalized(weights_BTL[:, 0], mask_BL) for name, weights_BTL in weights.items()},
+            inputs.positions_BTN2[:, 0],
+            inputs.masks_BTN[:, 0],
+            torch.zeros(inputs.masks_BTN.shape[-1], dtype=torch.int64),
+        )
 
     def place_logits(self, inputs: HeadInputs, pick_BT: torch.Tensor) -> torch.Tensor:
         """Logits (B, T, N) of the place, given the slot of the picked object."""
@@ -155,6 +171,12 @@ class ObjectPointer(nn.Module):
         )
         appearance_BTA = (scale_BTH[..., None] * appearance_BTHA).sum(dim=2)
         return (inputs.appearance_BTNA @ appearance_BTA[..., None]).squeeze(-1)
+
+    def prompt_weights(self, inputs: HeadInputs) -> torch.Tensor:
+        """Return how much of the appearance that is looked for comes from each prompt position, (B, T, L)."""
+        weights_BTHL = torch.softmax(self._attention_scores(inputs), dim=-1)
+        weights_BTL = (self._scale(inputs)[..., None] * weights_BTHL).sum(dim=2)
+        return weights_BTL * inputs.prompt.appearance_BLA.norm(dim=-1)[:, None]
 
     def keys(self, inputs: HeadInputs) -> torch.Tensor:
         """Return the keys of the objects, (B, T, N, D)."""

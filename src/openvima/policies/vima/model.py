@@ -37,6 +37,8 @@ class Vima(PolicyNetwork):
     Source: VIMA (Jiang et al. 2023), section 4.
     """
 
+    explains = True
+
     def __init__(self, config: VimaConfig) -> None:
         super().__init__()
         width = config.decoder.width

@@ -1,0 +1,115 @@
+"""Explanations of a network's last step, out of its trace."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import torch
+
+from openvima.perception.objects import ObjectViews
+from openvima.perception.preprocessing import extract_observation
+from openvima.policies.batch import WORD, PromptBatch
+from openvima.policies.explanation import Explanation, ObjectProbability, PlaceProbability
+from openvima.policies.nn.actions import ACTION_PARTS
+from openvima.policies.nn.step_trace import StepTrace
+from openvima.policies.pointer.candidates import KINDS
+from openvima.policies.pointer.coreference import coreference
+from openvima.policies.pointer.geometry import bin_to_yaw
+from openvima.policies.processor import Processor
+from openvima.render.camera import VIEWS
+from openvima.scene import RenderedPrompt
+from openvima.video.prompt_strip import prompt_pieces
+
+COMPONENTS = tuple(
+    f"{key}.{axis}" for key, part in ACTION_PARTS.items() for axis in "xyzw"[: part.stop - part.start]
+)
+
+
+def explain_row(
+    trace: StepTrace,
+    row: int,
+    action: Mapping[str, np.ndarray],
+    prompt: RenderedPrompt,
+    observation: Mapping,
+    processor: Processor,
+    *,
+    temperature: float = 0.0,
+    follow_coreference: bool = False,
+) -> Explanation:
+    """Explain the action of one episode.
+
+    Args:
+        trace: What the network computed for the step.
+        row: Row of the episode in it.
+        action: The action.
+        prompt: Prompt of the episode.
+        observation: Its last observation.
+        processor: Encoded prompt and observation for the network.
+        temperature: Divisor of the logits, with sampling; 0 without.
+        follow_coreference: Whether words have the appearance of the images they refer to; attention to such a
+            word counts as attention to these images then.
+    """
+    scale = temperature or 1.0
+    probabilities = [
+        torch.softmax(logits[row].to("cpu", torch.float64) / scale, dim=-1).numpy() for logits in trace.logits
+    ]
+    batch, _ = processor.encode_prompts([prompt])
+    words, piece_L = _prompt_pieces(prompt, batch, processor)
+    attention = {}
+    for kind, weights_BL in trace.attention.items():
+        weights_L = weights_BL[row, : len(piece_L)].to("cpu", torch.float64)
+        if follow_coreference:
+            refers_LL = coreference(batch)[0].to(torch.float64)
+            weights_L = weights_L * (refers_LL.sum(dim=1) == 0) + weights_L @ refers_LL
+        attention[kind] = np.bincount(piece_L, weights_L.numpy(), minlength=len(words))
+    if trace.positions_BC2 is None or trace.masks_BC is None or trace.kinds_C is None:
+        bins = dict(zip(COMPONENTS, probabilities, strict=True))
+        return Explanation(action, words, attention, bins=bins)
+    picks, places, yaws = probabilities
+    found = extract_observation(observation, processor.input_kind, processor.extractor)
+    return Explanation(
+        action,
+        words,
+        attention,
+        tuple(_objects(found, picks, has_ids=processor.extractor is None)),
+        tuple(
+            PlaceProbability(KINDS[trace.kinds_C[index]], (x, y), float(places[index]))
+            for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
+            if trace.masks_BC[row, index]
+        ),
+        bin_to_yaw(torch.arange(len(yaws)), len(yaws), torch.float64).numpy(),
+        yaws,
+    )
+
+
+def _objects(found: ObjectViews, picks: np.ndarray, *, has_ids: bool) -> Iterator[ObjectProbability]:
+    grasps = found.grasp_points().tolist()
+    for slot, (object_id, (x, y)) in enumerate(zip(found.ids.tolist(), grasps, strict=True)):
+        boxes = {
+            view: tuple(found.boxes[v, slot].tolist()) for v, view in enumerate(VIEWS) if found.masks[v, slot]
+        }
+        yield ObjectProbability(object_id if has_ids else -1, boxes, (x, y), float(picks[slot]))
+
+
+def _prompt_pieces(
+    prompt: RenderedPrompt, batch: PromptBatch, processor: Processor
+) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return words and images of a prompt and an empty end, and which of them each position belongs to."""
+    rows_L, image_index_S = batch.object_index_BL[0].numpy(), batch.image_index_S.numpy()
+    shown = prompt_pieces(prompt)
+    words = (*(piece if isinstance(piece, str) else f"{{{piece.name}}}" for piece in shown), "")
+    of_words: list[int] = []
+    of_images: list[int] = []
+    for number, piece in enumerate(shown):
+        if isinstance(piece, str):
+            of_words += [number] * len(processor.tokenizer.encode(piece))
+        else:
+            of_images.append(number)
+    is_word_L = rows_L == WORD
+    num_words = int(is_word_L.sum())
+    piece_L = np.empty(len(rows_L), np.int64)
+    # All but the end token; should a tokenizer split a whole text in fewer tokens, the last ones are the end.
+    piece_L[is_word_L] = [*of_words[: num_words - 1], *[len(shown)] * num_words][:num_words]
+    # Further tokens of the objects, such as those of the second view, are numbered after all first ones.
+    object_rows = rows_L[~is_word_L] % max(1, len(image_index_S))
+    piece_L[~is_word_L] = np.array(of_images, np.int64)[image_index_S[object_rows]]
+    return words, piece_L
