@@ -44,7 +44,7 @@ from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import ACTION_WIDTH
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
-from openvima.policies.tokenizer import CLOSED_TOKENIZER, Tokenizer
+from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 from sim import circumstances
 
 HISTORY = 5
@@ -68,6 +68,7 @@ class WordHash:
     """Numbers words without the files of T5, within the size of its vocabulary."""
 
     end_id = 1
+    texture_ids = np.zeros(0, np.int64)
 
     def encode(self, text: str) -> list[int]:
         """Give each word a number that follows from its letters."""
@@ -179,8 +180,8 @@ def random_network(name: str) -> PolicyNetwork:
 
 
 def tokenizer_of(network: PolicyNetwork) -> Tokenizer:
-    """Return the closed vocabulary for networks that have it, else a stand-in for that of T5."""
-    return CLOSED_TOKENIZER if network.config.prompt.tokenizer == "closed" else WordHash()
+    """Return the benchmark's vocabulary for networks without T5, else a stand-in for that of T5."""
+    return WordTokenizer() if network.config.prompt.tokenizer == "words" else WordHash()
 
 
 def demonstrations(tasks: Sequence[str], count: int, *, min_steps: int) -> list[Demonstration]:

@@ -7,7 +7,7 @@ Shape suffixes: see `openvima.policies.batch`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ from openvima.perception.objects import (
 from openvima.policies.batch import WORD, HistoryBatch, PromptBatch
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.decoder import MAX_POSITIONS
-from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
+from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 
@@ -42,6 +42,7 @@ class PromptInput:
             stands.
         parts: Which of its tokens stands there, shape (L,), int64: the view, front before top; the number of
             the token, with frames; 0 where one token shows both views.
+        names_texture: Which words name a texture, shape (L,), bool.
         mask: Which places count, shape (L,), bool; not those of objects hidden in their view.
         objects: All objects of all images, one row an appearance in the text.
         numbers: Which image shows each of them, counted from 0 in reading order, shape (S,), int64.
@@ -51,6 +52,7 @@ class PromptInput:
     words: np.ndarray
     entries: np.ndarray
     parts: np.ndarray
+    names_texture: np.ndarray
     mask: np.ndarray
     objects: ObjectViews
     numbers: np.ndarray
@@ -89,7 +91,7 @@ class NaiveProcessor:
     layout: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_frame_pair: int = 0
-    tokenizer: Tokenizer = CLOSED_TOKENIZER
+    tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor = GROUND_TRUTH
 
     @staticmethod
@@ -99,7 +101,7 @@ class NaiveProcessor:
         extractor: ObjectExtractor | None = None,
     ) -> "NaiveProcessor":
         """Make the processor for a network that takes such inputs."""
-        tokenizer = tokenizer or CLOSED_TOKENIZER
+        tokenizer = tokenizer or WordTokenizer()
         order = PUBLISHED_ORDER if inputs.tokens == "views" else GROUND_TRUTH
         return NaiveProcessor(
             inputs.tokens, inputs.image_size, inputs.tokens_per_frame_pair, tokenizer, extractor or order
@@ -137,7 +139,10 @@ class NaiveProcessor:
         numbers = np.repeat(np.arange(len(images)), [len(image) for image in images])
         kinds = [piece.kind == "scene" for piece in sequence if isinstance(piece, PromptImage)]
         in_scene = np.array(kinds, np.bool_)[numbers]
-        return PromptInput(words, entries, parts, mask, ObjectViews.concatenated(images), numbers, in_scene)
+        named = np.isin(words, self.tokenizer.texture_ids)
+        return PromptInput(
+            words, entries, parts, named, mask, ObjectViews.concatenated(images), numbers, in_scene
+        )
 
     def start_episode(self) -> "NaiveEpisode":
         """Return the processor of one episode's observations."""
@@ -241,7 +246,7 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
     length = max(len(prompt.words) for prompt in prompts)
     words = np.full((len(prompts), length), PADDING_ID)
     images = np.full((len(prompts), length), WORD)
-    mask = np.zeros((len(prompts), length), np.bool_)
+    mask, named = np.zeros((2, len(prompts), length), np.bool_)
     first, total = 0, sum(len(prompt.objects) for prompt in prompts)
     for row, prompt in enumerate(prompts):
         size = len(prompt.words)
@@ -249,12 +254,14 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
         numbered = prompt.entries + first + prompt.parts * total
         images[row, :size] = np.where(prompt.entries == WORD, WORD, numbered)
         mask[row, :size] = prompt.mask
+        named[row, :size] = prompt.names_texture
         first += len(prompt.objects)
     objects = [prompt.objects for prompt in prompts]
     return PromptBatch(
         torch.from_numpy(words),
         torch.from_numpy(images),
         torch.from_numpy(mask),
+        torch.from_numpy(named),
         torch.from_numpy(np.concatenate(list(crops), axis=1)),
         torch.from_numpy(np.concatenate([each.boxes for each in objects], axis=1)),
         torch.from_numpy(np.concatenate([each.masks for each in objects], axis=1)),

@@ -9,7 +9,13 @@ import pytest
 import openvima
 
 ROOT = Path(__file__).parents[1]
-POLICY_FILES = {"model.safetensors", "config.yaml", "MODEL_CARD.md", "training_data.json"}
+POLICY_FILES = {
+    "model.safetensors",
+    "config.yaml",
+    "tokenizer/vocabulary.json",
+    "MODEL_CARD.md",
+    "training_data.json",
+}
 TRAINED = {
     *(f"openvima/detector/trained/{name}" for name in ("model.safetensors", "config.yaml")),
     *(f"openvima/policies/trained/openvima-small/{name}" for name in POLICY_FILES),
@@ -53,6 +59,7 @@ def test_the_policy_in_the_package_is_small_and_whole() -> None:
     from openvima.policies.bundled import BUNDLED, SMALL
 
     policy = BUNDLED[SMALL]
-    assert {file.name for file in policy.folder.iterdir()} == POLICY_FILES
-    assert sum(file.stat().st_size for file in policy.folder.iterdir()) <= 20e6
+    files = [file for file in policy.folder.rglob("*") if file.is_file()]
+    assert {file.relative_to(policy.folder).as_posix() for file in files} == POLICY_FILES
+    assert sum(file.stat().st_size for file in files) <= 20e6
     assert "TODO" not in policy.model_card.read_text(encoding="utf-8")

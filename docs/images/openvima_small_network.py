@@ -18,7 +18,7 @@ from openvima.policies import preset
 from openvima.policies.batch import WORD
 from openvima.policies.pointer.candidates import GridCandidates
 from openvima.policies.processor import Processor
-from openvima.policies.tokenizer import END_ID, word_ids
+from openvima.policies.tokenizer import END_ID, benchmark_vocabulary
 from openvima.render.camera import TOP, project
 from openvima.scene import PromptImage
 from policy import (
@@ -75,7 +75,7 @@ def draw_prompt(axes: Any, demo: Demonstration) -> None:
     """Draw the prompt, its encoder, and its scene image."""
     batch, stack = Processor.of(preset("small").inputs).encode_prompts([demo.prompt])
     crops = stack.images()[batch.crop_index_VS]
-    words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
+    words = {number: word for word, number in benchmark_vocabulary().ids().items()} | {END_ID: "end"}
     draw_text(axes, LEFT, 0.62, "prompt", fontweight="bold")
     draw_text(axes, LEFT + 0.75, 0.62, f"“{demo.prompt.text}”", family="DejaVu Sans Mono", fontsize=8.5)
     x, middles = LEFT, []

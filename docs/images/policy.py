@@ -23,7 +23,7 @@ from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.nn.bins import NUM_BINS, encode_bins
 from openvima.policies.nn.decoder import PrefixDecoderConfig
 from openvima.policies.processor import Processor
-from openvima.policies.tokenizer import END_ID, word_ids
+from openvima.policies.tokenizer import END_ID, benchmark_vocabulary
 from openvima.render import channels_last
 from openvima.scene import PromptImage, RenderedPrompt
 
@@ -88,7 +88,7 @@ def prompt_tokens(processor: Processor, prompt: RenderedPrompt) -> list[Token]:
     """Return the tokens of a prompt."""
     batch, stack = processor.encode_prompts([prompt])
     crops, num_objects = stack.images()[batch.crop_index_VS], batch.crop_index_VS.shape[1]
-    words = {number: word for word, number in word_ids().items()} | {END_ID: "end"}
+    words = {number: word for word, number in benchmark_vocabulary().ids().items()} | {END_ID: "end"}
     return [
         Token(words[word])
         if index == WORD

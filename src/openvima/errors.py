@@ -131,6 +131,10 @@ class MissingExtraError(OpenVimaError, ImportError):
     """An optional dependency is not installed; the message names the extra."""
 
 
+class UnknownWordWarning(UserWarning):
+    """A prompt has words that the policy never saw in training."""
+
+
 MAX_ECHO = 200  # characters of what others sent that an error repeats
 
 

@@ -64,10 +64,10 @@ def read_yaml(file: Path) -> Any:  # Any: plain values
     return _checked(values, file)
 
 
-def read_json(file: Path) -> Any:  # Any: plain values
-    """Read a JSON file; see `read_yaml`."""
+def read_json(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: plain values
+    """Read a JSON file of at most `max_bytes`; see `read_yaml`."""
     try:
-        values = json.loads(read_text(file))
+        values = json.loads(read_text(file, max_bytes=max_bytes))
     except InputFileError:
         raise
     except (ValueError, RecursionError) as error:

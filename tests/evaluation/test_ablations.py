@@ -17,7 +17,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.perception.objects import observe, observe_prompt_image
 from openvima.policies import RandomPolicy
-from openvima.policies.tokenizer import encode_text
+from openvima.policies.tokenizer import WordTokenizer
 from openvima.scene import RenderedPrompt
 from openvima.tasks import list_tasks, task_spec
 
@@ -53,7 +53,7 @@ def test_ablations_of_one_episode_are_equal_whenever_they_are_drawn(task):
         again = ablate(begun(task)[0], ablation)
         assert same(first.prompt, again.prompt)
         assert np.array_equal(first.id_map, again.id_map)
-        encode_text(" ".join(piece for piece in again.prompt.sequence() if isinstance(piece, str)))
+        WordTokenizer().encode(" ".join(piece for piece in again.prompt.sequence() if isinstance(piece, str)))
 
 
 def test_without_a_prompt_all_tasks_are_told_the_same():

@@ -14,7 +14,7 @@ from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.evaluation.sources import policy_sources
 from openvima.policies import RandomPolicy
-from openvima.policies.tokenizer import encode_text
+from openvima.policies.tokenizer import WordTokenizer
 from openvima.tasks import task_spec
 
 
@@ -36,7 +36,7 @@ def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
     np.testing.assert_array_equal(prompt.images["frame_0"].rgb["top"], observation["rgb"]["top"])
     words = [piece for piece in prompt.sequence() if isinstance(piece, str)]
     assert words[0] == "Follow this motion:"
-    encode_text(" ".join(words))
+    WordTokenizer().encode(" ".join(words))
 
 
 def test_an_oracle_that_finds_no_action_shows_what_it_did_until_then(monkeypatch) -> None:

@@ -10,7 +10,8 @@ import pytest
 pytest.importorskip("torch")
 
 
-from openvima.policies import preset
+from openvima.policies.bundled import BUNDLED, SMALL
+from openvima.policies.checkpoint import read_info
 from openvima.policies.parameter_counts import policy_size
 from openvima.policies.pointer.candidates import GridCandidates
 from openvima.training.recipes import RECIPES
@@ -38,7 +39,7 @@ def test_every_mark_has_an_end_and_a_table_or_figure(page: str) -> None:
 
 
 def test_numbers_of_the_network_and_its_recipe_are_right() -> None:
-    size, recipe = policy_size(preset("small")), RECIPES["small"]
+    size, recipe = policy_size(read_info(BUNDLED[SMALL].folder).config), RECIPES["small"]
     assert f"{size.parameters.total / 1e6:.1f} million parameters" in TEXT
     assert f"text encoder of {size.parts['prompt'].total / 1e6:.1f} M parameters" in TEXT
     assert f"{len(GridCandidates(1).points_mm)} grid candidates" in TEXT

@@ -24,6 +24,7 @@ from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER  # noqa: E402
 from openvima.policies.loading import load_policy  # noqa: E402
 from openvima.policies.sources import checkpoint_folder  # noqa: E402
+from openvima.policies.tokenizer import VOCABULARY_FILE  # noqa: E402
 
 
 @pytest.fixture
@@ -157,7 +158,7 @@ def test_checkpoints_that_do_not_name_a_precision_hold_float32(saved) -> None:
 
 
 def test_a_checkpoint_is_replaced_as_a_whole_or_not_at_all(saved, small_sizes, tmp_path, monkeypatch) -> None:
-    before = {file.name: file.read_bytes() for file in saved.iterdir()}
+    before = {file.name: file.read_bytes() for file in saved.rglob("*.*")}
 
     def fail(*arguments, **options):
         raise OSError("disk is full")
@@ -165,7 +166,7 @@ def test_a_checkpoint_is_replaced_as_a_whole_or_not_at_all(saved, small_sizes, t
     monkeypatch.setattr(checkpoint.yaml, "safe_dump", fail)  # the weights have been written by then
     with pytest.raises(OSError, match="disk is full"):
         save_checkpoint(build_network(small_sizes, seed=4), saved)
-    assert {file.name: file.read_bytes() for file in saved.iterdir()} == before
+    assert {file.name: file.read_bytes() for file in saved.rglob("*.*")} == before
     assert [path.name for path in tmp_path.iterdir()] == [saved.name]
 
 
@@ -313,8 +314,8 @@ def test_files_of_a_checkpoint_have_the_mode_of_the_umask(small_sizes, tmp_path)
     plain = tmp_path / "plain"
     plain.touch()
     save_checkpoint(build_network(small_sizes, seed=3), tmp_path / "checkpoint")
-    modes = {file.name: file.stat().st_mode for file in (tmp_path / "checkpoint").iterdir()}
-    assert modes == dict.fromkeys((WEIGHTS_FILE, CONFIG_FILE), plain.stat().st_mode)
+    modes = {file.name: file.stat().st_mode for file in (tmp_path / "checkpoint").rglob("*.*")}
+    assert modes == dict.fromkeys((WEIGHTS_FILE, CONFIG_FILE, VOCABULARY_FILE), plain.stat().st_mode)
 
 
 def test_weights_that_were_changed_behind_the_config_are_refused(saved) -> None:

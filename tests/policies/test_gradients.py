@@ -18,8 +18,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig  # noqa: E402
 from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.sizes import Size  # noqa: E402
-from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
+from openvima.policies.sizes import VOCABULARY_SIZE, Size  # noqa: E402
 from openvima.policies.vima.config import vima  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
@@ -56,7 +55,7 @@ FROZEN = {
 def prompt_sizes(trained_layers: int | None, *, train_words: bool = False) -> PromptEncoderConfig:
     text = TextEncoderConfig(width=48, num_layers=NUM_LAYERS, num_heads=2, head_width=8, hidden_width=64)
     return PromptEncoderConfig(
-        text, 48, vocabulary_size(), train_words=train_words, trained_layers=trained_layers
+        text, 48, VOCABULARY_SIZE, train_words=train_words, trained_layers=trained_layers
     )
 
 
@@ -155,7 +154,7 @@ def encoded(encoder: PromptEncoder, images_IE):
     object_index_BL = torch.full_like(word_ids_BL, -1)
     object_index_BL[:, 3 : 3 + len(images_IE) // 2] = torch.arange(len(images_IE)).view(2, -1)
     mask_BL, no_objects = torch.ones_like(word_ids_BL, dtype=torch.bool), torch.zeros(0)
-    return encoder(PromptBatch(word_ids_BL, object_index_BL, mask_BL, *[no_objects] * 6), images_IE)
+    return encoder(PromptBatch(word_ids_BL, object_index_BL, mask_BL, ~mask_BL, *[no_objects] * 6), images_IE)
 
 
 def test_gradients_reach_images_through_a_frozen_text_encoder() -> None:

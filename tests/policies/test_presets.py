@@ -16,8 +16,7 @@ from openvima.policies.nn.bins import NUM_BINS  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.vit import VitConfig  # noqa: E402
 from openvima.policies.presets import PUBLISHED, SIZE_NAMES  # noqa: E402
-from openvima.policies.sizes import SIZES  # noqa: E402
-from openvima.policies.tokenizer import vocabulary_size  # noqa: E402
+from openvima.policies.sizes import SIZES, VOCABULARY_SIZE  # noqa: E402
 
 
 @pytest.mark.parametrize("name", ["nano", "nano-bins"])
@@ -25,7 +24,7 @@ def test_presets_have_the_size_that_they_promise(name: str) -> None:
     model = build_network(preset(name), seed=0)
     count = sum(parameter.numel() for parameter in model.parameters())
     assert 2e6 < count < 4e6  # "about 3 M"
-    assert model.prompt.words.num_embeddings == vocabulary_size()
+    assert model.prompt.words.num_embeddings == VOCABULARY_SIZE
     assert all(p.dtype == torch.float32 for p in model.parameters())
 
 

@@ -17,7 +17,7 @@ from openvima.policies.checkpoint import load_checkpoint, load_network  # noqa: 
 from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.t5 import T5Tokenizer  # noqa: E402
-from openvima.policies.tokenizer import CLOSED_TOKENIZER  # noqa: E402
+from openvima.policies.tokenizer import VOCABULARY_FILE, benchmark_vocabulary  # noqa: E402
 from published_policies import small_vima, write_published, write_tokenizer  # noqa: E402
 
 HUB_ID = "owner/some.policy-1"
@@ -72,7 +72,7 @@ def assert_same_actions(first, second, demonstrations) -> None:
 
 def test_a_saved_policy_comes_back_in_every_way_of_loading(policy, demonstrations, tmp_path) -> None:
     policy.save_pretrained(tmp_path / "saved")
-    assert not (tmp_path / "saved" / TOKENIZER_FOLDER).exists()
+    assert (tmp_path / "saved" / TOKENIZER_FOLDER / VOCABULARY_FILE).is_file()
     for load in (NetworkPolicy.from_pretrained, load_policy):
         assert_same_actions(load(str(tmp_path / "saved")), policy, demonstrations)
 
@@ -130,8 +130,8 @@ def test_without_a_tokenizer_the_error_says_how_to_give_one(published) -> None:
             make()
 
 
-def test_the_closed_vocabulary_is_for_networks_that_were_made_for_it(policy) -> None:
-    assert policy.processor.tokenizer is CLOSED_TOKENIZER
+def test_networks_with_fresh_weights_have_the_words_of_the_benchmark(policy) -> None:
+    assert policy.processor.tokenizer.vocabulary == benchmark_vocabulary()
 
 
 def test_a_file_that_is_no_policy_is_refused(tmp_path) -> None:

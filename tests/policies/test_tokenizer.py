@@ -1,20 +1,26 @@
-"""The closed vocabulary: every prompt of the benchmark has ids, everything else is refused."""
+"""Vocabularies: of the benchmark, of training data and from files; words that they lack."""
 
+import json
 from itertools import product
 
 import pytest
 
 from openvima.catalog import OBJECTS, TEXTURES
 from openvima.catalog.packs import load_assets
-from openvima.errors import PromptError
+from openvima.errors import CheckpointError, PromptError, UnknownWordWarning
 from openvima.policies.tokenizer import (
-    CLOSED_TOKENIZER,
     END_ID,
     LARGEST_NUMBER,
+    MAX_WORD_LENGTH,
+    MAX_WORDS,
     PADDING_ID,
-    encode_text,
-    vocabulary_size,
-    word_ids,
+    RESERVE,
+    UNKNOWN,
+    VOCABULARY_FILE,
+    Vocabulary,
+    WordTokenizer,
+    benchmark_vocabulary,
+    split_words,
 )
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import PromptImage, RenderedPrompt
@@ -83,12 +89,16 @@ def blank_images(text: str) -> RenderedPrompt:
     return RenderedPrompt(text, {name: PromptImage(name, "object", {}, {}, ()) for name in names})
 
 
+def encode_text(text: str) -> list[int]:
+    return WordTokenizer().encode(text)
+
+
 def encoded(prompt: RenderedPrompt) -> list[int | PromptImage]:
     """Ids and images in reading order, as the processor interleaves them."""
     sequence: list[int | PromptImage] = []
     for part in prompt.sequence():
-        sequence += CLOSED_TOKENIZER.encode(part) if isinstance(part, str) else [part]
-    return [*sequence, CLOSED_TOKENIZER.end_id]
+        sequence += encode_text(part) if isinstance(part, str) else [part]
+    return [*sequence, END_ID]
 
 
 @pytest.mark.parametrize("template", TEMPLATES + HARDER, ids=lambda template: template[:24])
@@ -98,7 +108,7 @@ def test_every_prompt_of_the_17_tasks_is_encoded(template: str) -> None:
         assert sequence[-1] == END_ID
         assert sum(isinstance(part, PromptImage) for part in sequence) == text.count("{")
         ids = [part for part in sequence if isinstance(part, int)]
-        assert all(PADDING_ID < part < vocabulary_size() for part in ids)
+        assert all(PADDING_ID < part < benchmark_vocabulary().num_ids for part in ids)
 
 
 def test_there_are_as_many_templates_as_tasks() -> None:
@@ -129,7 +139,7 @@ def test_sampled_prompts_of_every_task_are_encoded(task: str) -> None:
 def test_images_stand_where_their_placeholders_stood() -> None:
     prompt = blank_images("Put the {a} into the {b}.")
     sequence = encoded(prompt)
-    ids = word_ids()
+    ids = benchmark_vocabulary().ids()
     put, into, the, stop = (ids[word] for word in ("put", "into", "the", "."))
     assert sequence == [put, the, prompt.images["a"], into, the, prompt.images["b"], stop, END_ID]
 
@@ -140,8 +150,11 @@ def test_a_placeholder_that_stands_twice_gives_its_image_twice() -> None:
 
 
 def test_no_two_words_share_an_id() -> None:
-    ids = [*word_ids().values(), *(encode_text(str(number))[0] for number in range(LARGEST_NUMBER + 1))]
-    assert len(set(ids)) == len(ids) == vocabulary_size() - 2
+    ids = [
+        *benchmark_vocabulary().ids().values(),
+        *(encode_text(str(number))[0] for number in range(LARGEST_NUMBER + 1)),
+    ]
+    assert len(set(ids)) == len(ids) == benchmark_vocabulary().num_ids - 2
     assert {PADDING_ID, END_ID}.isdisjoint(ids)
 
 
@@ -153,23 +166,106 @@ def test_words_with_hyphens_are_one_word() -> None:
     assert len(encode_text("three-sided l-shaped counter-clockwise")) == 3
 
 
-def test_unknown_words_are_all_named_and_the_first_gets_a_suggestion() -> None:
-    with pytest.raises(PromptError) as caught:
-        encode_text("Rotatte the quokka 30 degrees")
-    message = str(caught.value)
-    assert "'rotatte'" in message
-    assert "'quokka'" in message
+def test_unknown_words_are_all_named_once_and_the_first_gets_a_suggestion() -> None:
+    tokenizer = WordTokenizer()
+    with pytest.warns(UnknownWordWarning) as caught:
+        ids = tokenizer.encode("Rotatte the quokka 30 degrees, rotatte it")
+    message = str(caught[0].message)
+    assert "'rotatte', 'quokka'" in message
     assert "Did you mean 'rotate'?" in message
+    unknown = benchmark_vocabulary().ids()[UNKNOWN]
+    assert [token == unknown for token in ids] == [True, False, True, False, False, False, True, False]
+    assert tokenizer.encode("the quokka")[1] == unknown  # without a second warning, which would be an error
+    with pytest.warns(UnknownWordWarning, match="'wombat'"):
+        tokenizer.encode("the quokka and the wombat")
+    with pytest.warns(UnknownWordWarning, match="'quokka'"):
+        WordTokenizer().encode("the quokka")  # another policy
+
+
+def test_a_vocabulary_without_an_unknown_token_drops_unknown_words() -> None:
+    tokenizer = WordTokenizer(Vocabulary(("put", "the")))
+    with pytest.warns(UnknownWordWarning, match="'quokka'"):
+        assert tokenizer.encode("Put the quokka") == tokenizer.encode("put the")
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["361", "9" * 5000, "naïve", "²", "\N{ARABIC-INDIC DIGIT THREE}"],
-    ids=lambda text: ascii(text[:8]),
+    ("text", "count"),
+    [("361", 1), ("9" * 5000, 1), ("naïve", 1), ("²", 1), ("\N{ARABIC-INDIC DIGIT THREE}", 1), ("a_zz", 2)],
+    ids=lambda value: ascii(value)[:8],
 )
-def test_numbers_and_letters_beyond_the_vocabulary_are_refused(text: str) -> None:
-    with pytest.raises(PromptError):
-        encode_text(text)
+def test_numbers_and_letters_beyond_the_vocabulary_are_unknown(text: str, count: int) -> None:
+    with pytest.warns(UnknownWordWarning):
+        assert encode_text(text).count(benchmark_vocabulary().ids()[UNKNOWN]) == count
+
+
+def test_the_words_of_texts_follow_the_unknown_token_in_an_order_of_their_own() -> None:
+    texts = ["Put it between the", "and the Büro-Stuhl 400 times 30", "."]
+    vocabulary = Vocabulary().extended(texts)
+    words = (UNKNOWN, ".", "400", "and", "between", "büro-stuhl", "it", "put", "the", "times")
+    assert vocabulary.words == words
+    assert Vocabulary().extended(reversed(texts)) == vocabulary
+    assert len(set(WordTokenizer(vocabulary).encode(" ".join(texts)))) == len(words)
+    assert split_words("BU\N{COMBINING DIAERESIS}RO") == ["büro"]
+
+
+def test_words_of_textures_are_those_of_the_catalogue_that_texts_have() -> None:
+    assert Vocabulary().extended(["the red and polka dot bowl"]).texture_words == ("dot", "polka", "red")
+
+
+def test_new_words_get_ids_behind_the_known_ones() -> None:
+    before = Vocabulary().extended(["put the blue bowl"])
+    after = before.extended(["sweep the green bowl", "\x1b " + "x" * (MAX_WORD_LENGTH + 1)])
+    assert after.words == (*before.words, "green", "sweep")
+    assert after.texture_words == ("blue", "green")
+    assert after.extended(["put the green bowl"]) == after
+    assert after.size_for(after.num_ids) == after.num_ids
+    assert after.size_for(after.num_ids - 1) >= after.num_ids + RESERVE
+
+
+def test_too_many_words_are_refused() -> None:
+    with pytest.raises(PromptError, match=f"more than {MAX_WORDS}"):
+        Vocabulary().extended(map("".join, product("abcdefghijkl", repeat=4)))
+
+
+def test_a_vocabulary_is_read_as_it_was_written(tmp_path) -> None:
+    vocabulary = benchmark_vocabulary().extended(["żółw “ 🤖"])
+    WordTokenizer(vocabulary).save(tmp_path / "tokenizer")
+    assert Vocabulary.read(tmp_path / "tokenizer") == vocabulary
+    assert vocabulary.digest() != benchmark_vocabulary().digest()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ('{"words": ["a", "a"], "texture_words": []}', "'a', twice"),
+        ('{"words": ["A"], "texture_words": []}', "'A', which is no word"),
+        ('{"words": ["two words"], "texture_words": []}', "no word"),
+        ('{"words": ["\\u001b"], "texture_words": []}', "no word"),
+        ('{"words": ["%s"], "texture_words": []}' % ("x" * 65), "no word"),
+        ('{"words": ["\\ud800"], "texture_words": []}', "no word"),
+        ('{"words": ["30"], "texture_words": []}', "no word"),
+        ('{"words": [""], "texture_words": []}', "no word"),
+        ('{"words": ["a"], "texture_words": ["b"]}', "lacks its texture word 'b'"),
+        ('{"words": [1], "texture_words": []}', "lists of text"),
+        ('{"words": "abc", "texture_words": []}', "lists of text"),
+        ('{"words": ["a"]}', "with the keys"),
+        ('["a"]', "with the keys"),
+        ('{"words": [', "no valid JSON"),
+        (json.dumps({"words": ["a"] * 20001, "texture_words": []}), "20001 words"),
+        (" " * 2**23, "more than"),
+    ],
+    ids=lambda value: value[:24],
+)
+def test_a_damaged_vocabulary_is_refused(content: str, reason: str, tmp_path) -> None:
+    (tmp_path / VOCABULARY_FILE).write_text(content, encoding="utf-8")
+    with pytest.raises(CheckpointError, match=reason) as error:
+        Vocabulary.read(tmp_path)
+    assert str(error.value).isprintable() and len(str(error.value)) < 600
+
+
+def test_a_vocabulary_that_is_missing_is_named(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match=r"lacks its vocabulary, .*vocabulary\.json"):
+        Vocabulary.read(tmp_path)
 
 
 def test_a_placeholder_without_image_is_refused() -> None:
@@ -183,6 +279,16 @@ def test_empty_text_has_no_ids() -> None:
 
 
 def test_unknown_words_are_shown_short_and_without_control_characters() -> None:
-    with pytest.raises(PromptError) as error:
+    with pytest.warns(UnknownWordWarning) as caught:
         encode_text("put \x1b[2J\u202e " + "juggle " * 5000 + "x" * 5000)
-    assert str(error.value).isprintable() and len(str(error.value)) < 400
+    message = str(caught[0].message)
+    assert message.isprintable() and len(message) < 400
+
+
+def test_a_client_with_ever_new_words_is_warned_of_a_bounded_number_of_times(recwarn) -> None:
+    tokenizer = WordTokenizer()
+    for number in range(600):
+        tokenizer.encode(f"{number + 1000} {'x' * 10**4}{number}")
+    assert 100 < len(recwarn) <= 300
+    assert len(tokenizer._warned) <= 300 and max(map(len, tokenizer._warned)) <= MAX_WORD_LENGTH
+    assert "Further unknown words are not named." in str(recwarn[-1].message)

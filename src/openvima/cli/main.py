@@ -4,12 +4,15 @@ import argparse
 import errno
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE
-from openvima.errors import OpenVimaError, echo, unknown_name
+from openvima.errors import OpenVimaError, UnknownWordWarning, echo, unknown_name
 from openvima.memory import address_space_remedy, lacks_memory, require_address_space
 
 # Verb → summary. Each verb is a module of this package.
@@ -77,7 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if words[0] not in VERBS:
         return _fail(unknown_name("verb", words[0], VERBS), 2)
-    return _run(words[0], words[1:])
+    with _warnings_in_one_line():
+        return _run(words[0], words[1:])
 
 
 def _run(verb: str, rest: list[str]) -> int:
@@ -134,6 +138,24 @@ def _out(words: Sequence[str]) -> str:
     known = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     known.add_argument("--out", nargs="?")
     return known.parse_known_args([*words])[0].out or str(Path.cwd())
+
+
+@contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    """Print warnings of unknown words as errors are, without the line of code that gave them."""
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any) -> None:  # Any: file, line
+        if issubclass(category, UnknownWordWarning):
+            _fail(f"{category.__name__}: {message}", 0)
+        else:
+            shown(message, category, *place)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
 
 
 def _fail(message: str, status: int) -> int:

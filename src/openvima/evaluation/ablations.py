@@ -4,7 +4,7 @@
 |---|---|
 | `no_prompt` | the same prompt in every episode: one full stop and no image |
 | `other_prompt_images` | its own words, with the images, or their descriptions, of another episode |
-| `scrambled_words` | its own images; each word, number and mark replaced by a random word of the vocabulary |
+| `scrambled_words` | its own images; each word, number and mark replaced by a random word of the benchmark |
 | `shuffled_objects` | permuted object ids, in segmentations and in the records of the prompt |
 | `detected_boxes` | boxes from a detector |
 | `in_context` | a demonstration of the oracle in the same episode as the prompt |
@@ -27,7 +27,7 @@ import numpy as np
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import SamplingError
 from openvima.evaluation.in_context import demonstrated
-from openvima.policies.tokenizer import word_ids
+from openvima.policies.tokenizer import benchmark_vocabulary
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectRecord, Prompt, PromptImage, RenderedPrompt
 from openvima.tasks.prompts import MULTIMODAL, rewritten
@@ -137,7 +137,7 @@ def _kinds(images: tuple[tuple[str, object], ...]) -> dict[str, type]:
 
 
 def _scrambled(text: str, rng: np.random.Generator) -> str:
-    """Replace each word, number and mark by a random word of the vocabulary; placeholders stay."""
+    """Replace each word, number and mark by a random word of the benchmark; placeholders stay."""
     pieces = _PIECE.findall(text)
     drawn = rng.choice(_words(), len(pieces)).tolist()
     return " ".join(piece if piece[0] == "{" else word for piece, word in zip(pieces, drawn, strict=True))
@@ -145,7 +145,7 @@ def _scrambled(text: str, rng: np.random.Generator) -> str:
 
 @cache
 def _words() -> tuple[str, ...]:
-    return tuple(sorted(word for word in word_ids() if word[0].isalpha()))
+    return tuple(sorted(word for word in benchmark_vocabulary().words if word[0].isalpha()))
 
 
 def _shuffled(env: TabletopEnv, rng: np.random.Generator) -> AblatedInput:

@@ -47,6 +47,7 @@ class PromptBatch(TensorRecord):
         object_index_BL: Image token at a position, in the order of all first tokens, all second tokens, and
             so on; `WORD` for a word.
         mask_BL: False for padding, and for tokens of objects hidden in their view.
+        names_texture_BL: Whether a word is one of texture names, such as "blue".
         crop_index_VS: Index of each object's image in the stack.
         boxes_VS4: Boxes in pixels.
         masks_VS: Whether the object is visible in the view.
@@ -58,6 +59,7 @@ class PromptBatch(TensorRecord):
     word_ids_BL: torch.Tensor
     object_index_BL: torch.Tensor
     mask_BL: torch.Tensor
+    names_texture_BL: torch.Tensor
     crop_index_VS: torch.Tensor
     boxes_VS4: torch.Tensor
     masks_VS: torch.Tensor

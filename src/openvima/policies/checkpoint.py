@@ -1,8 +1,8 @@
-"""Checkpoints: a folder with weights, config and, where needed, the tokenizer.
+"""Checkpoints: a folder with weights, config and tokenizer.
 
 model.safetensors    weights
 config.yaml          config of the network, precision of the weights
-tokenizer/           files of the T5 tokenizer, for policies that use it
+tokenizer/           the vocabulary, or the files of the T5 tokenizer
 """
 
 import re
@@ -25,9 +25,9 @@ from openvima.policies.file_names import CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.published.checkpoint import load_published
 from openvima.policies.sources import find_checkpoint
-from openvima.policies.t5 import T5Tokenizer
+from openvima.policies.t5 import T5Tokenizer, tokenizer_for
 from openvima.policies.tensor_files import file_digest, read_safetensors, write_safetensors
-from openvima.policies.tokenizer import Tokenizer
+from openvima.policies.tokenizer import Tokenizer, WordTokenizer
 
 _KIND = "network"
 _LAYER = re.compile(r"decoder\.self_blocks\.([0-9]{1,4})\.")
@@ -68,7 +68,8 @@ def save_checkpoint(
     Args:
         network: The network.
         folder: The folder; it must not exist, be empty, or be a checkpoint.
-        tokenizer: Stored beside the weights if it is a T5 tokenizer.
+        tokenizer: Stored beside the weights, unless it is one of your own. Networks with a vocabulary have
+            that of the benchmark by default.
         dtype: Precision of the stored weights: float32, bfloat16, float16 or float64, independent of the
             network's own. float16 halves the file size and rounds less than bfloat16; such weights are
             loaded as float32.
@@ -110,7 +111,9 @@ def write_checkpoint(
         "config": config_to_dict(network.config),
     }
     atomic_write_file(folder / CONFIG_FILE, yaml.safe_dump(values, sort_keys=False))
-    if isinstance(tokenizer, T5Tokenizer):
+    if tokenizer is None and network.config.prompt.tokenizer == "words":
+        tokenizer = tokenizer_for(network.config.prompt)
+    if isinstance(tokenizer, T5Tokenizer | WordTokenizer):
         tokenizer.save(folder / TOKENIZER_FOLDER)
 
 
@@ -173,7 +176,7 @@ def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None
     """Load a network from a path, the name of a bundled checkpoint or a Hub id; see `find_checkpoint`.
 
     Returns:
-        The network, and the folder of its stored tokenizer, if there is one.
+        The network, and the folder of its stored tokenizer; None if it uses T5 and that is not stored.
 
     Raises:
         CheckpointError: There is no such folder, or it holds no readable checkpoint.
@@ -181,8 +184,9 @@ def load_network(path_or_hub_id: str | Path) -> tuple[PolicyNetwork, Path | None
     found = find_checkpoint(path_or_hub_id)
     if found.is_file():
         return load_published(found), None
-    tokenizer = found / TOKENIZER_FOLDER
-    return load_checkpoint(found), tokenizer if tokenizer.is_dir() else None
+    network, tokenizer = load_checkpoint(found), found / TOKENIZER_FOLDER
+    is_needed = network.config.prompt.tokenizer == "words"
+    return network, tokenizer if is_needed or tokenizer.is_dir() else None
 
 
 def load_weights(model: PolicyNetwork, tensors: Mapping[str, torch.Tensor], *, source: str) -> None:

@@ -113,7 +113,8 @@ class NetworkPolicy(Policy):
 
     Args:
         network: The network; it is moved to the device and precision, and set to evaluation mode.
-        tokenizer: Tokenizer of prompts; by default the closed vocabulary, for networks trained with it.
+        tokenizer: Tokenizer of prompts; by default the benchmark's vocabulary, for networks with fresh
+            weights.
         extractor: Extracts objects from images; by default from the simulator's segmentation.
         device: Device, such as "cpu" or "cuda".
         dtype: Precision; by default float64 on a CPU and float32 elsewhere.
@@ -166,7 +167,7 @@ class NetworkPolicy(Policy):
 
         Raises:
             PolicyError: The batch is empty, a prompt is too long, or a session's batch is too large for it.
-            PromptError: A prompt is empty, a word is unknown, or placeholders and images do not match.
+            PromptError: A prompt is empty, T5 lacks a word, or placeholders and images do not match.
             ShapeError: An image has another shape or dtype.
         """
         if not prompts:
@@ -320,7 +321,7 @@ class NetworkPolicy(Policy):
         Args:
             path_or_hub_id: A checkpoint folder; a run folder, of which the best checkpoint is loaded; a
                 published `.ckpt` file; the name of a bundled checkpoint; or a Hub id such as "owner/policy".
-            tokenizer: By default the one stored with the policy, or the closed vocabulary.
+            tokenizer: By default the one stored with the policy.
             **options: Options of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
 
         Raises:

@@ -40,7 +40,7 @@ from openvima.policies.kernels import (
 from openvima.policies.nn.actions import ActionTargets
 from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS, check_length
 from openvima.policies.prompt_limits import PromptLimits
-from openvima.policies.tokenizer import CLOSED_TOKENIZER, PADDING_ID, Tokenizer
+from openvima.policies.tokenizer import PADDING_ID, Tokenizer, WordTokenizer
 from openvima.render.camera import CAMERAS, VIEWS
 from openvima.scene import RenderedPrompt
 
@@ -64,14 +64,14 @@ class Processor:
             published VIMA); "frames", part of a whole frame.
         image_size: Height and width of a crop or frame.
         tokens_per_frame_pair: With frames, number of tokens of the two frames of a step.
-        tokenizer: Tokenizer of prompt text.
+        tokenizer: Tokenizer of prompt text; by default that of the benchmark's vocabulary.
         extractor: Object extractor for inference; None uses the segmentation.
     """
 
     layout: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
     tokens_per_frame_pair: int = 0
-    tokenizer: Tokenizer = CLOSED_TOKENIZER
+    tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor | None = None
     _layouts: "dict[_LayoutKey, _Layout]" = field(default_factory=dict, init=False, repr=False)
 
@@ -86,7 +86,7 @@ class Processor:
             inputs.tokens,
             inputs.image_size,
             inputs.tokens_per_frame_pair,
-            tokenizer or CLOSED_TOKENIZER,
+            tokenizer or WordTokenizer(),
             extractor,
         )
 
@@ -108,7 +108,7 @@ class Processor:
             The batch, and its image stack.
 
         Raises:
-            PromptError: A prompt is empty or too large, a word is unknown, or placeholders and images do not
+            PromptError: A prompt is empty or too large, T5 lacks a word, or placeholders and images do not
                 match.
             PolicyError: An image lacks a view, or a prompt has too many tokens.
             ShapeError: An image has another shape or dtype.
@@ -207,6 +207,7 @@ class Processor:
             word_ids_BL,
             object_index_BL,
             mask_BL,
+            np.isin(word_ids_BL, self.tokenizer.texture_ids),
             crop_index_VS,
             boxes_VS4,
             masks_VS,
@@ -224,7 +225,7 @@ class Processor:
 
         Raises:
             DatasetError: A demonstration has a step without visible objects.
-            PromptError: A prompt has a word that the vocabulary lacks.
+            PromptError: A prompt has a word that T5 lacks.
         """
         steps = _Steps.of(episodes.num_steps)
         counts, objects = episodes.objects_per_step.astype(np.int64), episodes.objects

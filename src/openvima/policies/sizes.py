@@ -7,9 +7,9 @@ from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.nn.vit import VitConfig
-from openvima.policies.tokenizer import vocabulary_size
 
 T5_VOCABULARY_SIZE = 32128
+VOCABULARY_SIZE = 768  # padding, end, 361 numbers, the 160 words of the benchmark, and a reserve
 T5_BASE = TextEncoderConfig(width=768, num_layers=12, num_heads=12, head_width=64, hidden_width=3072)
 TUNED_T5_LAYERS = 2  # as in the paper
 
@@ -96,7 +96,7 @@ def _nano() -> Size:
         width=128,
         num_layers=2,
         num_heads=4,
-        prompt=PromptEncoderConfig(text, image_width=128, vocabulary_size=vocabulary_size()),
+        prompt=PromptEncoderConfig(text, image_width=128, vocabulary_size=VOCABULARY_SIZE),
         image_width=96,
         image_layers=2,
         image_heads=4,

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from openvima.errors import (
@@ -26,7 +27,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
 from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
-from openvima.policies.tokenizer import CLOSED_TOKENIZER, END_ID, PADDING_ID, Tokenizer
+from openvima.policies.tokenizer import END_ID, PADDING_ID, Tokenizer, Vocabulary, WordTokenizer
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast
@@ -59,6 +60,7 @@ class T5Tokenizer:
     """
 
     end_id = END_ID
+    texture_ids = np.zeros(0, np.int64)  # its pieces of words describe no appearance alone
 
     def __init__(self, path_or_hub_id: str | Path) -> None:
         self._tokenizer = _read_tokenizer(path_or_hub_id)
@@ -104,15 +106,24 @@ def tokenizer_for(config: PromptEncoderConfig, source: str | Path | None = None)
 
     Args:
         config: The prompt encoder.
-        source: Folder or Hub id of the T5 tokenizer, where needed; see `T5Tokenizer`.
+        source: Folder of the stored tokenizer; for T5, also its Hub id, see `T5Tokenizer`. Without one,
+            networks with a vocabulary have that of the benchmark.
 
     Raises:
-        PolicyError: The T5 tokenizer is needed, and no source is given or the vocabularies differ.
+        PolicyError: The T5 tokenizer is needed and no source is given, or the network has fewer word
+            embeddings.
         CheckpointError: The source has no such tokenizer.
         MissingExtraError: A required package is not installed.
     """
-    if config.tokenizer == "closed":
-        return CLOSED_TOKENIZER
+    if config.tokenizer == "words":
+        words = WordTokenizer(None if source is None else Vocabulary.read(Path(source)))
+        if words.vocabulary.num_ids > config.vocabulary_size:
+            raise PolicyError(
+                f"the vocabulary {'of the benchmark' if source is None else f'in {source}'} has "
+                f"{words.vocabulary.num_ids} ids, the policy {config.vocabulary_size}; use the vocabulary of "
+                "the policy."
+            )
+        return words
     if source is None:
         raise PolicyError(
             "this policy needs the tokenizer of T5, which is not stored with it. Give it as "

@@ -1,71 +1,155 @@
-"""Tokenizer of prompts over the benchmark's closed vocabulary.
+"""Word tokenizer: a vocabulary is built from the prompts that a network is trained on, and stored with it.
 
-The vocabulary is in `vocabulary.txt`, one word a line. New words are appended: the line number is the word's
-id in every checkpoint.
+Ids are 0 for padding, 1 for the end of the prompt, then the numbers from 0 to 360, then the words of the
+vocabulary in their order. Ids behind them are a reserve: fine-tuning on new words takes them.
 """
 
 import difflib
+import hashlib
+import json
 import re
+import unicodedata
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
+import numpy as np
+
+from openvima.atomic_io import atomic_write_file
 from openvima.catalog import TEXTURES
-from openvima.errors import PromptError, echo
+from openvima.errors import CheckpointError, InputFileError, PromptError, UnknownWordWarning, echo
+from openvima.input_files import read_json
 
 PADDING_ID, END_ID = 0, 1
 LARGEST_NUMBER = 360
+UNKNOWN = "<unknown>"  # takes the place of words that a vocabulary lacks; no text has it as one piece
+VOCABULARY_FILE = "vocabulary.json"
+RESERVE = 128  # unused ids of a new vocabulary, at least
+MAX_WORDS = 20_000
+MAX_WORD_LENGTH = 64  # characters
 _FIRST_NUMBER_ID = 2
 _FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
-_MAX_SHOWN = 100  # characters of the text, and of its unknown words, in an error
-_PIECE = re.compile(r"[a-z]+(?:-[a-z]+)*|[0-9]+|\S")
+_MAX_FILE_BYTES = 2**22
+_MAX_SHOWN = 100  # characters of unknown words in a warning
+_MAX_WARNED = 256  # words that a policy warns of; a server's clients may send any number
+_PIECE = re.compile(r"[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+|\S")
 
 
-@cache
-def word_ids() -> dict[str, int]:
-    """Return the ids of all words and punctuation marks; ids below them are numbers from 0 to 360."""
-    text = resources.files("openvima.policies").joinpath("vocabulary.txt").read_text(encoding="utf-8")
-    return {word: _FIRST_WORD_ID + index for index, word in enumerate(text.split())}
-
-
-@cache
-def texture_word_ids() -> frozenset[int]:
-    """Return the ids of words in texture names, such as "blue" and "stripe"."""
-    words = {word for name in TEXTURES for word in name.split()} - {"and"}
-    return frozenset(word_ids()[word] for word in words)
-
-
-def vocabulary_size() -> int:
-    """Number of ids: padding, end token, numbers and words."""
-    return _FIRST_WORD_ID + len(word_ids())
-
-
-def encode_text(text: str) -> list[int]:
-    """Encode text, ignoring case.
-
-    Args:
-        text: Words, whole numbers from 0 to 360 and punctuation, without placeholders.
-
-    Returns:
-        One id for each word, number or punctuation mark, without end token.
-
-    Raises:
-        PromptError: A word or number is not in the vocabulary.
+def split_words(text: str) -> list[str]:
+    """Split text into words, whole numbers and punctuation marks, in lower case.
 
     Example:
-        >>> encode_text("30 degrees.") == [32, word_ids()["degrees"], word_ids()["."]]
-        True
+        >>> split_words("Put it, counter-clockwise, 30 degrees.")
+        ['put', 'it', ',', 'counter-clockwise', ',', '30', 'degrees', '.']
     """
-    ids, unknown = [], []
-    for piece in _PIECE.findall(text.lower()):
-        token = _number_id(piece) if piece[0] in "0123456789" else word_ids().get(piece)
-        if token is None:
-            unknown.append(piece)
-        else:
-            ids.append(token)
-    if unknown:
-        raise PromptError(_unknown_words(unknown, text))
-    return ids
+    return _PIECE.findall(unicodedata.normalize("NFC", text.lower()))
+
+
+@dataclass(frozen=True, slots=True)
+class Vocabulary:
+    """The words that a network knows, in the order of their ids.
+
+    Args:
+        words: Words and punctuation marks; `UNKNOWN` where unknown words have an id.
+        texture_words: Those that name textures, such as "blue" and "stripe"; sorted.
+
+    Raises:
+        PromptError: A word occurs twice or is none, or there are too many.
+    """
+
+    words: tuple[str, ...] = (UNKNOWN,)
+    texture_words: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.words) > MAX_WORDS:
+            raise PromptError(f"a vocabulary has {len(self.words)} words; allowed are {MAX_WORDS}.")
+        seen: set[str] = set()
+        for word in self.words:
+            if word in seen or not (word == UNKNOWN or _is_word(word)):
+                what = "twice" if word in seen else "which is no word in lower case"
+                raise PromptError(f"a vocabulary holds {echo(repr(word), MAX_WORD_LENGTH)}, {what}.")
+            seen.add(word)
+        if others := sorted(set(self.texture_words) - seen):
+            raise PromptError(
+                f"a vocabulary lacks its texture word {echo(repr(others[0]), MAX_WORD_LENGTH)}."
+            )
+
+    @property
+    def num_ids(self) -> int:
+        """Number of ids in use."""
+        return _FIRST_WORD_ID + len(self.words)
+
+    def ids(self) -> dict[str, int]:
+        """Return the ids of the words; ids below them are numbers from 0 to 360."""
+        return {word: _FIRST_WORD_ID + index for index, word in enumerate(self.words)}
+
+    def size_for(self, size: int) -> int:
+        """Return `size` if so many embeddings suffice, else a larger number with a fresh reserve."""
+        return size if self.num_ids <= size else -(-(self.num_ids + RESERVE) // RESERVE) * RESERVE
+
+    def extended(self, texts: Iterable[str]) -> "Vocabulary":
+        """Append the words of texts that it lacks, sorted.
+
+        Args:
+            texts: Without placeholders. What is longer than 64 characters or not printable stays unknown.
+
+        Raises:
+            PromptError: There are too many words.
+        """
+        known, new = set(self.words), set[str]()
+        for text in texts:
+            new.update(word for word in split_words(text) if word not in known and _is_word(word))
+            if len(known) + len(new) > MAX_WORDS:
+                raise PromptError(
+                    f"the prompts have more than {MAX_WORDS} different words, the most that a vocabulary "
+                    "holds; train on tasks with fewer, or on a preset that encodes prompts with T5."
+                )
+        named = new & {word for name in TEXTURES for word in split_words(name)} - {"and"}
+        return Vocabulary(self.words + tuple(sorted(new)), tuple(sorted({*self.texture_words, *named})))
+
+    def digest(self) -> str:
+        """Return a hash of words and texture words."""
+        return hashlib.blake2b(self._content().encode(), digest_size=16).hexdigest()
+
+    def write(self, folder: Path) -> None:
+        """Write `vocabulary.json` to a folder."""
+        atomic_write_file(folder / VOCABULARY_FILE, self._content())
+
+    @staticmethod
+    def read(folder: Path) -> "Vocabulary":
+        """Read the `vocabulary.json` of a folder.
+
+        Raises:
+            CheckpointError: There is none, or it holds no vocabulary.
+        """
+        file = folder / VOCABULARY_FILE
+        try:
+            values = read_json(file, max_bytes=_MAX_FILE_BYTES)
+        except FileNotFoundError:
+            raise CheckpointError(f"the checkpoint lacks its vocabulary, {file}.") from None
+        except InputFileError as error:
+            raise CheckpointError(str(error)) from error
+        if not isinstance(values, dict) or values.keys() != {"words", "texture_words"}:
+            raise CheckpointError(f"{file} must be a mapping with the keys words and texture_words.")
+        try:
+            return Vocabulary(_texts(values["words"]), _texts(values["texture_words"]))
+        except PromptError as error:
+            raise CheckpointError(f"{file}: {error}") from error
+
+    def _content(self) -> str:
+        values = {"words": self.words, "texture_words": self.texture_words}
+        return json.dumps(values, ensure_ascii=False, indent=0) + "\n"
+
+
+@cache
+def benchmark_vocabulary() -> Vocabulary:
+    """Return the words of the benchmark's tasks and catalogue, for networks with fresh weights."""
+    text = resources.files("openvima.policies").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    return Vocabulary().extended([text])
 
 
 class Tokenizer(Protocol):
@@ -76,35 +160,95 @@ class Tokenizer(Protocol):
         """Id that ends every prompt."""
         ...
 
+    @property
+    def texture_ids(self) -> np.ndarray:
+        """Ids of words that name textures, which masked prompts leave out."""
+        ...
+
     def encode(self, text: str) -> list[int]:
         """Encode text without placeholders; no end token is added."""
         ...
 
 
-class ClosedTokenizer:
-    """The benchmark's closed vocabulary of a few hundred ids, with no download. See `encode_text`."""
+class WordTokenizer:
+    """Encodes words by a vocabulary.
+
+    Unknown words get the id of `UNKNOWN`, or none if the vocabulary lacks it. A warning names each of them
+    once.
+
+    Args:
+        vocabulary: The words; by default those of the benchmark.
+    """
 
     end_id = END_ID
 
+    def __init__(self, vocabulary: Vocabulary | None = None) -> None:
+        self.vocabulary = benchmark_vocabulary() if vocabulary is None else vocabulary
+        self._ids = self.vocabulary.ids()
+        self.texture_ids = np.array([self._ids[word] for word in self.vocabulary.texture_words], np.int64)
+        self._warned: set[str] = set()
+
     def encode(self, text: str) -> list[int]:
-        """Encode text without placeholders; no end token is added."""
-        return encode_text(text)
+        """Encode text, ignoring case.
+
+        Args:
+            text: Words, whole numbers and punctuation, without placeholders.
+
+        Returns:
+            One id for each word, number or punctuation mark, without end token.
+
+        Example:
+            >>> tokenizer = WordTokenizer(Vocabulary(("degrees", ".")))
+            >>> tokenizer.encode("30 degrees.")
+            [32, 363, 364]
+        """
+        pieces = split_words(text)
+        found = [self._id(piece) for piece in pieces]
+        if None not in found:
+            return [token for token in found if token is not None]
+        self._warn([piece for piece, token in zip(pieces, found, strict=True) if token is None])
+        unknown = self._ids.get(UNKNOWN)
+        return [token for each in found if (token := unknown if each is None else each) is not None]
+
+    def save(self, folder: Path) -> None:
+        """Write the vocabulary to a folder, which is created."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.vocabulary.write(folder)
+
+    def _id(self, piece: str) -> int | None:
+        return _FIRST_NUMBER_ID + int(piece) if _is_number(piece) else self._ids.get(piece)
+
+    def _warn(self, unknown: list[str]) -> None:
+        """Name unknown words once each; a bounded number of them, of bounded length."""
+        new = [w for w in dict.fromkeys(word[:MAX_WORD_LENGTH] for word in unknown) if w not in self._warned]
+        new = new[: _MAX_WARNED - len(self._warned)]
+        if not new:
+            return
+        self._warned.update(new)
+        near = difflib.get_close_matches(new[0], self._ids, n=1)
+        last = " Further unknown words are not named." if len(self._warned) == _MAX_WARNED else ""
+        warnings.warn(
+            f"the policy never saw {echo(', '.join(map(repr, new)), _MAX_SHOWN)} in training and reads the "
+            f"prompt without what they mean.{f' Did you mean {near[0]!r}?' if near else ''} Train on "
+            f"prompts with these words, or use other ones.{last}",
+            UnknownWordWarning,
+            stacklevel=2,
+        )
 
 
-CLOSED_TOKENIZER = ClosedTokenizer()
+def _is_number(piece: str) -> bool:
+    """Whether it has an id in every vocabulary."""
+    has_digits = piece[0] in "0123456789" and len(piece) <= len(str(LARGEST_NUMBER))
+    return has_digits and int(piece) <= LARGEST_NUMBER
 
 
-def _number_id(digits: str) -> int | None:
-    if len(digits) > len(str(LARGEST_NUMBER)) or int(digits) > LARGEST_NUMBER:
-        return None
-    return _FIRST_NUMBER_ID + int(digits)
+def _is_word(word: str) -> bool:
+    if len(word) > MAX_WORD_LENGTH or not word.isprintable() or split_words(word) != [word]:
+        return False
+    return not _is_number(word)
 
 
-def _unknown_words(unknown: list[str], text: str) -> str:
-    shown = echo(", ".join(repr(word) for word in dict.fromkeys(unknown)), _MAX_SHOWN)
-    near = difflib.get_close_matches(unknown[0][:_MAX_SHOWN], word_ids(), n=1)
-    suggestion = f" Did you mean {near[0]!r}?" if near else ""
-    return (
-        f"the prompt text {echo(repr(text), _MAX_SHOWN)} contains {shown}, which the policy's vocabulary "
-        f"lacks.{suggestion} It holds the words of the 17 tasks and whole numbers from 0 to {LARGEST_NUMBER}."
-    )
+def _texts(values: Any) -> tuple[str, ...]:  # Any: whatever a file holds
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise PromptError("words and texture_words must be lists of text.")
+    return tuple(values)

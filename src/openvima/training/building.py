@@ -1,5 +1,6 @@
 """Builds the learner of a run: the network of a preset, or a learner of your own."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import load_t5, tokenizer_for
+from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
@@ -105,15 +107,18 @@ def _sizes(config: TrainingConfig) -> PolicyConfig:
     return sizes
 
 
-def build_learner(config: TrainingConfig) -> Learner:
+def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:
     """Build the learner of a run, with fresh weights or those of `init_from`.
 
     Args:
         config: All settings, `resolved`.
+        texts: Of the prompts. Their words are the vocabulary of networks without T5, or extend that of
+            `init_from`.
 
     Raises:
         CheckpointError: T5 or the initial weights are not where the settings say.
         ConfigError: The initial weights are those of a network of other sizes, or lack a tokenizer.
+        PromptError: The texts have too many different words.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
     if ":" in config.preset:
@@ -123,19 +128,24 @@ def build_learner(config: TrainingConfig) -> Learner:
         if config.init_from:
             learner.read(find_checkpoint(config.init_from))
         return learner
-    sizes, stored = _sizes(config), None
-    network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+    sizes, initial, stored = _sizes(config), None, None
     if config.init_from:
-        stored = _load_weights_of(network, config.init_from)
+        initial, stored = load_network(config.init_from)
+        _check_sizes(sizes, initial.config, config.init_from)
+        sizes = replace(sizes, prompt=initial.config.prompt)
+    if sizes.prompt.tokenizer == "t5":
+        tokenizer = _t5_tokenizer(config, sizes, stored)
+    else:
+        known = Vocabulary() if stored is None else Vocabulary.read(stored)
+        tokenizer = WordTokenizer(known.extended(texts))
+        size = tokenizer.vocabulary.size_for(sizes.prompt.vocabulary_size)
+        sizes = replace(sizes, prompt=replace(sizes.prompt, vocabulary_size=size))
+    network = build_network(sizes, seed=step_seed(config.seed, "weights", 0))
+    if initial is not None:
+        _copy_weights(initial, network)
     elif config.t5:
         load_t5(network, config.t5)
-    where = config.t5 or stored
-    if sizes.prompt.tokenizer == "t5" and where is None:
-        raise ConfigError(
-            f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
-            "folder that holds it, or to 't5-base'. Its weights are then not read."
-        )
-    processor = Processor.of(sizes.inputs, tokenizer_for(sizes.prompt, where))
+    processor = Processor.of(sizes.inputs, tokenizer)
     return PolicyLearner(
         network,
         processor,
@@ -144,19 +154,38 @@ def build_learner(config: TrainingConfig) -> Learner:
     )
 
 
-def _load_weights_of(network: PolicyNetwork, source: str) -> Path | None:
-    """Load the weights of another network, and return the folder of its tokenizer, if it has one."""
-    other, tokenizer = load_network(source)
-    ours, theirs = flattened(config_to_dict(network.config)), flattened(config_to_dict(other.config))
+def _t5_tokenizer(config: TrainingConfig, sizes: PolicyConfig, stored: Path | None) -> Tokenizer:
+    where = config.t5 or stored
+    if where is None:
+        raise ConfigError(
+            f"init_from is {config.init_from}, with which no tokenizer of T5 is stored; set t5, too, to the "
+            "folder that holds it, or to 't5-base'. Its weights are then not read."
+        )
+    return tokenizer_for(sizes.prompt, where)
+
+
+def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
+    """Check that a network can begin with the weights of another, whose vocabulary may have another size."""
+    here, there = flattened(config_to_dict(ours)), flattened(config_to_dict(theirs))
+    if ours.prompt.tokenizer == theirs.prompt.tokenizer == "words":
+        here.pop("prompt.vocabulary_size")
+        there.pop("prompt.vocabulary_size")
     differing = [
-        f"{name} is {theirs.get(name)!r} there and {ours.get(name)!r} here"
-        for name in {**theirs, **ours}
-        if theirs.get(name) != ours.get(name)
+        f"{name} is {there.get(name)!r} there and {here.get(name)!r} here"
+        for name in {**there, **here}
+        if there.get(name) != here.get(name)
     ]
     if differing:
         raise ConfigError(
             f"init_from is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that "
             "it was trained with, and the same autoregressive and visual_residual."
         )
-    network.load_state_dict(other.state_dict())
-    return tokenizer
+
+
+def _copy_weights(initial: PolicyNetwork, network: PolicyNetwork) -> None:
+    """Copy all weights; embeddings of words behind those of the other network stay fresh."""
+    weights = initial.state_dict()
+    words = network.prompt.words.weight.detach()
+    count = len(weights["prompt.words.weight"])
+    words[:count] = weights["prompt.words.weight"]
+    network.load_state_dict({**weights, "prompt.words.weight": words})

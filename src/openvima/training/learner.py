@@ -16,10 +16,11 @@ from openvima.policies.base import Policy
 from openvima.policies.batch import Batch
 from openvima.policies.checkpoint import load_weights, write_checkpoint
 from openvima.policies.config import config_to_dict
-from openvima.policies.file_names import WEIGHTS_FILE
+from openvima.policies.file_names import TOKENIZER_FOLDER, WEIGHTS_FILE
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.training.augmentation.demonstrations import NO_AUGMENTATION, DemonstrationAugmentation
 from openvima.training.augmentation.false_positives import augmented
 from openvima.training.dataset import Example
@@ -145,13 +146,24 @@ class PolicyLearner(Learner):
         write_checkpoint(self.network, folder, self.processor.tokenizer, weights=own)
 
     def read(self, folder: Path) -> None:
-        """Load the weights of a checkpoint."""
-        file = folder / WEIGHTS_FILE
+        """Load the weights of a checkpoint, which must have the same vocabulary."""
+        tokenizer, file = self.processor.tokenizer, folder / WEIGHTS_FILE
+        if isinstance(tokenizer, WordTokenizer):
+            stored = Vocabulary.read(folder / TOKENIZER_FOLDER)
+            if stored != tokenizer.vocabulary:
+                raise CheckpointError(
+                    f"{folder} has another vocabulary, with {len(stored.words)} words instead of "
+                    f"{len(tokenizer.vocabulary.words)}; train into another --out."
+                )
         load_weights(self.network, read_safetensors(file), source=str(file))
 
     def description(self) -> dict[str, Any]:  # Any: plain YAML values
-        """Return all sizes of the network."""
-        return config_to_dict(self.network.config)
+        """Return all sizes of the network, and which vocabulary it has."""
+        tokenizer, sizes = self.processor.tokenizer, config_to_dict(self.network.config)
+        if not isinstance(tokenizer, WordTokenizer):
+            return sizes
+        words = tokenizer.vocabulary
+        return {**sizes, "vocabulary": {"words": len(words.words), "digest": words.digest()}}
 
 
 class PolicyCollate:

@@ -22,6 +22,7 @@ from openvima.training.pretraining.stage import ContrastivePretraining, compares
 from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
+from openvima.training.vocabulary import training_texts
 
 
 def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout | None = None) -> Path:
@@ -44,7 +45,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         DatasetError: There are no demonstrations, or one is too long for the network.
         CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
-        PromptError: A prompt has a word that the policy's vocabulary lacks.
+        PromptError: A prompt has a word that T5 lacks, or the prompts have too many different words.
         FolderLockedError: Another run writes to the folder.
         MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
     """
@@ -58,7 +59,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         joined(runtime.device, runtime.sharding) as parallel,
         run_lock(config.out, is_first=parallel.is_first),
     ):
-        learner = build_learner(config)
+        learner = build_learner(config, training_texts(dataset, config.augmentation))
         if boxes and learner.input_kind == "frames":
             raise ConfigError(
                 f"loader.boxes is {config.loader.boxes!r}, but preset {config.preset!r} takes whole frames; "

@@ -152,10 +152,10 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
 
 
 def check_words(cache: ObjectCache, processor: Processor) -> None:
-    """Check before training that the vocabulary has the words of every prompt.
+    """Check before training that T5 has the words of every prompt; other vocabularies are built of them.
 
     Raises:
-        PromptError: A prompt has a word that the vocabulary lacks.
+        PromptError: A prompt has a word that T5 lacks.
     """
     for text in cache.texts():
         for piece in split_prompt(text):

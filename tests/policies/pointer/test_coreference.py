@@ -27,6 +27,7 @@ def weights(words: list[int], images: list[int], exist: torch.Tensor | None = No
         torch.tensor([words]),
         torch.tensor([images]),
         mask,
+        torch.zeros_like(mask),
         objects,
         objects[..., None].expand(2, 0, 4),
         objects.bool(),

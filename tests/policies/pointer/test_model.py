@@ -21,7 +21,7 @@ from openvima.policies.nn.history import shift_actions  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
-from openvima.policies.tokenizer import texture_word_ids, word_ids  # noqa: E402
+from openvima.policies.tokenizer import benchmark_vocabulary  # noqa: E402
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
@@ -263,13 +263,13 @@ def test_names_of_textures_change_text_appearance_and_not_the_masked_encoding(ne
     assert (green.text_appearance_BLA - purple.text_appearance_BLA).abs().amax(-1).nonzero().tolist() == [
         [0, 2]
     ]
-    names = [word for word in re.split(r"\W+", rest) if word_ids().get(word) in texture_word_ids()]
+    names = [word for word in re.split(r"\W+", rest) if word in benchmark_vocabulary().texture_words]
     assert green.text_appearance_BLA.abs().amax(-1).count_nonzero() == 1 + len(
         names
     )  # no other word has an appearance
 
 
 def test_words_of_textures_are_those_that_name_them_alone():
-    words = {word for word, number in word_ids().items() if number in texture_word_ids()}
+    words = set(benchmark_vocabulary().texture_words)
     assert {"blue", "stripe", "polka", "dot", "paisley", "tiles", "dark"} <= words
     assert not words & {"and", "object", "the", "texture", "wug", "kobar", "darker"}

@@ -23,8 +23,9 @@ class PromptEncoderConfig:
     Args:
         text: The text encoder.
         image_width: Hidden width of the MLP that projects image tokens into the prompt.
-        vocabulary_size: Number of word ids.
-        tokenizer: "closed", the benchmark's vocabulary; or "t5", which needs the files of the tokenizer.
+        vocabulary_size: Number of word embeddings; those behind the vocabulary are its reserve.
+        tokenizer: "words", a vocabulary that is stored with the policy; or "t5", which needs the files of the
+            tokenizer.
         train_words: Whether the word embedding is trained.
         trained_layers: How many of the last layers of the text encoder are trained, with its final norm; 0
             freezes it. None trains all of it, position biases included.
@@ -34,14 +35,14 @@ class PromptEncoderConfig:
     text: TextEncoderConfig
     image_width: int
     vocabulary_size: int
-    tokenizer: Literal["closed", "t5"] = "closed"
+    tokenizer: Literal["words", "t5"] = "words"
     train_words: bool = True
     trained_layers: int | None = None
     visual_residual: bool = False
 
     def __post_init__(self) -> None:
-        if self.tokenizer not in ("closed", "t5"):
-            raise ConfigError(f"prompt encoder: tokenizer is {self.tokenizer!r}; allowed: 'closed', 't5'.")
+        if self.tokenizer not in ("words", "t5"):
+            raise ConfigError(f"prompt encoder: tokenizer is {self.tokenizer!r}; allowed: 'words', 't5'.")
         layers = self.text.num_layers
         if self.trained_layers is not None and not 0 <= self.trained_layers <= layers:
             raise ConfigError(

@@ -10,8 +10,7 @@ from openvima.policies.nn.decoder import DecoderConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
-from openvima.policies.sizes import size
-from openvima.policies.tokenizer import vocabulary_size
+from openvima.policies.sizes import VOCABULARY_SIZE, size
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +135,7 @@ def nano() -> PointerConfig:
 
 
 def small() -> PointerConfig:
-    """8.5 M parameters: place candidates, correspondence between images, coreference in the prompt."""
+    """8.6 M parameters: place candidates, correspondence between images, coreference in the prompt."""
     text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
     images = ObjectEncoderConfig(
         ConvConfig(width=48, output_width=192, place_channels=32),
@@ -149,7 +148,7 @@ def small() -> PointerConfig:
     )
     return PointerConfig(
         images,
-        PromptEncoderConfig(text, image_width=192, vocabulary_size=vocabulary_size()),
+        PromptEncoderConfig(text, image_width=192, vocabulary_size=VOCABULARY_SIZE),
         DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
         CandidateHeadConfig(),
         correspondence=CorrespondenceConfig(),

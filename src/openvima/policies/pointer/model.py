@@ -35,7 +35,7 @@ from openvima.policies.pointer.correspondence import (
 )
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt
 from openvima.policies.pointer.object_head import ObjectPointerHead
-from openvima.policies.tokenizer import PADDING_ID, texture_word_ids
+from openvima.policies.tokenizer import PADDING_ID
 from openvima.scene import END_EFFECTORS
 
 SUCTION = END_EFFECTORS.index("suction")
@@ -117,7 +117,7 @@ class Pointer(PolicyNetwork):
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
         weights_BLL = coreference(prompts).to(features_VSF.dtype)
         tokens_BLD = self._encode(prompts, features_VSF, changes_SD, weights_BLL)
-        describes_BL = self._describes_appearance(prompts.word_ids_BL)
+        describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
         masked = replace(prompts, word_ids_BL=prompts.word_ids_BL.masked_fill(describes_BL, PADDING_ID))
         masked_BLD = self._encode(masked, torch.zeros_like(features_VSF), changes_SD, weights_BLL)
         appearance_BLA = tokens_BLD.new_zeros(*is_image_BL.shape, appearance_SA.shape[-1])
@@ -270,19 +270,13 @@ class Pointer(PolicyNetwork):
     def _rotation_between(self) -> RotationBetween | None:
         return self.images.rotation_between if self.config.images.rotation_bins else None
 
-    def _describes_appearance(self, word_ids_BL: torch.Tensor) -> torch.Tensor:
-        """Which words describe appearance, (B, L): in our own vocabulary names of textures.
-
-        Other words have no appearance: it would be that of the objects they occurred with in training.
-        """
-        if self.text_appearance is None or self.config.prompt.tokenizer != "closed":
-            return torch.zeros_like(word_ids_BL, dtype=torch.bool)
-        return torch.isin(word_ids_BL, torch.tensor(sorted(texture_word_ids()), device=word_ids_BL.device))
-
     def _described_appearance(
         self, word_ids_BL: torch.Tensor, describes_BL: torch.Tensor, like_BLA: torch.Tensor
     ) -> torch.Tensor:
-        """Appearance that words describe, (B, L, A); zero for other words."""
+        """Appearance that names of textures describe, (B, L, A).
+
+        Other words have none: it would be that of the objects they occurred with in training.
+        """
         if self.text_appearance is None:
             return torch.zeros_like(like_BLA)
         return self.text_appearance(self.prompt.words(word_ids_BL)) * describes_BL[..., None]
