@@ -17,6 +17,7 @@ def main(
     name: str | None = None,
     device: str = "cpu",
     threads: int = 1,
+    prompts: str = "multimodal",
     max_connections: int = 16,
     max_episodes: int = 64,
     max_message_mb: int = 128,
@@ -42,6 +43,9 @@ def main(
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         threads: Threads that a network computes with on the cpu. More than one are faster for large networks,
             and may change the last bits of what it gives.
+        prompts: How the policy gets prompts: multimodal, as clients send them; text, which puts a description
+            such as "the red swirl letter A" in place of each object image; or mixed, which does so with
+            probability ½. With ",paraphrased": synonyms.
         max_connections: Clients at the same time; `openvima evaluate` has one for each worker.
         max_episodes: Largest batch of episodes.
         max_message_mb: Size of the largest message, in 2**20 bytes; an image of a prompt takes 0.26.
@@ -69,6 +73,7 @@ def main(
         max_connections=max_connections,
         idle_s=idle_s,
         num_threads=threads,
+        prompts=prompts,
     )
     (source,) = policy_sources([f"{name}={policy}" if name else policy], trust_code=trust_code)
     source.check()

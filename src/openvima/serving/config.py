@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from openvima.errors import ConfigError
 from openvima.serving.packing import MAX_LENGTH
 from openvima.serving.protocol import TOKEN_VARIABLE, check_token
+from openvima.tasks.prompts import check_prompts
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,9 +24,12 @@ class ServerConfig:
         idle_s: Seconds after which a client is dropped that has not sent a whole message, or not taken an
             answer.
         num_threads: Threads that a network computes with. One gives the last bits of `openvima evaluate`.
+        prompts: "multimodal": prompts as clients send them. "text" or "mixed": with descriptions in place of
+            object images, see `openvima.make`; a policy that reads language alone serves every client.
 
     Raises:
-        ConfigError: A setting is out of its range, or the server would be open to others without a token.
+        ConfigError: A setting is out of its range, there is no such form of prompts, or the server would be
+            open to others without a token.
     """
 
     host: str = "127.0.0.1"
@@ -36,6 +40,7 @@ class ServerConfig:
     max_connections: int = 16
     idle_s: float = 600.0
     num_threads: int = 1
+    prompts: str = "multimodal"
 
     def __post_init__(self) -> None:
         problems = [
@@ -58,6 +63,7 @@ class ServerConfig:
         if problems:
             raise ConfigError(" ".join(problems))
         check_token(self.token)
+        check_prompts(self.prompts)
 
 
 def is_loopback(host: str) -> bool:

@@ -216,7 +216,7 @@ class _PolicyServer:
             self._num_connections -= 1
 
     async def _converse(self, connection: "ServerConnection") -> None:
-        session = Session(self._new_policy(), self._config.max_episodes)
+        session = Session(self._new_policy(), self._config.max_episodes, self._config.prompts)
         loop = asyncio.get_running_loop()
         reply: bytes | str = self._metadata
         while True:

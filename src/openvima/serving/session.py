@@ -22,6 +22,7 @@ from openvima.serving.protocol import (
     read_list,
     type_of,
 )
+from openvima.tasks.prompts import MULTIMODAL, described
 
 # Objects in the images of a request, on average over the largest batch. The benchmark's hardest prompts have
 # 20, and demonstrations as prompts three times as many; its observations have 9, and ids of arm and table.
@@ -42,12 +43,14 @@ class Session:
     Args:
         policy: Has no other user. Its `prompt_limits`, if any, bound the prompts.
         max_episodes: Episodes of the largest batch.
+        prompts: Form in which the policy gets prompts, see `ServerConfig`.
     """
 
-    def __init__(self, policy: Policy, max_episodes: int) -> None:
+    def __init__(self, policy: Policy, max_episodes: int, prompts: str = MULTIMODAL) -> None:
         self._policy = policy
         self._limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         self._max_episodes = max_episodes
+        self._prompts = prompts
         self._num_episodes = 0
 
     def read(self, data: bytes | str) -> Answer | str:
@@ -99,7 +102,7 @@ class Session:
             self._limits.check(prompt)
         num_objects = sum(len(image.objects) for prompt in prompts for image in prompt.images.values())
         self._check_objects(num_objects, MAX_IN_PROMPTS)
-        return prompts
+        return [described(prompt, self._prompts) for prompt in prompts]
 
     def _check_objects(self, count: int, per_episode: int) -> None:
         allowed = max(256, per_episode * self._max_episodes)  # of a single one as many as an image may have

@@ -1,20 +1,22 @@
 """Text prompts: descriptions such as "the red swirl letter A" in place of object images."""
 
 import re
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from openvima.catalog import NEUTRAL_TEXTURE, object_spec
-from openvima.errors import ConfigError, unknown_name
-from openvima.scene import ObjectImage, Placement, Prompt, Scene
+from openvima.catalog import NEUTRAL_TEXTURE, OBJECTS
+from openvima.errors import ConfigError, PromptError, echo, unknown_name
+from openvima.scene import ObjectImage, ObjectRecord, Placement, Prompt, RenderedPrompt, Scene
 
 MULTIMODAL = "multimodal"
 PROMPTS = (MULTIMODAL, "text", "mixed", "text,paraphrased", "mixed,paraphrased")
 """Forms of prompts: published; all object images described; each with probability ½; with synonyms."""
 
 _REPLACED_PROB = 0.5  # of an object image in mixed prompts
+_MAX_NAMES = 200  # characters of object and texture that others send
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _INTRODUCED = re.compile(r"\bis an? [\w-]+ $")  # "This is a wug {image}."
 _ARTICLE = re.compile(r"\b([Aa])n? $")
@@ -54,30 +56,63 @@ def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generat
         >>> rewritten(prompt, scene, "text", rng).text  # doctest: +SKIP
         'Put the red swirl letter A into the blue bowl.'
     """
-    form, _, synonyms = prompts.partition(",")
-    draws = rng.random((len(prompt.images), 2))
-    nouns: dict[str, str] = {}
     shown = {name: fill.placement for name, fill in prompt.images if isinstance(fill, ObjectImage)}
-    for (name, _fill), (image_draw, noun_draw) in zip(prompt.images, draws, strict=True):
-        if name in shown and (form == "text" or image_draw < _REPLACED_PROB) and form != MULTIMODAL:
-            names = _names(shown[name])
-            nouns[name] = names[int(noun_draw * len(names))] if synonyms else names[0]
-    phrases = {name: _description(shown[name], noun) for name, noun in nouns.items()}
+    nouns = _nouns({name: shown.get(name) for name, _ in prompt.images}, prompts, rng)
     return replace(
         prompt,
-        text=_with_phrases(prompt.text, phrases),
+        text=_with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns}),
         images=tuple((name, fill) for name, fill in prompt.images if name not in nouns),
         is_ambiguous=any(_is_ambiguous(shown[n], noun, shown.values(), scene) for n, noun in nouns.items()),
     )
 
 
-def _names(placement: Placement) -> tuple[str, ...]:
-    spec = object_spec(placement.object)
-    return (spec.name, *spec.aliases)
+def described(prompt: RenderedPrompt, prompts: str) -> RenderedPrompt:
+    """Replace object images of a rendered prompt by descriptions, as `rewritten` does before rendering.
+
+    Args:
+        prompt: The prompt. Equal ones give equal choices.
+        prompts: One of `PROMPTS`.
+
+    Raises:
+        PromptError: A name is too long.
+    """
+    if prompts == MULTIMODAL:
+        return prompt
+    records = {name: image.objects for name, image in prompt.images.items()}
+    rng = np.random.default_rng(zlib.crc32(repr((prompt.text, records)).encode()))
+    shown = {
+        name: objects[0]
+        for name, objects in records.items()
+        if prompt.images[name].kind == "object" and objects
+    }
+    for name, record in shown.items():
+        if len(record.object) + len(record.texture) > _MAX_NAMES:
+            raise PromptError(f"image {echo(name)} has names of over {_MAX_NAMES} characters; shorten them.")
+    nouns = _nouns({name: shown.get(name) for name in records}, prompts, rng)
+    text = _with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns})
+    return RenderedPrompt(text, {name: image for name, image in prompt.images.items() if name not in nouns})
 
 
-def _description(placement: Placement, noun: str) -> str:
-    return noun if placement.texture == NEUTRAL_TEXTURE else f"{placement.texture} {noun}"
+def _nouns(
+    shown: Mapping[str, Placement | ObjectRecord | None], prompts: str, rng: np.random.Generator
+) -> dict[str, str]:
+    """Choose the images to replace, and a noun for each; images of scenes are None."""
+    form, _, synonyms = prompts.partition(",")
+    nouns: dict[str, str] = {}
+    for (name, item), (image_draw, noun_draw) in zip(shown.items(), rng.random((len(shown), 2)), strict=True):
+        if item is not None and (form == "text" or (form == "mixed" and image_draw < _REPLACED_PROB)):
+            names = _names(item)
+            nouns[name] = names[int(noun_draw * len(names))] if synonyms else names[0]
+    return nouns
+
+
+def _names(item: Placement | ObjectRecord) -> tuple[str, ...]:
+    spec = OBJECTS.get(item.object)
+    return (item.object, *(spec.aliases if spec else ()))
+
+
+def _description(item: Placement | ObjectRecord, noun: str) -> str:
+    return noun if item.texture == NEUTRAL_TEXTURE else f"{item.texture} {noun}"
 
 
 def _is_ambiguous(image: Placement, noun: str, shown: Iterable[Placement], scene: Scene) -> bool:
