@@ -219,7 +219,7 @@ def test_obj_files_are_cut_into_triangles_with_what_their_faces_name() -> None:
         ("v 0 0 0\n", "no faces"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "damaged"),
         ("v 0 0 x\n", "line 1"),
-        ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "damaged"),
+        ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "line 1"),
         ("v 0 0 0\nf 0 0 0\n", "line 2"),
     ],
 )

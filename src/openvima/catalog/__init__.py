@@ -22,6 +22,7 @@ from openvima.catalog.partitions import (
     pool,
     tasks_at,
 )
+from openvima.catalog.registration import register_object, register_texture
 from openvima.catalog.textures import NEUTRAL_TEXTURE, TEXTURES, TextureSpec, texture_spec
 
 __all__ = [
@@ -48,6 +49,8 @@ __all__ = [
     "load_assets",
     "object_spec",
     "pool",
+    "register_object",
+    "register_texture",
     "tasks_at",
     "texture_spec",
 ]

@@ -59,7 +59,11 @@ def parse_obj(text: str, name: str) -> ObjMesh:
         key, _, rest = line.strip().partition(" ")
         try:
             if key in numbers:
-                numbers[key].append([float(word) for word in rest.split()[: 2 if key == "vt" else 3]])
+                length = 2 if key == "vt" else 3
+                values = [float(word) for word in rest.split()[:length]]
+                if len(values) < length:
+                    raise ValueError(f"{len(values)} numbers instead of {length}")
+                numbers[key].append(values)
             elif key == "o":
                 part += bool(faces)
             elif key == "f":

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from openvima.catalog.geometry import Vector3
 from openvima.errors import UnknownObjectError, unknown_name
 
-ObjectKind = Literal["kit", "box", "compound", "mesh"]
+ObjectKind = Literal["kit", "box", "compound", "mesh", "registered"]
 Profile = Literal["square", "circle"]
 
 NO_SYMMETRY = 2 * math.pi
@@ -30,7 +30,8 @@ class ObjectSpec:
         name: Display name, by which everything refers to the object, such as "letter A".
         id: Identifier in upper case, such as "CAPITAL_LETTER_A".
         kind: "kit" (flat prism of fixed size, origin at its bottom), "box" (of the sampled size), "compound"
-            (boxes placed from the sampled size) or "mesh" (fixed size).
+            (boxes placed from the sampled size), "mesh" (fixed size) or "registered" (a user's mesh, of
+            the sampled size).
         size_min: Smallest nominal size (x, y, z) in metres. Sampling and spacing use it; the mesh may be
             smaller or larger.
         size_max: Largest nominal size; each axis is sampled uniformly in between.
@@ -246,6 +247,10 @@ OBJECTS: dict[str, ObjectSpec] = {spec.name: spec for spec in _SPECS}
 """All objects by display name, in the benchmark's order."""
 
 
+REGISTERED_OBJECTS: dict[str, ObjectSpec] = {}
+"""Objects of users by display name, from `register_object`."""
+
+
 def object_spec(name: str) -> ObjectSpec:
     """Return the record of an object.
 
@@ -260,7 +265,10 @@ def object_spec(name: str) -> ObjectSpec:
         (0.07, 0.07, 0.07)
     """
     try:
-        return OBJECTS[name]
+        return OBJECTS.get(name) or REGISTERED_OBJECTS[name]
     except (KeyError, TypeError):
-        hint = "`openvima.catalog.OBJECTS` holds all 31."
-        raise UnknownObjectError(unknown_name("object", name, OBJECTS, hint)) from None
+        hint = (
+            "`openvima.catalog.OBJECTS` holds the 31 built-in ones; `register_object` adds one of your own."
+        )
+        known = (*OBJECTS, *REGISTERED_OBJECTS)
+        raise UnknownObjectError(unknown_name("object", name, known, hint)) from None

@@ -12,9 +12,10 @@ from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vec
 from openvima.catalog.hanoi import LONG_RODS_Z, hanoi_stand
 from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.obj_file import ObjMesh, parse_obj
-from openvima.catalog.objects import ObjectSpec, object_spec
+from openvima.catalog.objects import REGISTERED_OBJECTS, ObjectSpec, object_spec
 from openvima.catalog.pack_files import CheckoutFiles, PackFiles, known_hashes
-from openvima.catalog.textures import TextureSpec, texture_spec
+from openvima.catalog.registration import registered_geometry, registered_texture
+from openvima.catalog.textures import REGISTERED_TEXTURES, TextureSpec, texture_spec
 from openvima.errors import AssetError
 
 # Scales of meshes of fixed size, metres per mesh unit, and the height at which their origin rests.
@@ -73,6 +74,8 @@ class OriginalAssets:
             UnknownObjectError: The catalogue has no such object.
             AssetError: A mesh is missing or damaged.
         """
+        if object_name in REGISTERED_OBJECTS:
+            return registered_geometry(object_name, size, scale)
         return _protected_geometry(self.files, object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
@@ -82,6 +85,8 @@ class OriginalAssets:
             UnknownTextureError: The catalogue has no such texture.
             AssetError: The image is missing or damaged.
         """
+        if texture_name in REGISTERED_TEXTURES:
+            return registered_texture(texture_name)
         return _protected_texture(self.files, texture_name)
 
     def problems(self) -> list[str]:

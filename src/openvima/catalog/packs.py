@@ -1,4 +1,4 @@
-"""Loading of asset packs by name or folder."""
+"""Loading of asset packs by name, folder or function."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 from openvima.catalog.geometry import Assets
 from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, unknown_name
+from openvima.user_code import is_code
 
 if TYPE_CHECKING:
     from openvima.catalog.pack_files import PackFiles
 
 ASSET_PACKS = ("procedural", "original")
-"""Named packs; anything else is the path of a checkout of VIMA-Bench."""
+"""Named packs; anything else is a function of a user, or the path of a checkout of VIMA-Bench."""
 
 
 def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
@@ -20,10 +21,12 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
 
     Args:
         assets: "procedural"; "original" after `openvima assets import`, or the path of a checkout of
-            VIMA-Bench; or a pack, which is returned unchanged.
+            VIMA-Bench; MODULE:FUNCTION or FILE.py:FUNCTION, which is run, see `user_assets`; or a pack, which
+            is returned unchanged.
 
     Raises:
         AssetError: The name is unknown, the folder contains no original pack, or none was imported.
+        ConfigError: There is no such function, or it fails.
 
     Example:
         >>> load_assets("procedural").texture("blue")
@@ -37,9 +40,16 @@ def load_assets(assets: str | Path | Assets = "procedural") -> Assets:
         from openvima.catalog.pack_files import ImportedFiles
 
         return _original(ImportedFiles.present())
+    if is_code(str(assets)):
+        from openvima.catalog.user_assets import load_user_assets
+
+        return load_user_assets(str(assets))
     folder = Path(assets).expanduser()
     if not folder.is_dir():
-        hint = "Allowed: 'procedural', 'original', or the folder of a checkout of the original benchmark."
+        hint = (
+            "Allowed: 'procedural', 'original', MODULE:FUNCTION, FILE.py:FUNCTION, or the folder of a "
+            "checkout of the original benchmark."
+        )
         raise AssetError(unknown_name("asset pack or folder", str(assets), ASSET_PACKS, hint))
     return _original(folder.resolve())
 

@@ -180,7 +180,8 @@ def _pools(table: dict[str, _SetNames]) -> dict[str, Pool]:
 
 _TABLES = (_TRAIN, _TRAIN, _L2, _L3, _L4)
 _POOLS = {level: _pools(table) for level, table in zip(LEVELS, _TABLES, strict=True)}
-_ALL_TASKS = (*_TRAIN, *_L4)
+PUBLISHED_TASKS = (*_TRAIN, *_L4)
+"""The 17 tasks of the benchmark."""
 
 
 def tasks_at(level: str) -> tuple[str, ...]:
@@ -202,8 +203,8 @@ def levels_of(task: str) -> tuple[Level, ...]:
     Raises:
         UnknownTaskError: There is no such task.
     """
-    if task not in _ALL_TASKS:
-        raise UnknownTaskError(unknown_name("task", task, _ALL_TASKS))
+    if task not in PUBLISHED_TASKS:
+        raise UnknownTaskError(unknown_name("task", task, PUBLISHED_TASKS))
     return tuple(level for level in LEVELS if task in _POOLS[level])
 
 

@@ -11,7 +11,9 @@ from openvima.catalog import cache, images, materials, noise, patterns, textures
 from openvima.catalog.bodies import build_geometry, has_fixed_size
 from openvima.catalog.cache import cached_array
 from openvima.catalog.geometry import Geometry, Vector3, protect
-from openvima.catalog.textures import texture_spec
+from openvima.catalog.objects import REGISTERED_OBJECTS
+from openvima.catalog.registration import registered_geometry, registered_texture
+from openvima.catalog.textures import REGISTERED_TEXTURES, texture_spec
 
 _DRAWING_MODULES = (cache, images, materials, noise, patterns, textures)  # cache: the form of its files
 _GEOMETRIES_KEPT = 256  # containers come in any size, so the memory of shapes needs a bound
@@ -31,12 +33,16 @@ class ProceduralAssets:
 
     def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
         """Return the shape of a catalogue object; see `Assets.geometry`."""
+        if object_name in REGISTERED_OBJECTS:
+            return registered_geometry(object_name, size, scale)
         if has_fixed_size(object_name):
             size = (0.0, 0.0, 0.0)  # one entry for all sizes
         return self._build(object_name, size, scale)
 
     def texture(self, texture_name: str) -> np.ndarray:
         """Return the texture's image; see `Assets.texture`."""
+        if texture_name in REGISTERED_TEXTURES:
+            return registered_texture(texture_name)
         if texture_name not in self._textures:
             texture = _load_texture(texture_name)
             texture.setflags(write=False)

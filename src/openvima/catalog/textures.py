@@ -11,7 +11,9 @@ from typing import Literal
 
 from openvima.errors import UnknownTextureError, unknown_name
 
-TextureCategory = Literal["plain", "special", "stripe", "polka_dot_2", "swirl", "paisley", "neutral"]
+TextureCategory = Literal[
+    "plain", "special", "stripe", "polka_dot_2", "swirl", "paisley", "neutral", "registered"
+]
 Rgb = tuple[float, float, float]
 
 NEUTRAL_TEXTURE = "gray"
@@ -47,7 +49,7 @@ class TextureSpec:
     Args:
         name: Display name, such as "dark red and yellow stripe".
         id: Identifier in upper case.
-        category: Family of patterns that it belongs to; "neutral" for gray.
+        category: Family of patterns that it belongs to; "neutral" for gray, "registered" for a user's.
         is_dark: Whether it is the dark variant of another one.
         colour: RGB in [0, 1] of a plain colour, unrounded; None for a pattern.
         base_colours: Names of the colours of a pattern: first and second stripe, dots and ground, or the one
@@ -134,6 +136,9 @@ def _plain_colours() -> list[TextureSpec]:
 TEXTURES: dict[str, TextureSpec] = {spec.name: spec for spec in (*_patterns(), *_plain_colours())}
 """The 82 textures by display name: patterns, each light one followed by its dark one, then plain colours."""
 
+REGISTERED_TEXTURES: dict[str, TextureSpec] = {}
+"""Textures of users by display name, from `register_texture`."""
+
 _NEUTRAL = TextureSpec(NEUTRAL_TEXTURE, "GRAY", "neutral", colour=_unit_rgb(NEUTRAL_COLOUR))
 
 
@@ -154,7 +159,10 @@ def texture_spec(name: str) -> TextureSpec:
     if name == NEUTRAL_TEXTURE:
         return _NEUTRAL
     try:
-        return TEXTURES[name]
+        return TEXTURES.get(name) or REGISTERED_TEXTURES[name]
     except (KeyError, TypeError):
-        hint = "`openvima.catalog.TEXTURES` holds all 82."
-        raise UnknownTextureError(unknown_name("texture", name, TEXTURES, hint)) from None
+        hint = (
+            "`openvima.catalog.TEXTURES` holds the 82 built-in ones; `register_texture` adds one of your own."
+        )
+        known = (*TEXTURES, *REGISTERED_TEXTURES)
+        raise UnknownTextureError(unknown_name("texture", name, known, hint)) from None

@@ -16,7 +16,8 @@ def gallery(*, out: Path, assets: str = "procedural") -> int:
 
     Args:
         out: Folder to write index.html and its pictures to.
-        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
 
     Returns:
         Exit status.

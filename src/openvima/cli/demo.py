@@ -33,7 +33,8 @@ def main(
         policy: oracle, openvima-small (bundled), random, untrained, a preset, the
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
             a published file, an id on the Hugging Face Hub, or a policy server (ws://HOST:PORT).
-        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd.
         difficulty: easy, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each

@@ -65,7 +65,8 @@ def main(
         seed: Number of the first episode; evaluation episodes never occur in training.
         workers: Processes; by default one, or all CPUs of the Ray cluster at --address.
         out: Folder to write to.
-        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
         compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
         difficulty: easy, as for all published results, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each

@@ -56,7 +56,8 @@ def main(
         compression: Codec of the files: lz4, or zstd, which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
         keep_failed: Keep episodes that the oracle did not solve too, in the folder's "failed".
-        assets: procedural, original (see `openvima assets import`), or a checkout of the original benchmark.
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
         difficulty: easy, as for all published results, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each

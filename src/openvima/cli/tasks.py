@@ -28,7 +28,8 @@ def main(
     Args:
         as_json: Print JSON instead of a table.
         gallery: Write an HTML page with an image of each task into this folder.
-        assets: Asset pack of the gallery: procedural, original, or the folder of a checkout of VIMA-Bench.
+        assets: Asset pack of the gallery: procedural, original, the folder of a checkout of VIMA-Bench, or
+            FILE.py:FUNCTION, which registers assets of your own.
 
     Returns:
         Exit status.

@@ -15,8 +15,10 @@ from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
 from openvima.errors import ShardError, unknown_name
 from openvima.tasks.prompts import MULTIMODAL
+from openvima.user_code import is_code
 
 _METADATA_KEY = b"openvima"
+_MAX_FUNCTION = 200  # characters
 _WORD = re.compile(r"\w[\w .+-]{0,100}")
 _NAMES = COLUMNS.names
 _TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
@@ -118,9 +120,15 @@ class ShardInfo:
         except (UnicodeDecodeError, json.JSONDecodeError, AttributeError, TypeError) as error:
             raise ShardError(f"what it says of itself is damaged ({error}).") from None
         for name in ("task", "level", "domain", "assets"):  # of which names of files are made
-            if not _WORD.fullmatch(getattr(info, name)):
+            value = getattr(info, name)
+            if not _WORD.fullmatch(value) and not (name == "assets" and _is_function(value)):
                 raise ShardError(f"its {name} is {getattr(info, name)!r:.80}, which is no plain name.")
         return info
+
+
+def _is_function(assets: str) -> bool:
+    """Whether assets are named by a function, without a folder."""
+    return len(assets) <= _MAX_FUNCTION and is_code(assets) and "/" not in assets and assets.isprintable()
 
 
 def encode(

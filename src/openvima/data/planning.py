@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
+from openvima.catalog.user_assets import recorded_assets
 from openvima.data.checksums import Span
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
@@ -165,7 +166,7 @@ class GenerateConfig:
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
                 "env_config": EnvConfig(
-                    record["assets"],
+                    recorded_assets(record["assets"]),
                     record["compat"],
                     record["difficulty"],
                     record.get("prompts", MULTIMODAL),

@@ -11,11 +11,18 @@ from functools import lru_cache
 import numpy as np
 
 from openvima.catalog.packs import load_assets
+from openvima.catalog.user_assets import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS
 from openvima.env.config import EnvConfig
-from openvima.errors import AssetError, OpenVimaError, ShardError
+from openvima.errors import (
+    AssetError,
+    OpenVimaError,
+    ShardError,
+    UnknownObjectError,
+    UnknownTextureError,
+)
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import RenderedPrompt, Scene
 from openvima.tasks import sample_episode
@@ -34,12 +41,13 @@ def rerendered(demo: Demonstration, info: ShardInfo, content_hash: str) -> Demon
 
     Raises:
         ShardError: It is not the same any more: the packages that draw are others than those that wrote.
-        AssetError: The asset pack is not there.
+        AssetError: The asset pack is not there, or is a function that was not loaded before.
+        UnknownObjectError, UnknownTextureError: An object or texture of a user is not registered.
     """
     try:
         rgb, segm = draw_observations(demo.scenes, info)
         prompt = draw_prompt(demo, info)
-    except AssetError:
+    except (AssetError, UnknownObjectError, UnknownTextureError):
         raise
     except OpenVimaError as error:  # the task draws no episode for this seed, or is gone
         raise _changed(demo, info, f" ({error})") from error
@@ -92,7 +100,7 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
 
 @lru_cache(maxsize=2)
 def _rasteriser(assets: str) -> Rasteriser:
-    return Rasteriser(load_assets(assets))
+    return Rasteriser(load_assets(recorded_assets(assets)))
 
 
 def _changed(demo: Demonstration, info: ShardInfo, details: str = "") -> ShardError:

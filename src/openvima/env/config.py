@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any  # options are of whatever type a task dec
 
 from openvima.tasks.options import check_difficulty
 from openvima.tasks.prompts import MULTIMODAL, check_prompts
+from openvima.user_code import is_code, without_folder
 
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
@@ -15,7 +16,8 @@ class EnvConfig:
     """Settings of the environments, whatever the task.
 
     Args:
-        assets: Asset pack: "procedural", "original" or the folder of a checkout of VIMA-Bench.
+        assets: Asset pack: "procedural", "original", MODULE:FUNCTION, FILE.py:FUNCTION, or the folder of a
+            checkout of VIMA-Bench.
         compat: Reproduce VIMA-Bench's quirks.
         difficulty: "easy", as for all published results, "medium" or "hard".
         prompts: "multimodal", as for all published results, "text" or "mixed"; see `openvima.make`.
@@ -66,7 +68,8 @@ class EnvConfig:
 
     def record(self) -> dict[str, str | bool]:
         """Return the settings for a record, without paths and without the prompts if they are published."""
-        record = {**asdict(self), "assets": self.assets if self.assets == "procedural" else "original"}
+        is_named = self.assets == "procedural" or is_code(self.assets)
+        record = {**asdict(self), "assets": without_folder(self.assets) if is_named else "original"}
         if self.prompts == MULTIMODAL:
             del record["prompts"]
         return record

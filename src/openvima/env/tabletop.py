@@ -132,7 +132,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         level: "train", "L1", "L2", "L3" or "L4": generalization level. By default
             "train", or the only level of a task held out for L4.
         domain: "train", "eval" or "user"; equal seeds of two domains are unrelated.
-        assets: "procedural", the folder of the original asset pack, or an object with shapes and textures.
+        assets: "procedural", the folder of the original asset pack, MODULE:FUNCTION or FILE.py:FUNCTION that
+            registers assets of your own, or an object with shapes and textures.
         compat: Reproduce VIMA-Bench's quirks: objects hover at the start, ids follow the order of
             spawning, the oracle picks any visible point.
         prompts: "multimodal", as published; "text": a description such as "the red swirl letter A" in place

@@ -22,7 +22,7 @@ from openvima.policies.bundled import BUNDLED
 from openvima.tasks.registry import list_tasks, task_spec
 from openvima.tasks.sampling import check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
-from openvima.user_code import with_absolute_path
+from openvima.user_code import is_code, with_absolute_path
 
 REFERENCE_POLICIES = (RANDOM, ORACLE)  # lower and upper bound
 DEFAULT_EPISODES = 200  # as in the published tables
@@ -223,7 +223,9 @@ class Batch:
             source = with_absolute_path(source)
         elif kind == "run" and source not in BUNDLED and Path(source).exists():
             source = str(Path(source).absolute())
-        if assets not in ASSET_PACKS:
+        if is_code(assets):
+            assets = with_absolute_path(assets)
+        elif assets not in ASSET_PACKS:
             assets = str(Path(assets).expanduser().absolute())
         name, is_trained, folder = boxes.partition("=")
         boxes = f"{name}={Path(folder).absolute()}" if is_trained else with_absolute_path(boxes)

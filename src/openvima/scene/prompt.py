@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -58,7 +58,7 @@ class Prompt:
 
     text: str
     images: tuple[tuple[str, PromptFill], ...]
-    is_ambiguous: bool = False
+    is_ambiguous: bool = field(default=False, repr=False)  # published digests are of the repr
 
     @staticmethod
     def parse(template: str, **fills: PromptFill | str | int) -> "Prompt":

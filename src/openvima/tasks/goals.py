@@ -1,8 +1,9 @@
 """Progress of an episode: goals met, constraints violated, success or failure with its reason."""
 
 from dataclasses import dataclass, replace
+from typing import cast
 
-from openvima.scene import Outcome, Problem, Scene, StepContext, in_workspace
+from openvima.scene import Outcome, Problem, Scene, StepConstraint, StepContext, in_workspace
 from openvima.scene.goal import is_condition, is_monitored, object_of, unmet_reason
 
 
@@ -96,11 +97,10 @@ def _outcome(problem: Problem, open_before: tuple[int, ...], progress: Progress,
 def _first_violation(problem: Problem, context: StepContext) -> str:
     """One sentence on the first constraint that the step violates, or an empty string."""
     for constraint in problem.constraints:
+        reason = ""
         if not is_condition(constraint):
-            reason = constraint.violation(context)
-        elif is_monitored(constraint) or constraint.is_met(context.scene):  # `monitor` has tested the former
-            reason = ""
-        else:
+            reason = cast(StepConstraint, constraint).violation(context)  # the only other kind
+        elif not is_monitored(constraint) and not constraint.is_met(context.scene):  # `monitor` tests those
             reason = unmet_reason(constraint, context.scene)
         if reason:
             return reason

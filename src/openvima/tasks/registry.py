@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
+from openvima.catalog.registration import with_registered
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
 from openvima.user_code import load_file
@@ -79,12 +80,13 @@ class TaskSpec:
         raise LevelError(f"task {self.name!r} is not defined at level {level}; use {', '.join(self.levels)}.")
 
     def pool(self, level: str | None = None) -> Pool:
-        """Return the objects and textures at a level, by default the first.
+        """Return the objects and textures at a level, by default the first, registered ones included.
 
         Raises:
             LevelError: There is no such level, or the task is not defined there.
         """
-        return self.pools[self.checked_level(level)]
+        level = self.checked_level(level)
+        return with_registered(self.pools[level], self.name, level)
 
 
 _TASKS: dict[str, TaskSpec] = {}

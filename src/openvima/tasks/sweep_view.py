@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from openvima.scene import InZone, NeverTouches, Pose, Problem, Scene, Zone
+from openvima.scene.goal import object_of
 from openvima.tasks.footprints import Rectangle
 from openvima.tasks.pushes import Point, Push
 
@@ -42,7 +43,8 @@ class View:
         return View(
             goals=tuple(sorted(goals, key=distance)),
             footprints={b.id: Rectangle.of_box(b.pose, b.size[0], b.size[1]) for b in blocks},
-            met_ids=frozenset(g.object_id for g in problem.goals) - {g.object_id for g in goals},
+            met_ids=frozenset(i for g in problem.goals if (i := object_of(g)) is not None)
+            - {g.object_id for g in goals},
             lines=tuple(c.zone for c in problem.constraints if isinstance(c, NeverTouches)),
         )
 

@@ -64,8 +64,12 @@ class TableSampler:
         return options[int(self.rng.integers(len(options)))]
 
     def sample_size(self, object_name: str) -> Vector3:
-        """Draw a nominal size in metres, each axis independently."""
+        """Draw a nominal size in metres: each axis independently, of registered objects all by one factor."""
         spec = object_spec(object_name)
+        if spec.kind == "registered":  # keeps its proportions
+            least, most = np.array(spec.size_min), np.array(spec.size_max)
+            x, y, z = (least + self.rng.random() * (most - least)).tolist()
+            return (x, y, z)
         x, y, z = self.rng.uniform(spec.size_min, spec.size_max).tolist()
         return (x, y, z)
 

@@ -111,7 +111,7 @@ def recipe_settings(name: str) -> dict[str, Any]:
     return dict(RECIPES[name])
 
 
-_CODE = ("preset", "loader.boxes")  # settings that may name a function as module:function
+_CODE = ("preset", "loader.boxes", "assets")  # settings that may name a function as module:function
 
 
 def read_settings(file: Path, *, trust_code: bool = False) -> dict[str, Any]:

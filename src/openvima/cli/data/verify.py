@@ -36,16 +36,19 @@ def verify(
         repair: Generate damaged shards again, or keep the whole records of those that cannot be generated.
         workers: Number of processes.
         seed: Decides which episodes are replayed.
-        assets: Folder of the original benchmark's assets, for data made with them.
+        assets: Folder of the original benchmark's assets, or FILE.py:FUNCTION, for data made with them.
         as_json: Print the result as JSON.
 
     Returns:
         Exit status.
     """
+    from openvima.catalog.packs import load_assets
     from openvima.data.verification import VerifyConfig
     from openvima.data.verification import repair as repair_folder
     from openvima.data.verification import verify as verify_folder
 
+    if assets is not None:
+        load_assets(assets)
     config = VerifyConfig(_number(replay), seed=seed, assets=assets, workers=workers)
     with progress_bar("repairing" if repair else "verifying") as report:
         done = repair_folder(folder, config, report) if repair else None

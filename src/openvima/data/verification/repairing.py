@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from openvima.catalog.packs import load_assets
 from openvima.data.checksums import spans_of
 from openvima.data.generation import finish
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, fingerprint, finish_folder
@@ -160,6 +161,7 @@ def _origin(
 def _settings(folder: Path, record: Mapping[str, Any], config: VerifyConfig) -> GenerateConfig:  # Any: JSON
     keep_failed = any((folder / FAILED_FOLDER).glob("*"))
     if config.assets is not None and record.get("assets") != "procedural":
+        load_assets(config.assets)  # may be a function: `from_record` runs none
         record = {**record, "assets": config.assets}
     return GenerateConfig.from_record(folder, record, keep_failed=keep_failed, workers=config.workers)
 

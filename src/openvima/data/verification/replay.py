@@ -1,14 +1,15 @@
 """Replaying stored episodes: seed, oracle and actions must reproduce the same bytes."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openvima.catalog.user_assets import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.shard import Shard
@@ -76,10 +77,10 @@ def replay(
     """
     if config.replay == 0:
         return Replayed()
-    tasks = list(_chosen(inventory, findings, config))
+    tasks, refused = _runnable(_chosen(inventory, findings, config))
     total = sum(len(task.rows) for task in tasks)
     watch = None if report is None else (lambda done: report(done, total, "replaying"))
-    problems, notes = [], _notes_on_origin(findings)
+    problems, notes = [], [*_notes_on_origin(findings), *refused]
     num_replayed = 0
     for task, found in imap_unordered(replay_shard, tasks, config.workers, report=watch):
         name = task.path.name
@@ -93,6 +94,19 @@ def replay(
             else:
                 problems.append(Problem(name, f"replayed, {cause}", _REMEDY))
     return Replayed(num_replayed, tuple(problems), tuple(notes))
+
+
+def _runnable(tasks: Iterable[ReplayTask]) -> tuple[list[ReplayTask], list[str]]:
+    """Tasks whose assets may be loaded, with what to load; and a note for each of the others."""
+    runnable, notes = [], []
+    for task in tasks:
+        try:
+            from_record = task.assets == task.info.assets
+            assets = recorded_assets(task.assets) if from_record else task.assets
+            runnable.append(replace(task, assets=assets))
+        except AssetError as error:
+            notes.append(f"{task.path.name} cannot be replayed: {error}")
+    return runnable, notes
 
 
 def replay_shard(task: ReplayTask, count: Callable[[int], None]) -> list[tuple[int, str]] | str:

@@ -1,0 +1,290 @@
+"""Objects and textures of users, by name, beside those of the catalogue."""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from openvima.catalog.geometry import Geometry, Vector3, protect
+from openvima.catalog.objects import OBJECTS, REGISTERED_OBJECTS, ObjectSpec, Profile
+from openvima.catalog.partitions import LEVELS, PUBLISHED_TASKS, Level, Pool
+from openvima.catalog.textures import NEUTRAL_TEXTURE, REGISTERED_TEXTURES, TEXTURES, TextureSpec
+from openvima.catalog.user_mesh import Mesh, UserMesh, check_lengths, read_mesh
+from openvima.errors import (
+    AssetError,
+    ConfigError,
+    InputFileError,
+    LevelError,
+    ShapeError,
+    echo,
+    unknown_name,
+)
+from openvima.input_files import open_regular
+
+MAX_NAME = 40  # characters
+MAX_ALIASES = 10
+MAX_REGISTERED = 10_000  # objects, and textures
+MAX_TEXTURE_SIDE = 1024  # pixels
+MAX_PNG_BYTES = 8 << 20
+_MASS_KG = (0.001, 2.0)
+_FRICTION = (0.05, 1.0)  # as in the catalogue, none exceeds 1; see `sim.model`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Entry:
+    """A registered object or texture with what it is made of; `digest` tells whether another one is equal."""
+
+    digest: str
+    mesh: UserMesh | None = None
+    image: np.ndarray | None = None
+    tasks: tuple[str, ...] = ()
+    levels: tuple[Level, ...] = ()
+    container: bool = False
+
+
+_ENTRIES: dict[tuple[str, str], _Entry] = {}  # by "object" or "texture", and name
+
+
+def register_object(
+    name: str,
+    mesh: Mesh,
+    *,
+    size: Vector3 | None = None,
+    size_max: Vector3 | None = None,
+    symmetry_deg: float = 360.0,
+    profile: Profile | None = None,
+    aliases: Sequence[str] = (),
+    collision: Mesh | None = None,
+    double_sided: bool = False,
+    mass_kg: float = 0.1,
+    friction: float = 1.0,
+    container: bool = False,
+    tasks: Sequence[str] = (),
+    levels: Sequence[Level] = LEVELS,
+) -> ObjectSpec:
+    """Register an object of your own. Registering an equal one again changes nothing.
+
+    Args:
+        name: Its name in prompts, scenes and pools, such as "toy car".
+        mesh: An OBJ file, or a pair of vertices, shape (V, 3), and triangles, shape (F, 3): counter-clockwise
+            seen from outside, z up. Its middle becomes the origin of the object.
+        size: Lengths of its bounding box in metres, to which the mesh is scaled; with `size_max` the smallest
+            ones. None: the mesh is in metres.
+        size_max: Largest lengths; sampling draws one factor for all three. None: one size.
+        symmetry_deg: Angle above 0, up to 360, by which it can be turned without a visible change; 360: none.
+        profile: Outline that counts for "same profile".
+        aliases: Other names for paraphrased instructions.
+        collision: Convex parts, as `user_mesh.read_mesh` describes; None: the convex hull, without hollows.
+        double_sided: Draw both sides of a mesh that is not closed.
+        mass_kg: Mass.
+        friction: Coulomb friction against the table.
+        container: Others are put into it: it is a base of the pools of `tasks`, fixed to the table.
+        tasks: Tasks of your own to whose pools it is added, not published ones. A task file may also name it
+            in its pools directly.
+        levels: Levels of these pools.
+
+    Returns:
+        The catalogue record.
+
+    Raises:
+        AssetError: A name is taken or no plain name, the mesh is unfit, or a number is out of bounds.
+        ShapeError: Arrays have a wrong shape or dtype.
+        ConfigError: A task is a published one.
+        LevelError: There is no such level.
+    """
+    what = f"object {echo(repr(name))}"
+    _check_name(name, what, "object")
+    if len(aliases) > MAX_ALIASES or isinstance(aliases, str):
+        raise AssetError(f"{what} has {len(aliases)} aliases; give a list of at most {MAX_ALIASES}.")
+    for alias in aliases:
+        _check_name(alias, f"alias {echo(repr(alias))} of {what}", "object", alias=True)
+    _check_number("symmetry_deg", symmetry_deg, 0.0, 360.0, what)
+    _check_number("mass_kg", mass_kg, *_MASS_KG, what)
+    _check_number("friction", friction, *_FRICTION, what)
+    if profile not in (None, "square", "circle"):
+        raise AssetError(f"profile of {what} is {profile!r:.80}; allowed are None, 'square' and 'circle'.")
+    _check_pools(tasks, levels, what)
+    user_mesh = read_mesh(mesh, collision, double_sided=double_sided, what=what)
+    smallest = check_lengths(user_mesh.extents if size is None else size, what)
+    largest = smallest if size_max is None else check_lengths(size_max, what)
+    if any(most < least for least, most in zip(smallest, largest, strict=True)):
+        raise AssetError(f"size_max of {what} is {largest}; no side may be shorter than in size, {smallest}.")
+    x, y, z = (mass_kg / 12 * length**2 for length in smallest)
+    spec = ObjectSpec(
+        name=name,
+        id=_identifier(name),
+        kind="registered",
+        size_min=smallest,
+        size_max=largest,
+        inertia_diag=(y + z, x + z, x + y),
+        symmetry_rad=math.radians(symmetry_deg) if symmetry_deg < 360 else 2 * math.pi,
+        profile=profile,
+        mass_kg=float(mass_kg),
+        friction=float(friction),
+        aliases=tuple(aliases),
+    )
+    arrays = (user_mesh.visual.vertices, user_mesh.visual.normals, user_mesh.visual.uvs, *user_mesh.parts)
+    pools = (tuple(tasks), tuple(levels))
+    digest = _digest(repr((spec, pools, container)), *arrays)
+    entry = _Entry(digest, mesh=user_mesh, tasks=pools[0], levels=pools[1], container=container)
+    if _is_new("object", name, entry):
+        REGISTERED_OBJECTS[name] = spec
+    return spec
+
+
+def register_texture(name: str, image: np.ndarray | str | Path) -> TextureSpec:
+    """Register a texture of your own. Registering an equal one again changes nothing.
+
+    Args:
+        name: Its name in prompts, scenes and pools, such as "newspaper".
+        image: Shape (H, W, 3), uint8, row 0 on top, sides of 1 to 1024 pixels; or a PNG file.
+
+    Returns:
+        The catalogue record.
+
+    Raises:
+        AssetError: A name is taken or no plain name, or the file is no opaque PNG or too large.
+        ShapeError: The array has a wrong shape or dtype.
+    """
+    what = f"texture {echo(repr(name))}"
+    _check_name(name, what, "texture")
+    pixels = _read_png(Path(image).expanduser(), what) if isinstance(image, str | Path) else np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
+        raise ShapeError(f"{what} is {pixels.dtype} of shape {pixels.shape}; it must be uint8 of (H, W, 3).")
+    if not all(1 <= side <= MAX_TEXTURE_SIDE for side in pixels.shape[:2]):
+        height, width = pixels.shape[:2]
+        raise AssetError(
+            f"{what} has {width} × {height} pixels; sides must lie within 1 … {MAX_TEXTURE_SIDE}."
+        )
+    pixels = np.array(pixels, order="C")
+    pixels.setflags(write=False)
+    spec = TextureSpec(name, _identifier(name), "registered")
+    if _is_new("texture", name, _Entry(_digest(repr(spec) + repr(pixels.shape), pixels), image=pixels)):
+        REGISTERED_TEXTURES[name] = spec
+    return spec
+
+
+def registered_geometry(object_name: str, size: Vector3, scale: Vector3) -> Geometry:
+    """Return the shape of a registered object, with sides of some lengths in metres times `scale`.
+
+    Raises:
+        AssetError: A length is out of bounds.
+    """
+    x, y, z = (length * factor for length, factor in zip(size, scale, strict=True))
+    return _geometry(_ENTRIES["object", object_name], object_name, (x, y, z))
+
+
+def registered_texture(texture_name: str) -> np.ndarray:
+    """Return the image of a registered texture, shape (H, W, 3), uint8."""
+    image = _ENTRIES["texture", texture_name].image
+    assert image is not None
+    return image
+
+
+def with_registered(pool: Pool, task: str, level: Level) -> Pool:
+    """Add the objects that were registered for a task to its pool at a level."""
+    entries = {name: entry for (kind, name), entry in _ENTRIES.items() if kind == "object" and entry.tasks}
+    added = {n: entry for n, entry in entries.items() if task in entry.tasks and level in entry.levels}
+    if not added:
+        return pool
+    bases = [name for name, entry in added.items() if entry.container]
+    others = [name for name in added if name not in bases]
+    return replace(
+        pool,
+        dragged_objects=tuple(dict.fromkeys((*pool.dragged_objects, *others))),
+        base_objects=tuple(dict.fromkeys((*pool.base_objects, *bases))),
+    )
+
+
+@lru_cache(maxsize=256)
+def _geometry(entry: _Entry, object_name: str, lengths: Vector3) -> Geometry:
+    assert entry.mesh is not None
+    return protect(entry.mesh.geometry(check_lengths(lengths, f"object {object_name!r}")))
+
+
+def _check_name(name: str, what: str, kind: str, *, alias: bool = False) -> None:
+    if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME:
+        raise AssetError(f"{what}: a name is a text of 1 … {MAX_NAME} characters.")
+    if not all(word and all(c.isalnum() or c in "-'" for c in word) for word in name.split(" ")):
+        raise AssetError(f"{what}: a name consists of letters, digits, '-' and single spaces.")
+    if name.casefold().startswith(("random ", "dark random ")):  # see `random_pack`
+        raise AssetError(f"{what}: names that begin with 'random' are reserved; choose another name.")
+    known = OBJECTS if kind == "object" else {**TEXTURES, NEUTRAL_TEXTURE: None}
+    registered = REGISTERED_OBJECTS if kind == "object" else REGISTERED_TEXTURES
+    taken = {other.casefold(): other for other in (*known, *(n for n in registered if alias or n != name))}
+    if (other := taken.get(name.casefold())) is not None:
+        raise AssetError(f"{what}: there is {kind} {other or name!r} already; choose another name.")
+
+
+def _check_number(field: str, value: float, least: float, most: float, what: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise AssetError(f"{field} of {what} is a {type(value).__name__}; give a number.")
+    if not least <= value <= most or value == 0:  # NaN fails too
+        bounds = f"above {least:g}, up to {most:g}" if least == 0 else f"within {least:g} … {most:g}"
+        raise AssetError(f"{field} of {what} is {float(value):g}; it must be {bounds}.")
+
+
+def _check_pools(tasks: Sequence[str], levels: Sequence[Level], what: str) -> None:
+    if isinstance(tasks, str) or isinstance(levels, str):
+        raise ConfigError(f"tasks and levels of {what} are lists of names.")
+    if published := [task for task in tasks if task in PUBLISHED_TASKS]:
+        raise ConfigError(
+            f"{what} cannot be added to the published task {published[0]!r}: every seed would give another "
+            "episode. Use it in a task of your own."
+        )
+    if unknown := [level for level in levels if level not in LEVELS]:
+        raise LevelError(f"{what}: {unknown_name('level', unknown[0], LEVELS)}")
+
+
+def _is_new(kind: str, name: str, entry: _Entry) -> bool:
+    """Add an entry, unless an equal one is there."""
+    known = _ENTRIES.get((kind, name))
+    if known is not None and known.digest != entry.digest:
+        raise AssetError(f"{kind} {name!r} is registered already, and differs; choose another name.")
+    if len(_ENTRIES) >= MAX_REGISTERED:
+        raise AssetError(f"{MAX_REGISTERED} objects and textures are registered, the most that is allowed.")
+    _ENTRIES.setdefault((kind, name), entry)
+    return known is None
+
+
+def _digest(text: str, *arrays: np.ndarray) -> str:
+    digest = hashlib.sha256(text.encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _identifier(name: str) -> str:
+    return name.upper().replace(" ", "_").replace("-", "_")
+
+
+def _read_png(file: Path, what: str) -> np.ndarray:
+    """Decode a PNG file of limited size, shape (H, W, 3), uint8."""
+    from PIL import Image
+
+    try:
+        with open_regular(file) as stream:
+            if file.stat().st_size > MAX_PNG_BYTES:
+                raise AssetError(f"{what}: {file} has more than {MAX_PNG_BYTES >> 20} MiB.")
+            with Image.open(stream, formats=["PNG"]) as image:
+                if max(image.size) > MAX_TEXTURE_SIDE:
+                    width, height = image.size
+                    raise AssetError(
+                        f"{what}: {file} has {width} × {height} pixels; sides must lie within 1 … "
+                        f"{MAX_TEXTURE_SIDE}."
+                    )
+                pixels = np.array(image.convert("RGBA"))
+    except InputFileError as error:
+        raise AssetError(f"{what}: {error}") from None
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        if isinstance(error, AssetError):
+            raise
+        reason = " ".join(str(error).split())[:120]
+        raise AssetError(f"{what}: {file} is no readable PNG file ({reason}).") from None
+    if (pixels[..., 3] != 255).any():
+        raise AssetError(f"{what}: {file} is partly transparent; save it without an alpha channel.")
+    return pixels[..., :3]

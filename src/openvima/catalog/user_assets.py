@@ -1,0 +1,87 @@
+"""Assets that a function of a user registers or returns, by the function's name.
+
+Records name the function without its folder. They never run it: whoever reads one loads the assets first.
+"""
+
+import numpy as np
+
+from openvima.catalog.geometry import Assets, Geometry, Vector3
+from openvima.catalog.procedural import procedural_assets
+from openvima.errors import AssetError, echo
+from openvima.user_code import call_function, is_code, with_absolute_path, without_folder
+
+_LOADED: dict[str, "UserAssets"] = {}  # by the name in records
+
+
+class UserAssets:
+    """A pack under the name of the function that made it.
+
+    Args:
+        source: MODULE:FUNCTION or FILE.py:FUNCTION, with the whole path.
+        base: The pack.
+    """
+
+    def __init__(self, source: str, base: Assets) -> None:
+        self.source = source
+        self.name = without_folder(source)
+        self._base = base
+
+    def __repr__(self) -> str:
+        return f"UserAssets({self.source!r})"
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return load_user_assets, (self.source,)
+
+    def geometry(self, object_name: str, size: Vector3, scale: Vector3 = (1.0, 1.0, 1.0)) -> Geometry:
+        """Return the shape of an object; see `Assets.geometry`."""
+        return self._base.geometry(object_name, size, scale)
+
+    def texture(self, texture_name: str) -> np.ndarray:
+        """Return the texture's image; see `Assets.texture`."""
+        return self._base.texture(texture_name)
+
+
+def load_user_assets(source: str) -> UserAssets:
+    """Run a function without arguments once per process, and return its pack.
+
+    Args:
+        source: MODULE:FUNCTION or FILE.py:FUNCTION. The function registers objects and textures, and returns
+            None for these and the built-in ones; or it returns an implementation of `Assets`.
+
+    Raises:
+        ConfigError: There is no such function, or it fails.
+        AssetError: It returned something else, or registered something unfit.
+    """
+    whole = with_absolute_path(source)
+    known = _LOADED.get(without_folder(source))
+    if known is not None and known.source == whole:
+        return known
+    made = call_function(whole, what="assets")
+    if made is not None and not all(callable(getattr(made, name, None)) for name in ("geometry", "texture")):
+        raise AssetError(
+            f"assets is {source!r}, whose function returned a {type(made).__name__}; return None, or an "
+            "object with the methods geometry and texture."
+        )
+    pack = _LOADED[without_folder(source)] = UserAssets(whole, made or procedural_assets())
+    return pack
+
+
+def recorded_assets(name: str) -> str:
+    """Return what to load for the assets that a data set or another record names, without running code.
+
+    Args:
+        name: As in the record.
+
+    Raises:
+        AssetError: It names a function that has not been loaded in this process.
+    """
+    if not is_code(name):
+        return name
+    known = _LOADED.get(without_folder(name))
+    if known is None:
+        shown = echo(name)
+        raise AssetError(
+            f"the record names assets {shown}, code that is not run without being asked for; pass --assets "
+            f"with the path of {shown}, or call openvima.catalog.load_assets with it first."
+        )
+    return known.source

@@ -1,0 +1,251 @@
+"""Meshes of users: reading, checks and centring. They come from files and code that nobody has reviewed."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vector3
+from openvima.catalog.meshes import TEXTURE_PER_M, scaled
+from openvima.catalog.obj_file import ObjMesh, face_normals, parse_obj
+from openvima.errors import AssetError, InputFileError, ShapeError
+from openvima.input_files import read_text
+
+MAX_TRIANGLES = 20_000
+MAX_VERTICES = 60_000
+MAX_OBJ_BYTES = 8 << 20
+MIN_LENGTH_M, MAX_LENGTH_M = 0.001, 0.4  # of each side; the workspace is 0.5 m × 1 m
+MAX_PARTS = 64  # convex parts of a collision body
+_MAX_UNITS = 1e6  # of coordinates in a file
+_MAX_UV = 1e3
+_MIN_THICKNESS = 1e-4  # of a body, relative to its length
+_MAX_HULL_POINTS = 256
+_NUM_DIRECTIONS = 512  # in which a larger hull keeps its farthest points
+
+Mesh: TypeAlias = str | Path | tuple[np.ndarray, np.ndarray]
+"""An OBJ file, or vertices, shape (V, 3), and triangles, shape (F, 3), as indices into them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UserMesh:
+    """A checked mesh whose bounding box is centred on the origin.
+
+    Args:
+        visual: Triangles, in the units of the source.
+        extents: Lengths of the bounding box.
+        parts: Points of each convex part of the collision body, shape (N, 3).
+    """
+
+    visual: TriangleMesh
+    extents: Vector3
+    parts: tuple[np.ndarray, ...]
+
+    def geometry(self, lengths: Vector3) -> Geometry:
+        """Return the shape with sides of some lengths, in metres; the origin is the middle of the box."""
+        x, y, z = (length / extent for length, extent in zip(lengths, self.extents, strict=True))
+        visual = _textured(scaled(self.visual, (x, y, z)))
+        hulls = tuple(CollisionHull(points * (x, y, z)) for points in self.parts)
+        return Geometry(visual, hulls, lengths[2] / 2)
+
+
+def read_mesh(
+    mesh: Mesh, collision: Mesh | None = None, *, double_sided: bool = False, what: str
+) -> UserMesh:
+    """Read and check a mesh.
+
+    Args:
+        mesh: What is drawn: counter-clockwise triangles seen from outside, z up.
+        collision: Convex parts, in the same coordinates: the separate pieces of another mesh (named objects
+            of an OBJ file, or triangles without common vertices). None: the convex hull of `mesh`.
+        double_sided: Draw both sides of an open mesh.
+        what: The object, for errors.
+
+    Raises:
+        ShapeError: Arrays have a wrong shape or dtype.
+        AssetError: The mesh cannot be read, or is empty, too large, not finite, flat or open.
+    """
+    drawn = _read(mesh, what)
+    vertices = _oriented(drawn.vertices, double_sided=double_sided, what=what)
+    normals, uvs = drawn.normals, drawn.uvs
+    if vertices is not drawn.vertices:  # turned inside out
+        normals, uvs = -normals[:, ::-1], uvs[:, ::-1]
+    if double_sided:
+        vertices = np.concatenate([vertices, vertices[:, ::-1]])
+        normals, uvs = np.concatenate([normals, -normals[:, ::-1]]), np.concatenate([uvs, uvs[:, ::-1]])
+    corners = vertices.reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    _check_thickness(corners, what)
+    parts = [corners] if collision is None else _parts(_read(collision, f"collision of {what}"))
+    if len(parts) > MAX_PARTS:
+        raise AssetError(f"collision of {what} has {len(parts)} parts; at most {MAX_PARTS} are allowed.")
+    middle = (low + high) / 2
+    for number, part in enumerate(parts):
+        _check_thickness(part, what if collision is None else f"part {number} of the collision of {what}")
+        if (np.abs(part - middle) > (high - low)).any():
+            raise AssetError(
+                f"part {number} of the collision of {what} is outside twice the mesh's bounds; "
+                "use the same coordinates for both."
+            )
+    area = np.linalg.norm(np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0]), axis=1)
+    seen = area > 0
+    visual = TriangleMesh(vertices[seen] - middle, normals[seen], uvs[seen])
+    x, y, z = (high - low).tolist()
+    return UserMesh(visual, (x, y, z), tuple(_extreme_points(part - middle) for part in parts))
+
+
+def check_lengths(lengths: Vector3, what: str) -> Vector3:
+    """Return three side lengths as numbers.
+
+    Raises:
+        AssetError: One is no number, or out of bounds.
+    """
+    try:
+        x, y, z = (float(length) for length in lengths)
+    except (TypeError, ValueError):
+        raise AssetError(f"size of {what} is {lengths!r:.80}; give three lengths in metres.") from None
+    if not all(MIN_LENGTH_M <= length <= MAX_LENGTH_M for length in (x, y, z)):
+        raise AssetError(
+            f"size of {what} is {x:g} × {y:g} × {z:g} m; each side must lie within {MIN_LENGTH_M:g} … "
+            f"{MAX_LENGTH_M:g} m. Is the mesh in metres? `size` scales it."
+        )
+    return x, y, z
+
+
+def _read(mesh: Mesh, what: str) -> ObjMesh:
+    """Read triangles; `parts` numbers the separate pieces."""
+    if isinstance(mesh, str | Path):
+        found = _read_file(Path(mesh).expanduser(), what)
+    else:
+        found = _from_arrays(mesh, what)
+    if not 4 <= len(found.vertices) <= MAX_TRIANGLES:
+        raise AssetError(
+            f"mesh of {what} has {len(found.vertices)} triangles; 4 … {MAX_TRIANGLES} are allowed."
+        )
+    if not (np.abs(found.vertices) <= _MAX_UNITS).all():  # NaN fails too
+        raise AssetError(f"mesh of {what} has a coordinate that is not finite or beyond ±{_MAX_UNITS:g}.")
+    lengths = np.linalg.norm(found.normals, axis=2, keepdims=True)
+    flat = face_normals(found.vertices)
+    is_usable = np.isfinite(lengths) & (lengths > 0)
+    normals = np.where(is_usable, found.normals / np.where(is_usable, lengths, 1.0), flat)
+    uvs = found.uvs
+    if not (np.abs(uvs) <= _MAX_UV).all():
+        raise AssetError(
+            f"mesh of {what} has a texture coordinate that is not finite or beyond ±{_MAX_UV:g}."
+        )
+    return ObjMesh(found.vertices, normals, uvs, found.parts)
+
+
+def _read_file(file: Path, what: str) -> ObjMesh:
+    try:
+        return parse_obj(read_text(file, max_bytes=MAX_OBJ_BYTES), str(file))
+    except OSError as error:
+        raise AssetError(f"mesh of {what}: {file} cannot be read ({error.strerror}).") from None
+    except InputFileError as error:
+        raise AssetError(f"mesh of {what}: {error}") from None
+
+
+def _from_arrays(mesh: object, what: str) -> ObjMesh:
+    form = "give an OBJ file, or (vertices, triangles) of shapes (V, 3), numbers, and (F, 3), whole numbers"
+    if not isinstance(mesh, tuple | list) or len(mesh) != 2:
+        raise ShapeError(f"mesh of {what} is a {type(mesh).__name__}; {form}.")
+    try:
+        vertices, triangles = np.asarray(mesh[0]), np.asarray(mesh[1])
+    except ValueError:
+        raise ShapeError(f"mesh of {what} holds rows of unequal length; {form}.") from None
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
+        raise ShapeError(f"vertices of {what} are {vertices.dtype} of shape {vertices.shape}; {form}.")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        raise ShapeError(f"triangles of {what} are {triangles.dtype} of shape {triangles.shape}; {form}.")
+    if len(vertices) > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
+        raise AssetError(
+            f"mesh of {what} has {len(vertices)} vertices and {len(triangles)} triangles; at most "
+            f"{MAX_VERTICES} and {MAX_TRIANGLES} are allowed."
+        )
+    if len(triangles) and not (triangles.min() >= 0 and triangles.max() < len(vertices)):
+        raise AssetError(
+            f"triangles of {what} name vertices {triangles.min()} … {triangles.max()}; it has 0 … "
+            f"{len(vertices) - 1}."
+        )
+    corners = vertices.astype(np.float64)[triangles.astype(np.int64)]
+    with np.errstate(invalid="ignore", over="ignore"):  # `_read` refuses what is not finite
+        normals = face_normals(corners)
+    return ObjMesh(corners, normals, np.zeros((len(corners), 3, 2)), _pieces(triangles, len(vertices)))
+
+
+def _pieces(triangles: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Number the groups of triangles that share vertices, shape (F,), int32."""
+    label = np.arange(num_vertices)
+    while True:
+        lowest = label[triangles].min(axis=1, initial=num_vertices)
+        lower = label.copy()
+        np.minimum.at(lower, triangles.reshape(-1), np.repeat(lowest, 3))
+        lower = lower[lower]
+        if (lower == label).all():
+            return label[triangles[:, 0]].astype(np.int32)
+        label = lower
+
+
+def _parts(mesh: ObjMesh) -> list[np.ndarray]:
+    """Points of each separate piece, shape (N, 3)."""
+    return [mesh.vertices[mesh.parts == part].reshape(-1, 3) for part in np.unique(mesh.parts)]
+
+
+def _oriented(vertices: np.ndarray, *, double_sided: bool, what: str) -> np.ndarray:
+    """Return the triangles facing outwards; the array itself where they do already.
+
+    Raises:
+        AssetError: The mesh is open, or its triangles are wound inconsistently.
+    """
+    if double_sided:
+        return vertices
+    _, corner = np.unique(np.round(vertices.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    corner = corner.reshape(-1, 3).astype(np.int64)
+    start, end = corner.reshape(-1), np.roll(corner, -1, axis=1).reshape(-1)
+    start, end = start[start != end], end[start != end]
+    count = int(corner.max()) + 1
+    edges, reverse = start * count + end, end * count + start
+    if not np.array_equal(np.sort(edges), np.sort(reverse)):
+        _, uses = np.unique(np.minimum(edges, reverse), return_counts=True)
+        num_open = int((uses % 2).sum())
+        fault = f"is open: {num_open} edges have no second triangle" if num_open else "has inverted triangles"
+        raise AssetError(
+            f"mesh of {what} {fault}, and triangles are drawn from outside only. Repair it, or pass "
+            "double_sided=True."
+        )
+    middle = vertices.reshape(-1, 3).mean(axis=0)
+    a, b, c = np.moveaxis(vertices - middle, 1, 0)
+    return vertices if (a * np.cross(b, c)).sum() >= 0 else vertices[:, ::-1]
+
+
+def _check_thickness(points: np.ndarray, what: str) -> None:
+    spread = np.linalg.svd(np.cov(points.T), compute_uv=False)  # squared lengths along the principal axes
+    if not spread[2] > _MIN_THICKNESS**2 * spread[0]:
+        raise AssetError(f"{what} is flat: all of its vertices lie in a plane; give it a thickness.")
+
+
+def _extreme_points(points: np.ndarray) -> np.ndarray:
+    """Drop repeated points, and most of those inside the hull of a large part."""
+    points = np.unique(points, axis=0)
+    if len(points) <= _MAX_HULL_POINTS:
+        return points
+    step = np.arange(_NUM_DIRECTIONS) + 0.5
+    z, turn = 1 - 2 * step / _NUM_DIRECTIONS, step * np.pi * (1 + 5**0.5)  # Fibonacci sphere
+    radius = np.sqrt(1 - z * z)
+    x, y = radius * np.cos(turn), radius * np.sin(turn)
+    farthest = {
+        int(np.argmax(points[:, 0] * i + points[:, 1] * j + points[:, 2] * k))
+        for i, j, k in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)
+    }
+    return points[sorted(farthest)]
+
+
+def _textured(mesh: TriangleMesh) -> TriangleMesh:
+    """Drape the texture over a mesh from above, unless it has texture coordinates."""
+    if mesh.uvs.any():
+        return mesh
+    normals = face_normals(mesh.vertices)
+    drop = mesh.vertices[..., 2].max() - mesh.vertices[..., 2]
+    flat = mesh.vertices[..., :2] + drop[..., None] * normals[..., :2]
+    density = min(TEXTURE_PER_M, 0.5 / max(float(np.abs(flat).max()), 1e-9))
+    return TriangleMesh(mesh.vertices, mesh.normals, 0.5 + density * flat)

@@ -1,0 +1,292 @@
+"""Objects and textures of users: what is taken, what is refused, and that nothing built-in changes."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from openvima.catalog import (
+    OBJECTS,
+    Pool,
+    load_assets,
+    object_spec,
+    pool,
+    register_object,
+    register_texture,
+    registration,
+    texture_spec,
+)
+from openvima.catalog.geometry import CollisionHull
+from openvima.catalog.original import OriginalAssets
+from openvima.errors import AssetError, ConfigError, LevelError, ShapeError, UnknownObjectError
+
+CORNERS = np.array([(x, y, z) for x in (0, 3) for y in (0, 2) for z in (0, 1)])
+TRIANGLES = np.array(
+    [
+        *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
+        *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
+    ]
+)
+SIZE = (0.06, 0.04, 0.02)
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Iterator[None]:
+    tables: list[dict[Any, Any]] = [
+        registration._ENTRIES,
+        registration.REGISTERED_OBJECTS,
+        registration.REGISTERED_TEXTURES,
+    ]
+    before = [dict(table) for table in tables]
+    yield
+    for table, content in zip(tables, before, strict=True):
+        table.clear()
+        table.update(content)
+
+
+def register_brick(name: str = "brick", **changes: Any) -> None:
+    register_object(name, changes.pop("mesh", (CORNERS, TRIANGLES)), **{"size": SIZE, **changes})
+
+
+def obj_text(corners: np.ndarray = CORNERS, triangles: np.ndarray = TRIANGLES) -> str:
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in triangles + 1]
+    return "\n".join(lines)
+
+
+def test_an_object_has_the_sampled_size_and_rests_on_the_table() -> None:
+    register_brick()
+    geometry = load_assets().geometry("brick", (0.12, 0.08, 0.04))
+    corners = geometry.visual.vertices.reshape(-1, 3)
+    np.testing.assert_allclose(corners.max(axis=0), (0.06, 0.04, 0.02))
+    np.testing.assert_allclose(corners.min(axis=0), (-0.06, -0.04, -0.02))
+    assert geometry.rest_z_m == 0.02 and not geometry.visual.vertices.flags.writeable
+    (hull,) = geometry.collision
+    assert isinstance(hull, CollisionHull) and len(hull.points) == 8
+    assert (geometry.visual.uvs >= 0).all() and (geometry.visual.uvs <= 1).all()
+
+
+def test_every_pack_has_the_registered_assets(tmp_path: Path) -> None:
+    register_brick()
+    register_texture("news", np.full((2, 3, 3), 7, np.uint8))
+    original = OriginalAssets.__new__(OriginalAssets)
+    for pack in (load_assets(), original):
+        assert pack.geometry("brick", SIZE).rest_z_m == 0.01
+        assert pack.texture("news").tolist() == [[[7, 7, 7]] * 3] * 2
+    assert texture_spec("news").category == "registered"
+
+
+def test_an_inverted_mesh_is_turned_inside_out() -> None:
+    register_brick()
+    register_brick("inverted", mesh=(CORNERS, TRIANGLES[:, ::-1]))
+    meshes = [load_assets().geometry(name, SIZE).visual for name in ("brick", "inverted")]
+    for mesh in meshes:
+        middle = mesh.vertices.mean(axis=1)
+        assert ((mesh.normals[:, 0] * middle).sum(axis=1) > 0).all()
+
+
+def test_the_bodies_of_a_hollow_are_those_of_its_collision_mesh(tmp_path: Path) -> None:
+    raised = CORNERS + np.array((0, 0, 0.5))
+    arrays = np.concatenate([CORNERS, raised]), np.concatenate([TRIANGLES, TRIANGLES + 8])
+    file = tmp_path / "parts.obj"
+    file.write_text(f"o floor\n{obj_text()}\no wall\n{obj_text(raised, TRIANGLES + 8)}\n")
+    for number, collision in enumerate((file, arrays)):
+        register_brick(f"tray {number}", collision=collision)
+        assert len(load_assets().geometry(f"tray {number}", SIZE).collision) == 2
+
+
+def test_registering_an_equal_object_again_changes_nothing_and_another_one_is_refused() -> None:
+    register_brick()
+    register_brick()
+    with pytest.raises(AssetError, match="'brick' is registered already, and differs"):
+        register_brick(size=(0.05, 0.05, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("bowl", "object 'bowl' already"),
+        ("BOWL", "object 'bowl' already"),
+        ("", "1 … 40 characters"),
+        ("a" * 41, "1 … 40 characters"),
+        (3, "1 … 40 characters"),
+        ("a  b", "single spaces"),
+        ("a\nb", "letters, digits"),
+        ("\x1b[31m", "letters, digits"),
+        ("../x", "letters, digits"),
+        ("{drop}", "letters, digits"),
+        ("random shape 7", "reserved"),
+    ],
+)
+def test_a_name_is_new_plain_and_short(name: Any, message: str) -> None:
+    with pytest.raises(AssetError, match=message):
+        register_brick(name)
+    assert name not in registration.REGISTERED_OBJECTS
+
+
+@pytest.mark.parametrize("name", ["red swirl", "gray", "Gray", "dark random texture 1"])
+def test_a_texture_has_a_name_of_its_own(name: str) -> None:
+    with pytest.raises(AssetError, match="choose another name"):
+        register_texture(name, np.zeros((1, 1, 3), np.uint8))
+
+
+def with_corner(value: float) -> np.ndarray:
+    corners = CORNERS.astype(float)
+    corners[0, 0] = value
+    return corners
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        ((np.zeros((0, 3)), np.zeros((0, 3), int)), "0 triangles; 4 … 20000"),
+        ((with_corner(np.nan), TRIANGLES), "not finite"),
+        ((with_corner(np.inf), TRIANGLES), "not finite"),
+        ((with_corner(1e9), TRIANGLES), "beyond"),
+        ((CORNERS, TRIANGLES + 1), "name vertices 1 … 8; it has 0 … 7"),
+        ((CORNERS, TRIANGLES - 1), "name vertices -1"),
+        ((CORNERS, np.zeros((20_001, 3), int)), "20001 triangles"),
+        ((np.zeros((60_001, 3)), TRIANGLES), "60001 vertices"),
+        ((CORNERS * (1, 1, 0), TRIANGLES), "is flat"),
+        ((np.zeros((8, 3)), TRIANGLES), "is flat"),
+        ((CORNERS, TRIANGLES[1:]), "is open: 3 edges"),
+        ((CORNERS, np.concatenate([TRIANGLES[:1, ::-1], TRIANGLES[1:]])), "inverted triangles"),
+        ("nowhere.obj", "cannot be read"),
+    ],
+)
+def test_an_unfit_mesh_is_refused_with_the_name_and_the_limit(mesh: Any, message: str) -> None:
+    with pytest.raises(AssetError, match=message) as error:
+        register_brick(mesh=mesh)
+    assert "'brick'" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        (CORNERS,),
+        3,
+        (CORNERS[:, :2], TRIANGLES),
+        (CORNERS, TRIANGLES.astype(float)),
+        ([[1], [1, 2]], TRIANGLES),
+    ],
+)
+def test_arrays_of_another_form_are_refused(mesh: Any) -> None:
+    with pytest.raises(ShapeError, match=r"'brick'.* give an OBJ file, or"):
+        register_brick(mesh=mesh)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "v 0 0 0\nf 1 1 1\n",
+        obj_text().replace("f 1", "f 99999999999999999999"),
+        obj_text() + "\nvt x\n",
+        "\x00",
+    ],
+)
+def test_a_hostile_obj_file_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "mesh.obj"
+    file.write_text(text)
+    with pytest.raises(AssetError):
+        register_brick(mesh=file)
+    file.write_bytes(b"\xff\xfe" + b"v 0 0 0\n" * 4)
+    with pytest.raises(AssetError, match="no UTF-8"):
+        register_brick(mesh=file)
+
+
+def test_an_open_mesh_is_drawn_from_both_sides_on_request() -> None:
+    register_brick(mesh=(CORNERS, TRIANGLES[2:]), double_sided=True)
+    assert len(load_assets().geometry("brick", SIZE).visual.vertices) == 2 * len(TRIANGLES[2:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": None}, r"3 × 2 × 1 m; each side must lie within 0.001 … 0.4 m"),
+        ({"size": (0.1, 0.1)}, "three lengths"),
+        ({"size": (0.1, 0.1, np.nan)}, "each side"),
+        ({"size_max": (0.05, 0.05, 0.05)}, "no side may be shorter"),
+        ({"symmetry_deg": 0}, "symmetry_deg of object 'brick' is 0; it must be above 0, up to 360"),
+        ({"symmetry_deg": float("nan")}, "symmetry_deg"),
+        ({"friction": 2}, "within 0.05 … 1"),
+        ({"mass_kg": "heavy"}, "mass_kg of object 'brick' is a str"),
+        ({"profile": "oval"}, "profile"),
+        ({"aliases": ("bowl",)}, "object 'bowl' already"),
+        ({"aliases": "bar"}, "give a list"),
+        ({"collision": (CORNERS + 100, TRIANGLES)}, "part 0 of the collision"),
+        ({"collision": (CORNERS * (1, 1, 0), TRIANGLES)}, "is flat"),
+    ],
+)
+def test_numbers_out_of_bounds_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(AssetError, match=message):
+        register_brick(**changes)
+
+
+def test_published_tasks_keep_their_pools() -> None:
+    before = pool("rotate", "train")
+    with pytest.raises(ConfigError, match="published task 'rotate'"):
+        register_brick(tasks=("rotate",))
+    with pytest.raises(LevelError, match="no level 'L9'"):
+        register_brick(tasks=("mine",), levels=("L9",))
+    register_brick(tasks=("mine",), levels=("train",), container=True)
+    register_brick("plate", tasks=("mine",))
+    assert pool("rotate", "train") == before and "brick" not in OBJECTS
+    mine = Pool(("heart",), (), ("red",), ())
+    assert registration.with_registered(mine, "mine", "train") == Pool(
+        ("heart", "plate"), ("brick",), ("red",), ()
+    )
+    assert registration.with_registered(mine, "mine", "L1") == Pool(("heart", "plate"), (), ("red",), ())
+    assert registration.with_registered(mine, "other", "train") == mine
+
+
+def test_an_unknown_object_is_told_how_to_be_registered() -> None:
+    with pytest.raises(UnknownObjectError, match="`register_object` adds one of your own"):
+        object_spec("brick")
+
+
+def png(mode: str, size: tuple[int, int]) -> bytes:
+    stream = io.BytesIO()
+    Image.new(mode, size, 200 if mode == "L" else (200,) * len(mode)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def test_a_texture_is_read_from_a_png_file(tmp_path: Path) -> None:
+    file = tmp_path / "news.png"
+    file.write_bytes(png("L", (3, 2)))
+    register_texture("news", file)
+    assert load_assets().texture("news").shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no readable PNG"),
+        (png("RGB", (8, 8))[:50], "no readable PNG"),
+        (png("RGBA", (8, 8)), "partly transparent"),
+        (png("RGB", (2000, 1)), "2000 × 1 pixels"),
+    ],
+)
+def test_an_unfit_png_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    file = tmp_path / "news.png"
+    file.write_bytes(content)
+    with pytest.raises(AssetError, match=f"'news'.*{message}"):
+        register_texture("news", file)
+
+
+@pytest.mark.parametrize(
+    ("image", "error"),
+    [
+        (np.zeros((4, 4, 3)), ShapeError),
+        (np.zeros((4, 4), np.uint8), ShapeError),
+        (np.zeros((4, 4, 4), np.uint8), ShapeError),
+        (np.zeros((0, 4, 3), np.uint8), AssetError),
+        (np.zeros((1, 1025, 3), np.uint8), AssetError),
+    ],
+)
+def test_an_unfit_array_is_no_texture(image: np.ndarray, error: type[Exception]) -> None:
+    with pytest.raises(error, match="texture 'news'"):
+        register_texture("news", image)
