@@ -26,6 +26,7 @@ def info_of(demo: Demonstration, env_config: EnvConfig) -> ShardInfo:
         versions=demo.versions,
         compat=env_config.compat,
         difficulty=env_config.difficulty,
+        prompts=env_config.prompts,
         images=False,
     )
 
@@ -47,6 +48,7 @@ def recorded() -> Demonstration:
         ("visual_manipulation", "L2", EnvConfig()),
         ("visual_manipulation", "train", EnvConfig(compat=True)),
         ("visual_manipulation", "train", EnvConfig(difficulty="medium")),
+        ("visual_manipulation", "train", EnvConfig(prompts="mixed,paraphrased")),
         ("rearrange", "train", EnvConfig()),  # a scene in the prompt
         ("twist", "train", EnvConfig()),  # scenes before and after
         ("follow_motion", "L4", EnvConfig()),  # frames of a motion

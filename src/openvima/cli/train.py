@@ -87,12 +87,14 @@ def run(words: Sequence[str]) -> int:
 
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":
-    """Return rollouts of a checkpoint on the tasks of the data."""
+    """Return rollouts of a checkpoint on the tasks of the data, with prompts in their form."""
     from openvima.data.reader import read_manifest
     from openvima.env import EnvConfig
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
+    from openvima.tasks.prompts import MULTIMODAL
     from openvima.tasks.registry import task_spec
 
-    tasks = sorted(read_manifest(config.data)["tasks"])
-    playable = tuple(task for task in tasks if ONLINE_EVAL_LEVEL in task_spec(task).levels)
-    return OnlineEval(playable, config.rollout.episodes, EnvConfig(config.assets))
+    manifest = read_manifest(config.data)
+    playable = tuple(t for t in sorted(manifest["tasks"]) if ONLINE_EVAL_LEVEL in task_spec(t).levels)
+    prompts = manifest["config"].get("prompts", MULTIMODAL)
+    return OnlineEval(playable, config.rollout.episodes, EnvConfig(config.assets, prompts=prompts))

@@ -1,0 +1,170 @@
+"""Text prompts name what their images show; nothing else of an episode depends on them."""
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from openvima.errors import ConfigError, PromptError
+from openvima.scene import (
+    ObjectImage,
+    ObjectRecord,
+    Placement,
+    Pose,
+    Prompt,
+    PromptImage,
+    RenderedPrompt,
+    Scene,
+)
+from openvima.tasks import list_tasks, make_rng, sample_episode, task_spec
+from openvima.tasks.prompts import PROMPTS, described, rewritten
+from openvima.tasks.sampling import has_text_form
+from prompts import is_understood
+
+SCENES_ONLY = {"follow_order", "rearrange", "rearrange_then_restore", "scene_understanding", "twist"}
+COMPARING = {"novel_adj", "novel_adj_and_noun"}  # by height in half of the episodes
+WITH_TEXT = sorted(set(list_tasks()) - SCENES_ONLY)
+NUM_EPISODES = 10
+
+
+def test_all_tasks_but_those_with_scenes_alone_have_a_text_form() -> None:
+    assert {task for task in list_tasks() if not has_text_form(task)} >= SCENES_ONLY
+    assert all(has_text_form(task) for task in WITH_TEXT)
+
+
+@pytest.mark.parametrize("prompts", ["text", "text,paraphrased"])
+@pytest.mark.parametrize("task", WITH_TEXT)
+def test_a_reader_of_the_text_finds_the_goal_objects(task: str, prompts: str) -> None:
+    for level in task_spec(task).levels:
+        episodes = [sample_episode(task, level=level, seed=s, prompts=prompts) for s in range(NUM_EPISODES)]
+        clear = [episode for episode in episodes if not episode.problem.prompt.is_ambiguous]
+        assert clear and all(map(is_understood, clear))
+        assert (len(clear) < NUM_EPISODES) == (task in COMPARING)
+        assert not any(isinstance(fill, ObjectImage) for e in episodes for _, fill in e.problem.prompt.images)
+
+
+def test_the_reader_is_lost_where_the_text_is_ambiguous() -> None:
+    episodes = [sample_episode("novel_adj", seed=seed, prompts="text") for seed in range(NUM_EPISODES)]
+    assert not any(is_understood(e) for e in episodes if e.problem.prompt.is_ambiguous)
+
+
+@pytest.mark.parametrize("task", ["rotate", "novel_adj", "rearrange", "follow_motion"])
+def test_nothing_but_the_prompt_depends_on_its_form(task: str) -> None:
+    published = sample_episode(task, seed=4)
+    for prompts in PROMPTS:
+        if task != "rearrange" or not prompts.startswith("text"):
+            episode = sample_episode(task, seed=4, prompts=prompts)
+            problem = replace(episode.problem, prompt=published.problem.prompt)
+            assert replace(episode, problem=problem) == published
+    assert sample_episode(task, seed=4, prompts="multimodal") == published
+
+
+def test_mixed_prompts_describe_half_of_the_images_and_synonyms_choose_the_same() -> None:
+    counts = Counter[bool]()
+    for seed in range(60):
+        all_images, mixed, synonyms = (
+            dict(sample_episode("novel_noun", seed=seed, prompts=p).problem.prompt.images)
+            for p in ("multimodal", "mixed", "mixed,paraphrased")
+        )
+        assert mixed == synonyms
+        counts.update(name in mixed for name in all_images)
+    assert 40 <= counts[True] <= 80
+
+
+def test_synonyms_are_used_about_half_of_the_time() -> None:
+    prompt = prompt_of("Put the {a} away.", a="block")
+    words = Counter(
+        rewritten(prompt, Scene(()), "text,paraphrased", make_rng("user", "t", "train", seed, "prompt")).text
+        for seed in range(60)
+    )
+    assert set(words) == {"Put the red block away.", "Put the red cube away."}
+    assert min(words.values()) > 15
+
+
+def placed(name: str, texture: str = "red", object_id: int = 0) -> Placement:
+    return Placement(object_id, name, texture, (0.1, 0.1, 0.1), Pose((0.0, 0.0, 0.0)))
+
+
+def prompt_of(text: str, **images: str) -> Prompt:
+    named = {
+        slot: placed(words, "gray" if slot.startswith("gray") else "red") for slot, words in images.items()
+    }
+    return Prompt.parse(text, **{slot: ObjectImage(placement) for slot, placement in named.items()})
+
+
+def text_of(prompt: Prompt) -> str:
+    return rewritten(prompt, Scene(()), "text", make_rng("user", "t", "train", 0, "prompt")).text
+
+
+@pytest.mark.parametrize(
+    ("template", "text"),
+    [
+        ("Put {a} into {b}.", "Put the red heart into the red bowl."),
+        ("Put the {a} into the same {b}.", "Put the red heart into the same red bowl."),
+        ("{a} is on {b}. {a} is not!", "The red heart is on the red bowl. The red heart is not!"),
+        ("Put a {a} onto any {b}", "Put a red heart onto any red bowl"),
+        ("Sweep two {a} and all {b}", "Sweep two red hearts and all red bowls"),
+        ("The same texture as {a}, {b}.", "The same texture as the red heart, the red bowl."),
+        ("Put the less kobar {a} into {b}.", "Put the less kobar red heart into the red bowl."),
+    ],
+)
+def test_descriptions_get_the_article_that_their_sentence_needs(template: str, text: str) -> None:
+    assert text_of(prompt_of(template, a="heart", b="bowl")) == text
+
+
+def test_shapes_alone_are_introduced_by_name() -> None:
+    text = "This is a wug {gray_1}. This is a dax {gray_2}. Put a wug into a dax."
+    prompt = prompt_of(text, gray_1="L-shaped block", gray_2="pan")
+    assert text_of(prompt) == "This is a wug: an L-shaped block. This is a dax: a pan. Put a wug into a dax."
+    assert text_of(prompt_of("Two {gray}", gray="cross")) == "Two crosses"
+    assert text_of(prompt_of("A {gray}", gray="L-shaped block")) == "An L-shaped block"
+
+
+def test_words_that_fit_another_object_on_the_table_are_ambiguous() -> None:
+    image = ObjectImage(placed("block", object_id=5))
+    prompt = Prompt.parse("Rotate the {a} 30 degrees.", a=image)
+    tall = replace(placed("block", object_id=6), scale=(1.0, 1.0, 2.0))
+
+    def is_ambiguous(other: Placement, prompts: str = "text") -> bool:
+        results = [
+            rewritten(
+                prompt, Scene((image.placement, other)), prompts, make_rng("user", "t", "L1", n, "prompt")
+            )
+            for n in range(10)
+        ]
+        return any(result.is_ambiguous for result in results)
+
+    assert is_ambiguous(tall)
+    assert not is_ambiguous(placed("block", "blue", 6))
+    assert not is_ambiguous(placed("shorter block", object_id=6))
+    assert is_ambiguous(placed("shorter block", object_id=6), "text,paraphrased")
+    assert not sample_episode("novel_adj", seed=4).problem.prompt.is_ambiguous
+
+
+def test_unknown_forms_and_tasks_without_text_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"there is no form of prompts 'txt'. Did you mean 'text'\? Allowed"
+    ):
+        sample_episode("rotate", seed=0, prompts="txt")
+    with pytest.raises(ConfigError, match="'paraphrased'"):
+        sample_episode("rotate", seed=0, prompts="paraphrased")
+    with pytest.raises(
+        ConfigError, match=r"'twist' has no text form.* Tasks with one: follow_motion, .*rotate"
+    ):
+        sample_episode("twist", seed=0, prompts="text")
+
+
+def test_rendered_prompts_are_described_alike() -> None:
+    def image(name: str, *records: ObjectRecord) -> PromptImage:
+        return PromptImage(name, "object" if len(records) == 1 else "scene", {}, {}, records)
+
+    heart, bowl = ObjectRecord(2, "heart", "red"), ObjectRecord(2, "own shape", "blue")
+    images = {"a": image("a", heart), "b": image("b", bowl), "c": image("c", heart, bowl)}
+    prompt = RenderedPrompt("Put the {a} into {b} as in {c}.", images)
+    told = described(prompt, "text")
+    assert told.text == "Put the red heart into the blue own shape as in {c}."
+    assert set(told.images) == {"c"}
+    assert described(prompt, "multimodal") is prompt
+    assert described(prompt, "mixed").text == described(prompt, "mixed").text
+    with pytest.raises(PromptError, match="image a has names of over 200"):
+        described(RenderedPrompt("{a}", {"a": image("a", ObjectRecord(2, "x" * 300, "red"))}), "text")
