@@ -48,7 +48,7 @@ def read_text(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputFileError(f"{file} is no UTF-8 text ({error.reason} at byte {error.start}).") from None
 
 
-def read_yaml(file: Path) -> Any:  # Any: plain values
+def read_yaml(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: plain values
     """Read a YAML file of plain values: mappings with text keys, lists, text, numbers, booleans and null.
 
     Raises:
@@ -56,7 +56,7 @@ def read_yaml(file: Path) -> Any:  # Any: plain values
         InputFileError: It is no YAML, too large or nested too deep, or holds aliases or other values.
     """
     try:
-        values = yaml.load(read_text(file), _PlainLoader)
+        values = yaml.load(read_text(file, max_bytes=max_bytes), _PlainLoader)
     except InputFileError:
         raise
     except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, TypeError, AttributeError) as error:

@@ -1,14 +1,15 @@
-"""`openvima demo`: record a video of the oracle or of a policy on one task."""
+"""`openvima demo`: record a video of the oracle or of a policy on one task or on an episode from a file."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 
 def main(
-    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")],
+    task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
     *,
+    episode: Path | None = None,
     out: Path = Path("demo.mp4"),
     seed: int = 0,
     level: str | None = None,
@@ -26,7 +27,8 @@ def main(
     Example: openvima demo rotate --seed 3 --out rotate.mp4
 
     Args:
-        task: Name of the task; `openvima tasks` lists them.
+        task: Name of the task; `openvima tasks` lists them. Leave it out with --episode.
+        episode: YAML or JSON file of an episode, sampled or composed (see docs/compose.md).
         out: MP4 file to write.
         seed: Number of the episode.
         level: train, L1, L2, L3 or L4; by default the task's first.
@@ -50,7 +52,9 @@ def main(
     from openvima.errors import ConfigError
     from openvima.tasks import task_spec
 
-    level = task_spec(task).checked_level(level)  # before what takes a second to load
+    if (task is None) == (episode is None):
+        raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
+    level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")
     if boxes is not None and policy in ("oracle", "random"):
@@ -62,6 +66,18 @@ def main(
     from openvima.evaluation.sources import PolicySource
 
     PolicySource(policy, policy, trust_code).check()  # before a scene is built
+    if episode is not None:
+        return _record_file(
+            episode,
+            policy,
+            out,
+            assets=assets,
+            compat=compat,
+            device=device,
+            boxes=boxes or "",
+            trust_code=trust_code,
+        )
+    assert task is not None  # as checked
     env_config = EnvConfig(assets, compat, difficulty, prompts)
     batch = Batch(
         policy,
@@ -81,4 +97,19 @@ def main(
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
     steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
     print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {steps}")
+    return 0
+
+
+def _record_file(file: Path, policy: str, out: Path, **options: Any) -> int:  # Any: options of `play`
+    """Play the episode of a file."""
+    from openvima.env import load_episode
+    from openvima.evaluation import play
+
+    episode = load_episode(file, assets=options["assets"])
+    result = play(episode, policy, video=out, title=f"{file.stem} · {Path(policy).name}", **options)
+    ended = "solved" if result.outcome.success else f"not solved: {result.outcome.reason}"
+    if not episode.problem.goals and not result.outcome.failure:
+        ended = result.outcome.reason
+    steps = "1 step" if result.steps == 1 else f"{result.steps} steps"
+    print(f"{out}: {file}, by {policy}: {ended}; {steps}")
     return 0

@@ -8,23 +8,34 @@ from openvima.lazy import lazy_names
 
 if TYPE_CHECKING:
     from openvima.env.action_validation import stack_actions
+    from openvima.env.composed_objects import SceneObject
+    from openvima.env.composing import compose
+    from openvima.env.episode_file import load_episode, save_episode
     from openvima.env.tabletop import TabletopEnv, VideoFrame
     from openvima.env.vector import make_vec
 
 __all__ = [
     "EnvConfig",
+    "SceneObject",
     "TabletopEnv",
     "VideoFrame",
+    "compose",
+    "load_episode",
     "make",
     "make_vec",
     "register_environments",
+    "save_episode",
     "stack_actions",
 ]
 
 _HOMES = {
+    "SceneObject": "composed_objects",
     "VideoFrame": "tabletop",
     "TabletopEnv": "tabletop",
+    "compose": "composing",
+    "load_episode": "episode_file",
     "make_vec": "vector",
+    "save_episode": "episode_file",
     "stack_actions": "action_validation",
 }
 

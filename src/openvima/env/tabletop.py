@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
+from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.render import channels_last
@@ -118,7 +119,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
-    `reset(options={"episode": episode})` loads a sampled episode.
+    `reset(options={"episode": episode})` loads a sampled or composed episode, or a file of one.
 
     Version history:
         v1: Sweeps leave bodies out of reach out of the physics and carry aligned ones farther, for speed:
@@ -198,17 +199,19 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
         Args:
             seed: The episode's number; None draws one from the environment's generator.
-            options: May hold "episode", an `Episode` to load instead of sampling one.
+            options: May hold "episode", to load instead of sampling one: an `Episode`, a YAML or JSON file of
+                one, or the values of such a file.
 
         Returns:
             The first observation, and the info.
 
         Raises:
             SamplingError: The task finds no start for this seed; no episode is running then.
+            InputFileError, SceneError: The episode's file or values are not valid.
             ConfigError: An option is unknown, or the seed is not an integer from 0 to 2**63 - 1.
         """
         seed = None if seed is None else checked_seed(seed)
-        given = _episode_option(options)
+        given = _episode_option(options, self.assets)
         super().reset(seed=seed)
         self._run = None  # no running episode should the rest fail
         episode = given or self._sample(seed)
@@ -432,11 +435,17 @@ def _check_render_mode(render_mode: str | None) -> None:
         raise ConfigError(f"render_mode is {render_mode!r}; allowed are None and {', '.join(modes)}.")
 
 
-def _episode_option(options: Mapping[str, Any] | None) -> Episode | None:
+def _episode_option(options: Mapping[str, Any] | None, assets: Assets) -> Episode | None:
     unknown = set(options or ()) - {"episode"}
     if unknown:
         raise ConfigError(f"reset has no option {', '.join(sorted(unknown))}; it takes 'episode'.")
     episode = (options or {}).get("episode")
+    if isinstance(episode, str | Path):
+        return load_episode(episode, assets=assets)
+    if isinstance(episode, Mapping):
+        return episode_from_values(episode, assets=assets)
     if episode is not None and not isinstance(episode, Episode):
-        raise ConfigError(f"option 'episode' is a {type(episode).__name__}; give an Episode.")
+        raise ConfigError(
+            f"option 'episode' is a {type(episode).__name__}; give an Episode, a file or the values of one."
+        )
     return episode

@@ -7,6 +7,7 @@ from openvima.lazy import lazy_names
 if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison, compare
     from openvima.evaluation.config import EvaluationConfig
+    from openvima.evaluation.free_play import PlayResult, play
     from openvima.evaluation.merging import merge
     from openvima.evaluation.recording import save_episode_image
     from openvima.evaluation.results import EpisodeOutcome, Results, Row
@@ -18,11 +19,13 @@ _HOMES = {
     "Comparison": "comparison",
     "EpisodeOutcome": "results",
     "EvaluationConfig": "config",
+    "PlayResult": "free_play",
     "Results": "results",
     "Row": "results",
     "compare": "comparison",
     "evaluate": "runner",
     "merge": "merging",
+    "play": "free_play",
     "save_episode_image": "recording",
     "score": "scoring",
     "wilson_interval": "statistics",
@@ -32,11 +35,13 @@ __all__ = [
     "Comparison",
     "EpisodeOutcome",
     "EvaluationConfig",
+    "PlayResult",
     "Results",
     "Row",
     "compare",
     "evaluate",
     "merge",
+    "play",
     "save_episode_image",
     "score",
     "wilson_interval",

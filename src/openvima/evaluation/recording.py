@@ -8,8 +8,9 @@ from PIL import Image, ImageDraw
 from openvima.atomic_io import atomic_write_file
 from openvima.env.tabletop import TabletopEnv
 from openvima.evaluation.results import EpisodeOutcome
-from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout import begin_episode, play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
+from openvima.scene import Episode
 from openvima.video.clips import png
 from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
 from openvima.video.recorder import ENLARGE, EpisodeRecorder, SceneRenderer
@@ -20,7 +21,7 @@ _GAP = 12  # pixels between the parts
 def record_episode(
     env: TabletopEnv,
     policy: RolloutPolicy,
-    seed: int,
+    start: int | Episode,
     path: Path,
     *,
     title: str = "",
@@ -32,7 +33,7 @@ def record_episode(
     Args:
         env: An environment with `realtime`.
         policy: Decides the actions.
-        seed: The episode's seed.
+        start: The episode, or its seed.
         path: The MP4 file to write.
         title: Caption below the scene; no caption if empty.
         with_prompt: Whether to draw the prompt above the scene.
@@ -41,10 +42,10 @@ def record_episode(
     Returns:
         How the episode ended.
     """
-    env.reset(seed=seed)
+    begin_episode(env, start)
     with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, enlarge=enlarge) as recorder:
-        (outcome,) = play([env], [seed], policy, after_step=recorder.record_step)
-        recorder.record_outcome(outcome.success, outcome.steps)
+        (outcome,) = play([env], [start], policy, after_step=recorder.record_step)
+        recorder.record_outcome(outcome.success if env.episode.problem.goals else None, outcome.steps)
     return outcome
 
 

@@ -7,10 +7,12 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError
 from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, failure_kind
 from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
+from openvima.scene import Episode
 from openvima.scene.goal import object_of
 
 NOTHING_PICKED = "nothing was picked up within the step limit"
 WRONG_PICKED = "only wrong objects were picked up within the step limit"
+NO_GOALS = "the step limit is reached; the episode has no goals"
 OUT_OF_STEPS = "not done within the step limit"
 NO_ORACLE_ACTION = "the oracle has no action"
 
@@ -18,14 +20,14 @@ NO_ORACLE_ACTION = "the oracle has no action"
 class _EpisodeSlot:
     """One environment of a batch and the state of its episode."""
 
-    def __init__(self, env: TabletopEnv, seed: int) -> None:
+    def __init__(self, env: TabletopEnv, start: int | Episode) -> None:
         self.env = env
-        self.seed = seed
         self.steps = 0
         self.grasped: set[int] = set()
         self.near_ties = 0
         self.outcome: EpisodeOutcome | None = None
-        self.observation: dict[str, Any] | None = env.reset(seed=seed)[0]  # None once the episode is over
+        self.observation: dict[str, Any] | None = begin_episode(env, start)  # None once the episode is over
+        self.seed = start.seed if isinstance(start, Episode) else start
 
     def step(self, decision: Decision) -> None:
         """Take one step, unless there is no usable action; then the episode has failed."""
@@ -48,6 +50,8 @@ class _EpisodeSlot:
 
     def _why_not_done(self, picks: bool) -> tuple[str, str]:
         """Say what was lacking at the end of the steps, with numbers and without."""
+        if not self.env.episode.problem.goals:
+            return NO_GOALS, NO_GOALS
         if picks and not self.grasped:
             return NOTHING_PICKED, NOTHING_PICKED
         problem = self.env.episode.problem
@@ -76,9 +80,16 @@ class _EpisodeSlot:
         )
 
 
+def begin_episode(env: TabletopEnv, start: int | Episode) -> dict[str, Any]:
+    """Reset an environment to an episode or the number of one, and return the first observation."""
+    if isinstance(start, Episode):
+        return env.reset(options={"episode": start})[0]
+    return env.reset(seed=start)[0]
+
+
 def play(
     envs: Sequence[TabletopEnv],
-    seeds: Sequence[int],
+    starts: Sequence[int | Episode],
     policy: RolloutPolicy,
     *,
     after_step: Callable[[TabletopEnv], None] | None = None,
@@ -87,12 +98,12 @@ def play(
 
     Args:
         envs: Environments of one task and level.
-        seeds: Seed of the episode of each.
+        starts: Seed of the episode of each, or the episode.
         policy: Decides the actions; its `modalities` become those of the environments.
         after_step: Called with an environment after each of its steps, for recording.
 
     Returns:
-        How each episode ended, in the order of `seeds`.
+        How each episode ended, in the order of `starts`.
 
     Raises:
         PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
@@ -100,7 +111,7 @@ def play(
     if isinstance(policy, PromptedRolloutPolicy):
         for env in envs:
             env.modalities = policy.modalities
-    slots = [_EpisodeSlot(env, seed) for env, seed in zip(envs, seeds, strict=True)]
+    slots = [_EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
     policy.begin(envs)
     while any(slot.outcome is None for slot in slots):
         decisions = policy.decide([slot.observation for slot in slots])

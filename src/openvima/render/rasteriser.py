@@ -18,9 +18,11 @@ from openvima.scene import (
     SHEET_ID,
     ObjectImage,
     ObjectRecord,
+    PhotoImage,
     Placement,
     Pose,
     Prompt,
+    PromptFill,
     PromptImage,
     RenderedPrompt,
     Scene,
@@ -32,6 +34,9 @@ FLOOR_RGB = (255, 255, 255)
 SHEET_RGB = (51, 51, 51)
 SHEET_SIZE = (0.501, 0.999)  # m, x and y, about (0.5, 0)
 PROMPT_POSE = Pose.planar(0.5, 0.0, math.pi / 2)  # pose of the object in object images
+PHOTO_WHITE = 245  # a pixel of a photo belongs to the object if a channel is below
+PHOTO_CENTRES = {"front": (128, 76), "top": (128, 63)}  # column, row of the objects of object images
+PHOTO_OBJECT, PHOTO_TEXTURE = "photo", "unknown"  # names in the record of a photo
 LARGEST_ID = 254  # 255 is background
 
 Rgb = tuple[int, int, int]
@@ -127,14 +132,13 @@ class Rasteriser:
         Raises:
             UnknownObjectError, UnknownTextureError, AssetError: An object has no shape or texture.
         """
-        images = {}
-        for name, fill in prompt.images:
-            images[name] = (
-                self._object_image(name, fill)
-                if isinstance(fill, ObjectImage)
-                else self._scene_image(name, fill)
-            )
+        images = {name: self._prompt_image(name, fill) for name, fill in prompt.images}
         return RenderedPrompt(prompt.text, images)
+
+    def _prompt_image(self, name: str, fill: PromptFill) -> PromptImage:
+        if isinstance(fill, ObjectImage):
+            return self._object_image(name, fill)
+        return self._scene_image(name, fill) if isinstance(fill, SceneImage) else _photo_image(name, fill)
 
     def _object_image(self, name: str, fill: ObjectImage) -> PromptImage:
         placement = fill.placement
@@ -205,6 +209,22 @@ class _Canvas:
 
 
 _Prepared = tuple[IndexedMesh, np.ndarray, np.ndarray, int]  # mesh, pose, texture, id
+
+
+def _photo_image(name: str, fill: PhotoImage) -> PromptImage:
+    """Put a photo into both views where the objects of object images are."""
+    pixels, rgb, segm = fill.pixels(), {}, {}
+    is_object = (pixels < PHOTO_WHITE).any(axis=2)
+    for view in VIEWS:
+        camera = CAMERAS[view]
+        column, row = PHOTO_CENTRES[view]
+        rows = slice(row - fill.height // 2, row - fill.height // 2 + fill.height)
+        columns = slice(column - fill.width // 2, column - fill.width // 2 + fill.width)
+        rgb[view] = np.full((3, camera.height, camera.width), 255, np.uint8)
+        rgb[view][:, rows, columns] = np.moveaxis(pixels, -1, 0)
+        segm[view] = np.full((camera.height, camera.width), BACKGROUND_ID, np.uint8)
+        segm[view][rows, columns][is_object] = 0
+    return PromptImage(name, "object", rgb, segm, (ObjectRecord(0, PHOTO_OBJECT, PHOTO_TEXTURE),))
 
 
 def _prepared(body: Drawable) -> _Prepared:

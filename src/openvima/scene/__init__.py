@@ -17,6 +17,7 @@ from openvima.scene.pose import Pose, angle_difference
 from openvima.scene.prompt import (
     ObjectImage,
     ObjectRecord,
+    PhotoImage,
     Prompt,
     PromptFill,
     PromptImage,
@@ -61,6 +62,7 @@ __all__ = [
     "ObjectImage",
     "ObjectRecord",
     "Outcome",
+    "PhotoImage",
     "Placement",
     "Pose",
     "Problem",

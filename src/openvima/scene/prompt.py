@@ -11,6 +11,7 @@ from openvima.errors import PromptError, echo
 from openvima.scene.scene import Placement, Scene
 
 FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
+PHOTO_SIDE = 48  # pixels; rendered prompt objects have 22 to 60
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
@@ -42,7 +43,40 @@ class SceneImage:
         return SceneImage(Scene(tuple(replace(p, id=n) for n, p in enumerate(placements, FIRST_IMAGE_ID))))
 
 
-PromptFill = ObjectImage | SceneImage
+@dataclass(frozen=True, slots=True)
+class PhotoImage:
+    """A picture of a single object on white that was not rendered, such as a photo.
+
+    Args:
+        width: Columns, at most 48.
+        height: Rows, at most 48.
+        rgb: Its pixels, `height` × `width` × 3 bytes, row 0 on top.
+
+    Raises:
+        PromptError: The picture is too large, or the pixels do not fit its size.
+    """
+
+    width: int
+    height: int
+    rgb: bytes = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= PHOTO_SIDE and 1 <= self.height <= PHOTO_SIDE):
+            raise PromptError(
+                f"a photo is {self.width} × {self.height} pixels; 1 to {PHOTO_SIDE} are allowed."
+            )
+        if len(self.rgb) != 3 * self.width * self.height:
+            raise PromptError(
+                f"a photo of {self.width} × {self.height} pixels has {len(self.rgb)} bytes; "
+                f"it must have {3 * self.width * self.height}."
+            )
+
+    def pixels(self) -> np.ndarray:
+        """Return the picture, shape (height, width, 3), uint8."""
+        return np.frombuffer(self.rgb, np.uint8).reshape(self.height, self.width, 3)
+
+
+PromptFill = ObjectImage | SceneImage | PhotoImage
 
 
 @dataclass(frozen=True, slots=True)

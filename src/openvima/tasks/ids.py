@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from openvima.scene import Condition, Placement, Problem, Prompt, PromptFill, Scene, SceneImage
+from openvima.scene import Condition, PhotoImage, Placement, Problem, Prompt, PromptFill, Scene, SceneImage
 from openvima.scene.goal import (
     OracleMove,
     is_condition,
@@ -113,5 +113,7 @@ class RenumberedCondition:
 def _renumbered_image(fill: PromptFill, new_of: dict[int, int], new_in_prompt: dict[int, int]) -> PromptFill:
     if isinstance(fill, SceneImage):
         return SceneImage(_renumbered_scene(fill.scene, new_in_prompt))
+    if isinstance(fill, PhotoImage):
+        return fill
     placement: Placement = fill.placement
     return replace(fill, placement=replace(placement, id=new_of.get(placement.id, placement.id)))

@@ -55,7 +55,7 @@ class TableSampler:
         self.pool = pool
         self.compat = compat
         self.placements: list[Placement] = []
-        self._assets = assets
+        self.assets = assets
         self._end_effector: EndEffector = end_effector
         self._labels, self._heights = empty_labels()
 
@@ -216,15 +216,15 @@ class TableSampler:
             object_name: Display name in the catalogue.
             size: Nominal size in metres.
         """
-        base_x, base_y = _circle_centre_m(self._assets, base.object, base.size)
-        x, y = _circle_centre_m(self._assets, object_name, size)
+        base_x, base_y = _circle_centre_m(self.assets, base.object, base.size)
+        x, y = _circle_centre_m(self.assets, object_name, size)
         return Pose.planar(base.pose.x + base_x - x, base.pose.y + base_y - y)
 
     def blank(self) -> "TableSampler":
         """Return an empty sampler for a prompt scene with the same generator; nothing is fixed."""
         pool = replace(self.pool, base_objects=())
         return TableSampler(
-            self.rng, pool, assets=self._assets, end_effector=self._end_effector, compat=self.compat
+            self.rng, pool, assets=self.assets, end_effector=self._end_effector, compat=self.compat
         )
 
     def free_pose(self, object_name: str, size: Vector3) -> Pose | None:
@@ -249,7 +249,7 @@ class TableSampler:
         num_free = mark_free_centres(self._labels, side, run, centres, counts)
         if num_free == 0:
             return None
-        is_larger = not self.compat and _reach_m(self._assets, object_name, size) > (side / 2 + 1) * CELL_M
+        is_larger = not self.compat and _reach_m(self.assets, object_name, size) > (side / 2 + 1) * CELL_M
         for _ in range(_FOOTPRINT_TRIES if is_larger else 1):
             row, column = nth_centre(centres, counts, int(self.rng.integers(num_free)))
             pose = Pose.planar(
@@ -260,6 +260,13 @@ class TableSampler:
             if not is_larger or self._footprint_is_free(object_name, size, pose):
                 return pose
         return None
+
+    def covered(self, placement: Placement) -> np.ndarray:
+        """Return the cells that an object covers from above, whatever its height; shape (320, 160), bool."""
+        geometry = self.assets.geometry(placement.object, placement.size, placement.scale)
+        pose = placement.pose
+        raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
+        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
 
     def scene(self) -> Scene:
         """Return the scene placed so far."""
@@ -275,7 +282,7 @@ class TableSampler:
         fixed: bool | None = None,
     ) -> Placement:
         hover_z = size[2] * scale[2] / 2
-        z = hover_z if self.compat else self._assets.geometry(object_name, size, scale).rest_z_m
+        z = hover_z if self.compat else self.assets.geometry(object_name, size, scale).rest_z_m
         return Placement(
             id=FIRST_OBJECT_ID[self._end_effector] + len(self.placements),
             object=object_name,
@@ -294,7 +301,7 @@ class TableSampler:
     def _stamp(self, labels: np.ndarray, heights: np.ndarray, placement: Placement) -> None:
         from openvima.render.labels import stamp
 
-        stamp(labels, heights, placement, self._assets)
+        stamp(labels, heights, placement, self.assets)
 
     def _stamped(self, placements: Sequence[Placement]) -> tuple[np.ndarray, np.ndarray]:
         """Labels and heights of these objects."""
@@ -305,25 +312,18 @@ class TableSampler:
             self._stamp(labels, heights, placement)
         return labels, heights
 
-    def _covered(self, placement: Placement) -> np.ndarray:
-        """Cells that an object covers from above, whatever its height; shape (320, 160), bool."""
-        geometry = self._assets.geometry(placement.object, placement.size, placement.scale)
-        pose = placement.pose
-        raised = Pose((pose.x, pose.y, max(geometry.rest_z_m, 0.0)), pose.quaternion)
-        return self._stamped([replace(placement, id=1, pose=raised)])[0] > 0
-
     def _height_below(self, placement: Placement) -> float:
         """Height in metres of the highest point under an object."""
-        return float(self._heights[self._covered(placement)].max(initial=0.0))
+        return float(self._heights[self.covered(placement)].max(initial=0.0))
 
     def _footprint_is_free(self, object_name: str, size: Vector3, pose: Pose) -> bool:
-        geometry = self._assets.geometry(object_name, size)
+        geometry = self.assets.geometry(object_name, size)
         corners = pose.transform(geometry.visual.vertices.reshape(-1, 3))[:, :2]
         if (corners < WORKSPACE_LOW).any() or (corners > WORKSPACE_HIGH).any():
             return False
         if not self.placements:
             return True
-        return not self._labels[self._covered(Placement(1, object_name, "", size, pose))].any()
+        return not self._labels[self.covered(Placement(1, object_name, "", size, pose))].any()
 
     def _is_crowded(self, new: Placement, apart_m: float) -> bool:
         for other in self.placements:

@@ -78,10 +78,12 @@ class EpisodeRecorder:
         for self._last in env.frames:
             self._video.write(self._compose(_caption(self._title, self._width)))
 
-    def record_outcome(self, success: bool, steps: int) -> None:
-        """Append a still of the last frame with the outcome in the caption."""
-        outcome = f"solved in {steps} step{'' if steps == 1 else 's'}" if success else "not solved"
-        caption = _caption(self._title, self._width, outcome, _GOOD if success else _BAD)
+    def record_outcome(self, success: bool | None, steps: int) -> None:
+        """Append a still of the last frame with the outcome in the caption; None: without goals."""
+        taken = f"{steps} step{'' if steps == 1 else 's'}"
+        outcome = taken if success is None else f"solved in {taken}" if success else "not solved"
+        colour = MUTED if success is None else _GOOD if success else _BAD
+        caption = _caption(self._title, self._width, outcome, colour)
         self._video.write(self._compose(caption), repeat=math.ceil(_STILL_END_S * FRAMES_PER_SECOND))
 
     def _compose(self, caption: np.ndarray | None) -> np.ndarray:

@@ -1,0 +1,366 @@
+"""Episodes as YAML or JSON files: sampled and composed ones, and scenes written by hand.
+
+A file holds either all fields of an `Episode`, as `save_episode` writes them, or the arguments of `compose`.
+Files of others are hostile until checked: only the recorded fields are read, each with its type and limits.
+"""
+
+import base64
+import binascii
+import json
+import math
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Any  # plain values of a file
+
+import numpy as np
+import yaml
+
+from openvima.atomic_io import atomic_write_file
+from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
+from openvima.env.checked_values import MAX_ENTRIES, shown
+from openvima.env.composing import MAX_STEPS, composed
+from openvima.env.photos import read_photo
+from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
+from openvima.input_files import read_json, read_yaml
+from openvima.perception.objects import MAX_OBJECTS
+from openvima.scene import (
+    FIRST_OBJECT_ID,
+    AtPose,
+    Constraint,
+    DistractorsApart,
+    Episode,
+    EveryStepCounts,
+    Goal,
+    InOrder,
+    InZone,
+    NeverTouches,
+    ObjectImage,
+    PhotoImage,
+    Placement,
+    Pose,
+    PromptFill,
+    Scene,
+    SceneImage,
+    ZoneKeptClear,
+    in_workspace,
+)
+from openvima.tasks.seeding import DOMAINS, checked_seed
+
+MAX_EPISODE_BYTES = 512 * 1024
+FORMATS = (".yaml", ".yml", ".json")
+_KINDS: dict[Any, tuple[type, ...]] = {  # classes of fields that take several; files name them as "type"
+    PromptFill: (ObjectImage, SceneImage, PhotoImage),
+    Goal: (AtPose, InZone),
+    Constraint: (DistractorsApart, ZoneKeptClear, NeverTouches, InOrder, EveryStepCounts),
+}
+_IMAGES = tuple[tuple[str, PromptFill], ...]  # a mapping in files
+_MAX_NUMBER = 100.0  # metres, radians and factors
+_MAX_CHARS = 4096
+_SIZE_FACTOR, _SCALE_LIMITS = 4.0, (0.05, 20.0)  # of what the catalogue and the tasks use
+_HEIGHTS_M = (-0.1, 0.5)
+_WORD = re.compile(r"\w[\w.+-]{0,99}")
+
+
+def save_episode(episode: Episode, path: str | Path) -> Path:
+    """Save an episode as a readable file; `load_episode` returns an equal one.
+
+    Args:
+        episode: A sampled or composed episode.
+        path: File ending in .yaml, .yml or .json.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputFileError: The path ends in none of these, or the episode has a goal of a class of one's own.
+    """
+    path = Path(path)
+    suffix = _checked_suffix(path)
+    values = _encode(episode, Episode)
+    if suffix == ".json":
+        text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
+    else:
+        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
+    return atomic_write_file(path, text)
+
+
+def load_episode(path: str | Path, *, assets: str | Path | Assets = "procedural") -> Episode:
+    """Load an episode from a YAML or JSON file.
+
+    Args:
+        path: A file by `save_episode`, or a scene written by hand with the arguments of `compose`. PNG files
+            are relative to its folder and must be inside.
+        assets: Asset pack, for the rest heights of a scene written by hand.
+
+    Raises:
+        InputFileError: The file cannot be read, or holds no valid episode; the message names the field.
+        SceneError, UnknownObjectError, UnknownTextureError: The scene is not possible.
+    """
+    path = Path(path)
+    read = read_json if _checked_suffix(path) == ".json" else read_yaml
+    try:
+        values = read(path, max_bytes=MAX_EPISODE_BYTES)
+    except OSError as error:
+        raise InputFileError(f"episode {str(path)!r} cannot be read: {error.strerror or error}.") from None
+    try:
+        return episode_from_values(values, assets=assets, folder=path.parent)
+    except OpenVimaError as error:
+        raise type(error)(f"{path.name}: {error}") from None
+
+
+def episode_from_values(
+    values: object, *, assets: str | Path | Assets = "procedural", folder: Path | None = None
+) -> Episode:
+    """Read an episode from the plain values of a file.
+
+    Args:
+        values: All fields of an episode, or the arguments of `compose`.
+        assets: Asset pack.
+        folder: Folder of PNG files; None: there may be none.
+
+    Raises:
+        InputFileError, SceneError, UnknownObjectError, UnknownTextureError: As for `load_episode`.
+    """
+    if not isinstance(values, Mapping):
+        raise InputFileError(f"an episode is {shown(values)}; it must be a mapping.")
+    if "problem" in values:
+        episode = _decode(values, Episode, "episode")
+        _check(episode)
+        return episode
+    return composed(values, assets=load_assets(assets), photo=lambda name: _photo_beside(name, folder))
+
+
+def _checked_suffix(path: Path) -> str:
+    if (suffix := path.suffix.lower()) not in FORMATS:
+        raise InputFileError(f"episode file {str(path)!r} must end in {', '.join(FORMATS)}.")
+    return suffix
+
+
+def _photo_beside(name: str, folder: Path | None) -> PhotoImage:
+    """Read a PNG file in or below a folder, also after links are followed."""
+    if folder is None:
+        raise InputFileError(f"photo {shown(name)} needs an episode file to be relative to.")
+    try:
+        file = (folder / name).resolve()
+        if not Path(name).is_absolute() and file.is_relative_to(folder.resolve()):
+            return read_photo(file)
+    except (OSError, RuntimeError, UnicodeError):  # too long, loops of links
+        pass
+    raise InputFileError(f"photo {shown(name)} must be inside the folder of the episode file.")
+
+
+def _encode(value: Any, kind: Any) -> Any:  # Any: a part of an episode, annotations, plain values
+    """Return plain values: records as mappings without fields that have their default."""
+    if kind in _KINDS and type(value) not in _KINDS[kind]:
+        allowed = ", ".join(known.__name__ for known in _KINDS[kind])
+        raise InputFileError(f"a {type(value).__name__} cannot be saved in a file; allowed are {allowed}.")
+    if is_dataclass(value):
+        hints = typing.get_type_hints(type(value))
+        tag = {"type": type(value).__name__} if kind in _KINDS else {}
+        return tag | {
+            field.name: _encode(getattr(value, field.name), hints[field.name])
+            for field in fields(value)
+            if field.default is MISSING or getattr(value, field.name) != field.default
+        }
+    if kind == _IMAGES:
+        return {name: _encode(fill, PromptFill) for name, fill in value}
+    if isinstance(value, tuple):
+        kinds = _entry_kinds(kind, len(value))
+        return [_encode(entry, entry_kind) for entry, entry_kind in zip(value, kinds, strict=True)]
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _entry_kinds(kind: Any, count: int) -> Sequence[Any]:  # Any: annotations
+    """Annotations of a tuple's entries."""
+    arguments = typing.get_args(_without_none(kind))
+    return [arguments[0]] * count if arguments[-1] is Ellipsis else arguments
+
+
+def _without_none(kind: Any) -> Any:  # Any: annotations
+    """The kind of an optional field."""
+    arguments = typing.get_args(kind)
+    if type(None) in arguments and len(arguments) == 2:
+        return next(argument for argument in arguments if argument is not type(None))
+    return kind
+
+
+def _decode(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, annotations
+    """Return the value of an annotation; the inverse of `_encode`, for values that nobody has checked."""
+    if kind in _KINDS:
+        if not isinstance(value, Mapping) or not isinstance(value.get("type"), str):
+            raise InputFileError(f"{where} must be a mapping with a type.")
+        known = {each.__name__: each for each in _KINDS[kind]}
+        if value["type"] not in known:
+            raise InputFileError(f"{where}: {unknown_name('type', value['type'], known)}")
+        return _record({k: v for k, v in value.items() if k != "type"}, known[value["type"]], where)
+    if (inner := _without_none(kind)) is not kind:
+        return None if value is None else _decode(value, inner, where)
+    if is_dataclass(kind):
+        return _record(value, kind, where)
+    if kind == _IMAGES:
+        if not isinstance(value, Mapping):
+            raise InputFileError(
+                f"{where} is {shown(value)}; it must be a mapping of placeholders to images."
+            )
+        return tuple((name, _decode(fill, PromptFill, f"{where}.{name}")) for name, fill in value.items())
+    if typing.get_origin(kind) is tuple:
+        return _tuple(value, kind, where)
+    if typing.get_origin(kind) is typing.Literal:
+        if value not in typing.get_args(kind):
+            raise InputFileError(f"{where} is {shown(value)}; allowed: {', '.join(typing.get_args(kind))}.")
+        return value
+    return _scalar(value, kind, where)
+
+
+def _record(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, a dataclass, a record
+    if not isinstance(value, Mapping):
+        raise InputFileError(f"{where} is {shown(value)}; it must be a mapping.")
+    hints = typing.get_type_hints(kind)
+    if unknown := [name for name in value if name not in hints]:
+        raise InputFileError(f"{where}: {unknown_name('field', unknown[0], hints)}")
+    required = [field.name for field in fields(kind) if field.default is MISSING]
+    if missing := [name for name in required if name not in value]:
+        raise InputFileError(f"{where} has no {missing[0]}.")
+    try:
+        return kind(**{name: _decode(entry, hints[name], f"{where}.{name}") for name, entry in value.items()})
+    except InputFileError:
+        raise
+    except OpenVimaError as error:
+        raise InputFileError(f"{where}: {error}") from None
+
+
+def _tuple(value: Any, kind: Any, where: str) -> tuple[Any, ...]:  # Any: plain values, annotations
+    if not isinstance(value, list | tuple) or len(value) > MAX_ENTRIES:
+        raise InputFileError(
+            f"{where} is {shown(value)}; it must be a list of at most {MAX_ENTRIES} entries."
+        )
+    kinds = _entry_kinds(kind, len(value))
+    if len(kinds) != len(value):
+        raise InputFileError(f"{where} has {len(value)} entries; it must have {len(kinds)}.")
+    pairs = zip(value, kinds, strict=True)
+    return tuple(_decode(entry, entry_kind, f"{where}[{n}]") for n, (entry, entry_kind) in enumerate(pairs))
+
+
+def _scalar(value: Any, kind: Any, where: str) -> Any:  # Any: plain values, annotations
+    if kind is bool and isinstance(value, bool):
+        return value
+    if kind is int and type(value) is int:
+        return value
+    if kind is float and type(value) in (int, float) and abs(value) <= _MAX_NUMBER:  # NaN is not
+        return float(value)
+    if kind is str and isinstance(value, str) and len(value) <= _MAX_CHARS and value.isprintable():
+        return value
+    if kind is bytes and isinstance(value, str):
+        try:
+            return base64.b64decode(value, validate=True)
+        except (binascii.Error, ValueError):
+            pass
+    allowed = {
+        float: f"a number from {-_MAX_NUMBER:g} to {_MAX_NUMBER:g}",
+        int: "a whole number",
+        bool: "true or false",
+        str: f"one line of at most {_MAX_CHARS} characters",
+        bytes: "base64 text",
+    }[kind]
+    raise InputFileError(f"{where} is {shown(value)}; it must be {allowed}.")
+
+
+def _check(episode: Episode) -> None:
+    """Check what the types of the fields leave open.
+
+    Raises:
+        InputFileError, SceneError, UnknownObjectError, UnknownTextureError, ConfigError: It is not valid.
+    """
+    for name in ("max_steps", "oracle_max_steps"):
+        if not 1 <= getattr(episode, name) <= MAX_STEPS:
+            raise InputFileError(f"{name} is {getattr(episode, name)}; it must be 1 to {MAX_STEPS}.")
+    for name, value, known in (("level", episode.level, LEVELS), ("domain", episode.domain, DOMAINS)):
+        if value not in known:
+            raise InputFileError(unknown_name(name, value, known))
+    if not _WORD.fullmatch(episode.task):
+        raise InputFileError(f"task is {echo(repr(episode.task))}; give a plain name.")
+    checked_seed(episode.seed)
+    problem = episode.problem
+    _check_scene(problem.scene, FIRST_OBJECT_ID[problem.scene.end_effector], "scene")
+    _check_prompt(episode)
+    ids = {placement.id for placement in problem.scene.placements}
+    for record in (*problem.goals, *problem.constraints, *problem.prerequisites):
+        named = _ids_of(record)
+        if not named <= ids:
+            raise InputFileError(
+                f"a {type(record).__name__} names object {min(named - ids)}; the scene has {sorted(ids)}."
+            )
+        indices = getattr(record, "goals", None) or ()
+        if any(not 0 <= index < len(problem.goals) for index in indices):
+            raise InputFileError(f"a {type(record).__name__} names goals {list(indices)[:9]}, not all known.")
+    if any(size < 1 for size in problem.stages):
+        raise InputFileError(f"stages are {list(problem.stages)[:9]}; each must be at least 1.")
+    if problem.num_required is not None and not 0 < problem.num_required <= len(problem.goals):
+        raise InputFileError(f"num_required is {problem.num_required} of {len(problem.goals)} goals.")
+
+
+def _ids_of(record: Any) -> set[int]:  # Any: a goal or constraint
+    """Ids of the objects that a goal or constraint names."""
+    single = (getattr(record, name, None) for name in ("object_id", "relative_to"))
+    return {number for number in (*single, *getattr(record, "object_ids", ())) if number is not None}
+
+
+def _check_prompt(episode: Episode) -> None:
+    prompt = episode.problem.prompt
+    slots = list(dict.fromkeys(re.findall(r"\{(\w+)\}", prompt.text)))
+    names = [name for name, _ in prompt.images]
+    if names != slots:
+        raise InputFileError(f"the prompt has placeholders {shown(slots)} but images {shown(names)}.")
+    for name, fill in prompt.images:
+        if isinstance(fill, SceneImage):
+            _check_scene(fill.scene, 2, f"image {name!r}")
+        elif isinstance(fill, ObjectImage):
+            _check_placement(fill.placement, f"image {name!r}")
+            if not 0.1 <= fill.magnification <= 20:
+                raise InputFileError(
+                    f"image {name!r} has magnification {fill.magnification:g}; use 0.1 to 20."
+                )
+
+
+def _check_scene(scene: Scene, first_id: int, label: str) -> None:
+    if not len(scene.placements) <= MAX_OBJECTS:
+        raise InputFileError(
+            f"{label} has {len(scene.placements)} objects; at most {MAX_OBJECTS} are allowed."
+        )
+    for placement in scene.placements:
+        what = f"{label}, object {placement.id}"
+        if not first_id <= placement.id <= 254:
+            raise InputFileError(f"{what}: ids must be {first_id} to 254.")
+        _check_placement(placement, what)
+        if not in_workspace(placement.pose) or not _HEIGHTS_M[0] <= placement.pose.z <= _HEIGHTS_M[1]:
+            raise SceneError(
+                f"{what} ({placement.texture} {placement.object}) is at {shown(placement.pose.position)}; x "
+                "must lie in 0.25 … 0.75 m, y in -0.5 … 0.5 m and z in "
+                f"{_HEIGHTS_M[0]} … {_HEIGHTS_M[1]} m."
+            )
+
+
+def _check_placement(placement: Placement, label: str) -> None:
+    spec = object_spec(placement.object)
+    texture_spec(placement.texture)
+    for size, low, high in zip(placement.size, spec.size_min, spec.size_max, strict=True):
+        if not low / _SIZE_FACTOR <= size <= high * _SIZE_FACTOR:
+            raise SceneError(
+                f"{label}: size {shown(placement.size)} is not like that of a {placement.object}, "
+                f"{shown(spec.size_max)} m."
+            )
+    if not all(_SCALE_LIMITS[0] <= factor <= _SCALE_LIMITS[1] for factor in placement.scale):
+        raise SceneError(
+            f"{label}: scale {shown(placement.scale)} must lie in {_SCALE_LIMITS[0]} … {_SCALE_LIMITS[1]}."
+        )
+    _check_rotation(placement.pose, label)
+
+
+def _check_rotation(pose: Pose, label: str) -> None:
+    if not math.isclose(math.hypot(*pose.quaternion), 1.0, abs_tol=1e-6):
+        raise SceneError(f"{label}: quaternion {shown(pose.quaternion)} has not length 1.")
