@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from openvima.cli.main import main
-from openvima.cli.progress import LINES, Pace, generation_table, table_of
+from openvima.cli.progress import Pace, generation_table, plain_lines, table_of
 from openvima.data import Dataset, GenerationProgress, Shard, TaskProgress
 from openvima.tasks import list_tasks
 
@@ -60,15 +60,41 @@ def progress(done: int, total: int = 1000) -> GenerationProgress:
     return GenerationProgress((TaskProgress("rotate", done, total, done, 2 * done, 3),))
 
 
-def test_without_a_terminal_progress_is_a_few_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_terminal_generating_prints_a_first_and_a_last_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with generation_table() as report:
         for done in range(1001):
             report(progress(done))
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == LINES + 1
+    assert len(lines) == 2
     assert lines[0] == "demonstrations: 0 of 1,000 (0 %)"
-    assert lines[-1].startswith("demonstrations: 1,000 of 1,000 (100 %), ")
-    assert lines[-1].endswith(" episodes/s, 50.0 % of the seeds solved")
+    assert lines[1].startswith("demonstrations: 1,000 of 1,000 (100 %), ")
+    assert lines[1].endswith(" episodes/s; 50.0 % of the seeds solved")
+
+
+def test_without_a_terminal_progress_is_a_line_at_each_stage_and_each_minute(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    now = 0.0
+    report = plain_lines("training", clock=lambda: now)
+    for step in range(401):
+        now = float(step)
+        stage = "pretraining" if step < 150 else "cloning"
+        report(step, 400, f"{stage}: loss {step}")
+    lines = capsys.readouterr().err.splitlines()
+    assert [int(line.split()[1]) for line in lines] == [0, 60, 120, 150, 210, 270, 330, 390, 400]
+    assert lines[1] == "training: 60 of 400 (15 %), 1.0/s, 0:05:40 left; pretraining: loss 60"
+    assert lines[3] == "training: 150 of 400 (37 %); cloning: loss 150"
+    assert lines[-1] == "training: 400 of 400 (100 %), 1.0/s; cloning: loss 400"
+
+
+def test_less_than_one_a_second_is_a_number_a_minute(capsys: pytest.CaptureFixture[str]) -> None:
+    now = iter([0.0, 0.0, 90.0, 90.0])
+    report = plain_lines("evaluation", clock=lambda: next(now))
+    report(0, 32, "")
+    report(16, 32, "")
+    assert capsys.readouterr().err.splitlines()[1] == "evaluation: 16 of 32 (50 %), 10.7/min, 0:01:30 left"
 
 
 def test_a_run_with_nothing_to_do_says_that_it_is_done(capsys: pytest.CaptureFixture[str]) -> None:
@@ -89,11 +115,11 @@ def test_all_tasks_fit_a_small_terminal() -> None:
 
 
 def test_the_pace_leaves_out_the_start_of_the_workers() -> None:
-    now = iter([100.0, 102.0, 104.0])
+    now = iter([40.0, 100.0, 102.0, 104.0])
     pace = Pace(lambda: next(now))
     pace.update(0)
-    assert "left" not in pace.summary(progress(0))
+    assert "left" not in pace.summary(0, 1000)
     for written in (10, 30, 60):
         pace.update(written)
     assert pace.rate == 12.5
-    assert pace.summary(progress(60, 45_060)) == "60 of 45,060 (0 %), 12.5 episodes/s, 1:00:00 left"
+    assert pace.summary(60, 45_060, " episodes") == "60 of 45,060 (0 %), 12.5 episodes/s, 1:00:00 left"

@@ -10,6 +10,7 @@ import tyro
 
 from openvima.cli.lists import parse_list
 from openvima.cli.progress import progress_bar
+from openvima.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -150,7 +151,6 @@ def main(
 
 def print_results(results: "Results") -> None:
     """Print success rates as a table, a row a task and level, a column a policy; then the ablations."""
-    from rich.console import Console
     from rich.table import Table
 
     policies = results.policy_names()
@@ -168,9 +168,9 @@ def print_results(results: "Results") -> None:
         table.add_row(level, "mean", *cells, style="bold")
         oracle_horizon = (_oracle_horizon_mean(results, policy, level) for policy in policies)
         table.add_row(level, "mean, oracle horizon", *oracle_horizon, end_section=True)
-    Console().print(table)
+    print_table(table, num_heads=2)
     if any(row.ablation for row in results.rows):
-        Console().print(_ablation_table(results, means))
+        print_table(_ablation_table(results, means), num_heads=2)
 
 
 def _ablation_table(results: "Results", means: "Mapping[tuple[str, str, str], LevelMean]") -> "Table":

@@ -12,6 +12,7 @@ from typing import Any
 
 from openvima import __version__
 from openvima.atomic_io import FREE_SPACE
+from openvima.cli.streams import accept_any_text
 from openvima.errors import OpenVimaError, UnknownWordWarning, echo, unknown_name
 from openvima.memory import address_space_remedy, lacks_memory, require_address_space
 
@@ -70,6 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit status: 0 done, 1 failed, 2 wrong usage or input, 130 interrupted.
     """
+    accept_any_text()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in (*_HELP, "help"):
         verbs = "\n".join(f"  {verb:<15} {summary}" for verb, summary in VERBS.items())

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from openvima.cli.tables import print_table, table_console
+
 if TYPE_CHECKING:
     from openvima.policies.bundled import BundledPolicy
     from openvima.policies.config import PolicyConfig
@@ -207,12 +209,9 @@ def _record(size: "PolicySize") -> dict[str, object]:
 
 def _print_table(sizes: dict[str, "PolicySize"]) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
-    if not console.is_terminal:  # a file or a pipe takes long lines
-        console = Console(width=FULL_WIDTH)
+    console = table_console()
     rows = {name: _cells(name, size) for name, size in sizes.items()}
     columns = list(next(iter(rows.values())))
     if console.width < FULL_WIDTH:
@@ -227,7 +226,7 @@ def _print_table(sizes: dict[str, "PolicySize"]) -> None:
             table.add_section()
             architecture = sizes[name].architecture
         table.add_row(*(cells[column] for column in columns))
-    console.print(table)
+    print_table(table, console)
     for note in _NOTES:
         console.print(note, highlight=False)
 

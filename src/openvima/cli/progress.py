@@ -1,5 +1,10 @@
-"""Progress on stderr: bars for `report(done, total, note)` callbacks, and a table for generating."""
+"""Progress on stderr: bars for `report(done, total, note)` callbacks, and a table for generating.
 
+Where stderr is no terminal, both are lines: one at each stage, one a minute and one at the end.
+"""
+
+import re
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +16,7 @@ if TYPE_CHECKING:
     from openvima.data import GenerationProgress
 
 Report = Callable[[int, int, str], None]
-LINES = 10  # of progress, where stderr is no terminal
+LINE_S = 60.0  # between two lines of a stage, where stderr is no terminal
 REDRAW_S = 0.25
 
 
@@ -26,6 +31,11 @@ def progress_bar(label: str) -> Iterator[Report]:
         A callback `report(done, total, note)`; the note ends the line and is cut where the line ends.
     """
     from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield plain_lines(label)
+        return
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -36,37 +46,34 @@ def progress_bar(label: str) -> Iterator[Report]:
     )
     from rich.table import Column
 
+    is_wide = console.width >= 80
+    first = 18 if is_wide else None
     columns = (
-        TextColumn("{task.description}", table_column=Column(no_wrap=True, min_width=18)),
-        BarColumn(bar_width=16),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True, min_width=first)),
+        *([BarColumn(bar_width=16)] if is_wide else []),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TimeRemainingColumn(compact=True, table_column=Column(no_wrap=True)),
         TextColumn("left", table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
     )
-    console = Console(stderr=True)
     progress = Progress(*columns, console=console, refresh_per_second=4, expand=True)
     task = progress.add_task(label, total=None, note="")
     has_begun = False
 
     def report(done: int, total: int, note: str) -> None:
         nonlocal has_begun
-        if not has_begun:
-            progress.start()
-            has_begun = True
+        has_begun = True
         progress.update(task, completed=done, total=total, note=note)
 
-    if console.is_terminal:
-        progress.start()
+    progress.start()
     try:
         yield report
     finally:
         if not has_begun:  # what follows, mostly an error, says it all
             progress.update(task, visible=False)
             progress.live.transient = True
-        if has_begun or console.is_terminal:  # else even stopping would print a line
-            progress.stop()
+        progress.stop()
 
 
 @contextmanager
@@ -80,11 +87,11 @@ def generation_table() -> Iterator[Callable[["GenerationProgress"], None]]:
     from rich.live import Live
 
     console = Console(stderr=True)
-    pace = Pace()
     if not console.is_terminal:
-        yield _plain_lines(console.file.write, pace)
-        console.file.flush()
+        say = plain_lines("demonstrations", unit=" episodes")
+        yield lambda progress: say(progress.done, progress.total, _solved(progress), progress.written)
         return
+    pace = Pace()
     with Live(console=console, auto_refresh=False) as live:
         drawn_s = 0.0
 
@@ -99,8 +106,41 @@ def generation_table() -> Iterator[Callable[["GenerationProgress"], None]]:
         yield report
 
 
+def plain_lines(
+    label: str, *, unit: str = "", clock: Callable[[], float] = time.monotonic
+) -> Callable[..., None]:
+    """Return a progress callback that prints lines: at each stage, once a minute, and at the end.
+
+    Args:
+        label: What is being done, in a word or two.
+        unit: Of what is counted, after a space.
+        clock: Returns the time in seconds.
+
+    Returns:
+        A callback `report(done, total, note)`. How many were done by this process may follow, for the rate.
+    """
+    stage, stages_ended, shown_s, pace = None, set[str](), 0.0, Pace(clock)
+
+    def report(done: int, total: int, note: str, new: int | None = None) -> None:
+        nonlocal stage, shown_s, pace
+        now_s, before = clock(), stage
+        stage = re.sub(r"[^a-z].*", "", note.lower())  # its first word
+        if stage != before:
+            pace = Pace(clock)
+        pace.update(done if new is None else new)
+        is_end = done == total and stage not in stages_ended
+        if stage != before or is_end or now_s - shown_s >= LINE_S:
+            shown_s = now_s
+            if done == total:
+                stages_ended.add(stage)
+            text = f"{label}: {pace.summary(done, total, unit)}{f'; {note}' if note else ''}"
+            print(text, file=sys.stderr, flush=True)
+
+    return report
+
+
 class Pace:
-    """Episodes a second since the first one, which leaves out the start of the workers.
+    """Things done a second; where possible since the first one, which leaves out the start of workers.
 
     Args:
         clock: Returns the time in seconds.
@@ -108,52 +148,42 @@ class Pace:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._first: tuple[float, int] | None = None
+        self._marks: list[tuple[float, int]] = []  # of the first update, and of the first progress
         self.rate: float | None = None
 
-    def update(self, written: int) -> None:
-        """Take note of the number of episodes written so far."""
-        if written and self._first is None:
-            self._first = (self._clock(), written)
-        elif self._first is not None:
-            seconds, episodes = self._clock() - self._first[0], written - self._first[1]
-            if seconds > 0 and episodes > 0:
-                self.rate = episodes / seconds
+    def update(self, count: int) -> None:
+        """Take note of how many are done."""
+        now_s = self._clock()
+        if not self._marks or (len(self._marks) == 1 and count > self._marks[0][1]):
+            self._marks.append((now_s, count))
+        for since_s, before in self._marks:  # the later one counts if anything was done after it
+            if now_s > since_s and count > before:
+                self.rate = (count - before) / (now_s - since_s)
 
-    def summary(self, progress: "GenerationProgress") -> str:
-        """Describe in a line how far it is."""
-        share = f"{progress.done:,} of {progress.total:,} ({100 * progress.done // progress.total} %)"
+    def summary(self, done: int, total: int, unit: str = "") -> str:
+        """Describe in a line how far it is, how fast, and how long it still takes."""
+        text = f"{done:,} of {total:,}" + (f" ({100 * done // total} %)" if total else "")
         if self.rate is None:
-            return share
-        num_left = progress.total - progress.done
-        left = f", {_duration(num_left / self.rate)} left" if num_left else ""
-        return f"{share}, {self.rate:.1f} episodes/s{left}"
+            return text
+        speed = f"{self.rate:.1f}{unit}/s" if self.rate >= 1 else f"{60 * self.rate:.1f}{unit}/min"
+        left = f", {_duration((total - done) / self.rate)} left" if done < total else ""
+        return f"{text}, {speed}{left}"
 
 
-def _plain_lines(write: Callable[[str], object], pace: Pace) -> Callable[["GenerationProgress"], None]:
-    shown = -1
-
-    def report(progress: "GenerationProgress") -> None:
-        nonlocal shown
-        pace.update(progress.written)
-        part = LINES * progress.done // progress.total
-        if part > shown:
-            shown = part
-            solved = (
-                f", {_percent(progress.written, progress.tried)} of the seeds solved"
-                if progress.tried
-                else ""
-            )
-            write(f"demonstrations: {pace.summary(progress)}{solved}\n")
-
-    return report
+def _solved(progress: "GenerationProgress") -> str:
+    return f"{_percent(progress.written, progress.tried)} of the seeds solved" if progress.tried else ""
 
 
 def table_of(progress: "GenerationProgress", pace: Pace) -> "Table":
     """Draw a line a task; 17 of them fit a terminal of 80 columns and 24 lines."""
     from rich.table import Table
 
-    table = Table(title=pace.summary(progress), title_justify="left", box=None, pad_edge=False)
+    table = Table(
+        title=pace.summary(progress.done, progress.total, " episodes"),
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+    )
     table.add_column("task", no_wrap=True)
     for name in ("done", "of", "solved", "redraws"):
         table.add_column(name, justify="right", no_wrap=True)

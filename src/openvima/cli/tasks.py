@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from openvima.cli.tables import print_table, table_console
 from openvima.tasks.oracle_success import oracle_record
 
 if TYPE_CHECKING:
@@ -42,13 +43,10 @@ def main(
     if as_json:
         print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
         return 0
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console()
-    if not console.is_terminal:  # a file or a pipe takes long lines
-        console = Console(width=150)
+    console = table_console()
     table = Table(title=f"{len(specs)} tasks", show_lines=True)
     columns = ["task", "family", "prompt", "tool", "levels", "steps", "oracle"]
     if console.width < FULL_WIDTH:  # else words of the prompts would break
@@ -68,7 +66,7 @@ def main(
             "oracle": _percent(oracle_record(spec.name)),
         }
         table.add_row(*(cells[name] for name in columns))
-    console.print(table)
+    print_table(table, console)
     console.print("steps: step limit of the oracle, and what a policy may use beyond it")
     console.print("oracle: its success rate in %, over all levels; --json has each level")
     return 0

@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from openvima.cli.progress import progress_bar
+from openvima.cli.tables import print_table
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from openvima.data.summary import Histogram, Summary, Unfinished
 
 _BAR_WIDTH = 40
@@ -65,7 +68,8 @@ def info(
     elif isinstance(summary, Unfinished):
         print("\n".join(_unfinished(summary)))
     else:
-        print("\n".join([*_summary(summary), *_hints(details or html is not None, html)]))
+        for line in [*_summary(summary), *_hints(details or html is not None, html)]:
+            print(line) if isinstance(line, str) else print_table(line)
     return 0
 
 
@@ -88,7 +92,7 @@ def _write_appearance(folder: Path, file: Path) -> None:
         print(f"{file}: everything is inside the training partition", file=sys.stderr)
 
 
-def _summary(summary: "Summary") -> Iterator[str]:
+def _summary(summary: "Summary") -> "Iterator[str | Table]":
     manifest = summary.manifest
     counts, versions = manifest["counts"], manifest["versions"]
     yield (
@@ -103,7 +107,7 @@ def _summary(summary: "Summary") -> Iterator[str]:
     for name, size in summary.object_caches.items():
         yield f"object cache {name}: {size / 1e6:,.1f} MB"
     yield ""
-    yield from _task_table(summary)
+    yield _task_table(summary)
     for histogram in summary.histograms:
         if len(histogram.counts) > 1:
             yield ""
@@ -120,16 +124,25 @@ def _shown(value: object) -> str:
     return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
 
 
-def _task_table(summary: "Summary") -> Iterator[str]:
-    yield (
-        f"{'task':<28}{'episodes':>10}{'steps':>10}{'kB/episode':>12}{'images':>8}"
-        f"{'seeds tried':>13}{'oracle success':>16}{'redraws':>10}"
-    )
+def _task_table(summary: "Summary") -> "Table":
+    from rich.table import Table
+
+    table = Table("task", box=None, pad_edge=False, header_style="")
+    for name in ("episodes", "steps", "kB/episode", "images", "seeds tried", "oracle success", "redraws"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.columns[0].no_wrap = True
     for task in summary.tasks:
-        yield (
-            f"{task.task:<28}{task.episodes:>10,}{task.steps:>10,}{task.bytes / task.episodes / 1e3:>12.1f}"
-            f"{task.image_fraction:>8.0%}{task.seeds_tried:>13,}{task.success_rate:>16.1%}{task.redraws:>10,}"
+        table.add_row(
+            task.task,
+            f"{task.episodes:,}",
+            f"{task.steps:,}",
+            f"{task.bytes / task.episodes / 1e3:.1f}",
+            f"{task.image_fraction:.0%}",
+            f"{task.seeds_tried:,}",
+            f"{task.success_rate:.1%}",
+            f"{task.redraws:,}",
         )
+    return table
 
 
 def _bars(histogram: "Histogram") -> Iterator[str]:
