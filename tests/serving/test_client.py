@@ -8,7 +8,7 @@ import pytest
 from websockets.server import ServerProtocol
 
 from openvima.errors import ConfigError, PolicyError, ServerError
-from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread
+from openvima.serving import PROTOCOL, RemotePolicy, serve_in_thread
 from openvima.serving.packing import pack
 from openvima.serving.protocol import TOKEN_VARIABLE
 from served_policies import (
@@ -46,7 +46,7 @@ def test_a_server_that_is_not_there_is_named_with_what_starts_one() -> None:
 
 def test_the_token_comes_from_the_variable_or_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    with serve_in_thread(ForMany(), ServerConfig(port=0, token="secret")) as url:
+    with serve_in_thread(ForMany(), token="secret") as url:
         for token in (None, "wrong"):
             with pytest.raises(ServerError, match=f"HTTP 401.*{TOKEN_VARIABLE}"):
                 RemotePolicy(url, token=token)
@@ -110,7 +110,7 @@ def test_a_connection_lost_within_an_episode_is_an_error_and_the_next_reset_make
         policy.reset([made_up_prompt(2)])
     with pytest.raises(PolicyError, match="call reset"):
         policy.act([made_up_observation(1)])
-    with serve_in_thread(ForMany(), ServerConfig(port=port_of(url))):
+    with serve_in_thread(ForMany(), port=port_of(url)):
         policy.reset([made_up_prompt(3)])
         assert told(policy.act([made_up_observation(4)])[0]) == (3, 4, 1)
         policy.close()
@@ -119,17 +119,17 @@ def test_a_connection_lost_within_an_episode_is_an_error_and_the_next_reset_make
 def test_another_policy_at_the_same_address_is_refused() -> None:
     with serve_in_thread(ForMany(), about={"policy": {"sha256": "one"}}) as url:
         policy = RemotePolicy(url)
-    config = ServerConfig(port=port_of(url))
-    with serve_in_thread(ForMany(), config, about={"policy": {"sha256": "two"}}):
+    port = port_of(url)
+    with serve_in_thread(ForMany(), port=port, about={"policy": {"sha256": "two"}}):
         with pytest.raises(ServerError, match="another policy than before"):
             policy.reset([made_up_prompt(1)])
         policy.close()
 
 
 def test_the_same_policy_with_other_limits_goes_on_under_those() -> None:
-    with serve_in_thread(ForMany(), ServerConfig(port=0, max_episodes=1)) as url:
+    with serve_in_thread(ForMany(), max_episodes=1) as url:
         policy = RemotePolicy(url)
-    with serve_in_thread(ForMany(), ServerConfig(port=port_of(url), max_episodes=2)):
+    with serve_in_thread(ForMany(), port=port_of(url), max_episodes=2):
         policy.reset([made_up_prompt(1)] * 2)
         policy.close()
 
@@ -233,8 +233,8 @@ def test_a_server_that_does_not_read_is_given_up() -> None:
 
 
 def test_batches_above_the_limits_are_refused_before_they_are_sent() -> None:
-    config = ServerConfig(port=0, max_episodes=2, max_message_bytes=1024)
-    with serve_in_thread(Telltale(), config) as url, RemotePolicy(url) as policy:
+    limits = {"max_episodes": 2, "max_message_bytes": 1024}
+    with serve_in_thread(Telltale(), **limits) as url, RemotePolicy(url) as policy:
         with pytest.raises(PolicyError, match=r"at most 2 episodes at once, got 3.*--max-episodes"):
             policy.reset([made_up_prompt(1)] * 3)
         with pytest.raises(PolicyError, match=r"prompts take [\d,]+ bytes.*--max-message-mb"):

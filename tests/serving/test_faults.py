@@ -17,18 +17,18 @@ from websockets.sync.client import connect
 
 from fuzz_server import Fuzzer
 from openvima.errors import ServerError
-from openvima.serving import RemotePolicy, ServerConfig, serve_in_thread
+from openvima.serving import RemotePolicy, serve_in_thread
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import encode_observation, encode_prompt
 from served_policies import ForMany, made_up_observation, made_up_prompt, told
 
-CONFIG = ServerConfig(port=0, max_message_bytes=2**18, idle_s=0.3)
+SETTINGS = {"max_message_bytes": 2**18, "idle_s": 0.3}
 NUM_MALFORMED = 1000
 
 
 @pytest.fixture
 def url() -> Iterator[str]:
-    with serve_in_thread(ForMany(), CONFIG) as url:
+    with serve_in_thread(ForMany(), **SETTINGS) as url:
         yield url
 
 
@@ -210,7 +210,7 @@ def test_a_client_that_goes_while_the_policy_thinks_is_forgotten() -> None:
             assert answered.wait(10)
             return super().act(observations)
 
-    with serve_in_thread(Slow(), ServerConfig(port=0, max_connections=1)) as url:
+    with serve_in_thread(Slow(), max_connections=1) as url:
         with connect(url, compression=None, proxy=None) as connection:
             connection.recv()
             connection.send(good_messages()[0])

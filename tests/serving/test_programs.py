@@ -58,7 +58,7 @@ def test_serve_prints_its_address_answers_and_ends_with_ctrl_c() -> None:
         server.send_signal(signal.SIGINT)
         assert server.wait(timeout=20) == 130
         logged = server.stderr.read()
-        assert "connected" in logged and logged.endswith("stopped\n") and "Traceback" not in logged
+        assert "connected" in logged and logged.endswith("goodbye.\n") and "Traceback" not in logged
         policy.close()
 
 

@@ -21,7 +21,7 @@ from openvima.policies import RandomPolicy, load_policy  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.presets import preset  # noqa: E402
-from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread  # noqa: E402
+from openvima.serving import PROTOCOL, RemotePolicy, serve_in_thread  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding")
 TINY = EvaluationConfig(("random",), TASKS, ("L1",), episodes=3, batch=2)
@@ -121,8 +121,8 @@ def test_outcomes_are_kept_for_the_same_server_and_played_again_for_another(tmp_
         path = evaluate(config)
         first = path.read_bytes()
         assert evaluate(config).read_bytes() == first
-    same_port = ServerConfig(port=int(url.rpartition(":")[2]))
-    with serve_in_thread(RandomPolicy(1), same_port, about={"policy": {"sha256": "other"}}):
+    same_port = int(url.rpartition(":")[2])
+    with serve_in_thread(RandomPolicy(1), port=same_port, about={"policy": {"sha256": "other"}}):
         with pytest.raises(ConfigError, match="another evaluation"):
             evaluate(config)
         evaluate(replace(config, force=True))

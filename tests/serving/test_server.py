@@ -2,7 +2,6 @@
 
 import socket
 from collections.abc import Iterator
-from dataclasses import replace
 from http.client import HTTPConnection
 from typing import Any
 from urllib.parse import urlsplit
@@ -13,18 +12,19 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from openvima import __version__
-from openvima.errors import ConfigError
-from openvima.serving import PROTOCOL, RemotePolicy, ServerConfig, serve_in_thread
+from openvima.errors import ConfigError, PolicyError
+from openvima.serving import PROTOCOL, RemotePolicy, serve, serve_in_thread
+from openvima.serving.config import ServerConfig
 from openvima.serving.packing import pack, unpack
 from openvima.serving.protocol import encode_observation, encode_prompt
 from served_policies import ForMany, Telltale, made_up_observation, made_up_prompt, told
 
-CONFIG = ServerConfig(port=0, max_episodes=3, max_connections=2, max_message_bytes=2**16)
+SETTINGS = {"max_episodes": 3, "max_connections": 2, "max_message_bytes": 2**16}
 
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    with serve_in_thread(ForMany(), CONFIG, about={"policy": {"name": "telltale"}}) as url:
+    with serve_in_thread(ForMany(), **SETTINGS, about={"policy": {"name": "telltale"}}) as url:
         yield url
 
 
@@ -175,13 +175,13 @@ def test_a_policy_without_sessions_serves_one_client_at_a_time() -> None:
 def test_health_is_answered_over_http_with_and_without_a_token(url: str) -> None:
     assert fetch(url, "/healthz") == (200, b"OK\n")
     assert fetch(url, "/")[0] == 426  # Upgrade Required
-    with serve_in_thread(Telltale(), replace(CONFIG, token="secret")) as guarded:
+    with serve_in_thread(Telltale(), **SETTINGS, token="secret") as guarded:
         assert fetch(guarded, "/healthz") == (200, b"OK\n")
 
 
 @pytest.mark.parametrize("header", [None, "Bearer", "Bearer ", "Bearer wrong", "secret", "Bearer secret2"])
 def test_who_does_not_know_the_token_is_turned_away(header: str | None) -> None:
-    with serve_in_thread(Telltale(), replace(CONFIG, token="secret")) as url:
+    with serve_in_thread(Telltale(), **SETTINGS, token="secret") as url:
         headers = {"Authorization": header} if header else None
         with pytest.raises(InvalidStatus, match="401"), connect(url, additional_headers=headers, proxy=None):
             pass
@@ -222,7 +222,7 @@ def test_a_port_that_is_taken_is_named() -> None:
         port = taken.getsockname()[1]
         with (
             pytest.raises(ConfigError, match=f"port {port}"),
-            serve_in_thread(Telltale(), ServerConfig(port=port)),
+            serve_in_thread(Telltale(), port=port),
         ):
             pass
 
@@ -238,3 +238,7 @@ def test_settings_out_of_range_are_named_together_and_tokens_are_not_shown() -> 
     with pytest.raises(ConfigError, match=r"port is 70000.*max_episodes is 0"):
         ServerConfig(port=70000, max_episodes=0)
     assert "secret" not in repr(ServerConfig(token="secret"))
+    with pytest.raises(ConfigError, match=r"no setting of a server 'tokn'\. Did you mean 'token'"):
+        serve(Telltale(), tokn="secret")
+    with pytest.raises(PolicyError, match="the policy is a dict without reset and act"):
+        serve({})

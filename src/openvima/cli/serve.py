@@ -3,6 +3,7 @@
 import logging
 import os
 import sys
+from dataclasses import asdict
 from typing import Annotated
 
 import tyro
@@ -59,12 +60,12 @@ def main(
     from openvima.evaluation.versions import versions
     from openvima.policies import load_policy
     from openvima.serving import serve
-    from openvima.serving.config import ServerConfig
+    from openvima.serving.config import server_config
     from openvima.serving.packing import require_extra
     from openvima.serving.protocol import TOKEN_VARIABLE
 
     require_extra()  # before the seconds that loading takes
-    config = ServerConfig(
+    settings = server_config(
         host=host,
         port=port,
         token=token or os.environ.get(TOKEN_VARIABLE) or None,
@@ -86,5 +87,5 @@ def main(
         },
     }
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s")
-    serve(loaded, config, about=about, ready=lambda url: print(url, flush=True))
+    serve(loaded, **asdict(settings), about=about, ready=lambda url: print(url, flush=True))
     return 0

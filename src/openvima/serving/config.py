@@ -1,9 +1,10 @@
 """Settings of a policy server."""
 
 import ipaddress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, unknown_name
 from openvima.serving.packing import MAX_LENGTH
 from openvima.serving.protocol import TOKEN_VARIABLE, check_token
 from openvima.tasks.prompts import check_prompts
@@ -64,6 +65,18 @@ class ServerConfig:
             raise ConfigError(" ".join(problems))
         check_token(self.token)
         check_prompts(self.prompts)
+
+
+def server_config(**settings: Any) -> ServerConfig:  # Any: of several kinds
+    """Return the config with these fields.
+
+    Raises:
+        ConfigError: There is no such field, or as for `ServerConfig`.
+    """
+    known = [field.name for field in fields(ServerConfig)]
+    if unknown := [name for name in settings if name not in known]:
+        raise ConfigError(" ".join(unknown_name("setting of a server", name, known) for name in unknown))
+    return ServerConfig(**settings)
 
 
 def is_loopback(host: str) -> bool:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from openvima import __version__
 from openvima.errors import ConfigError, echo
 from openvima.policies.base import Policy
+from openvima.policies.own_code import checked_policy
 from openvima.policies.prompt_limits import PromptLimits
-from openvima.serving.config import ServerConfig
+from openvima.serving.config import ServerConfig, server_config
 from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import PROTOCOL
 from openvima.serving.session import Session
@@ -35,54 +36,61 @@ _TRANSPORT_LOG.setLevel(logging.CRITICAL)  # a traceback for every port scan; `s
 
 def serve(
     policy: Policy,
-    config: ServerConfig | None = None,
     *,
+    port: int = 8000,
     about: Mapping[str, Any] | None = None,  # Any: plain values
     ready: Callable[[str], None] | None = None,
+    **settings: Any,  # Any: of several kinds
 ) -> None:
     """Serve a policy until Ctrl-C.
 
     Args:
         policy: Follows the `Policy` protocol. If it has a method `new_session`, which returns a policy with
             episodes of its own, each client gets one; else only one client is let in at a time.
-        config: Where, and with which limits.
+        port: TCP port; 0 takes a free one.
         about: What the policy is, for clients and their results: its name, a hash of its weights. Results
             of an interrupted evaluation are kept for as long as this stays the same.
         ready: Called with the server's address once it answers.
+        **settings: Other fields of `ServerConfig`, such as `host`, `token` or `max_connections`.
 
     Raises:
-        ConfigError: The port is taken, or the host is not one of this machine.
+        ConfigError: A setting is unknown or out of range, the port is taken, or the host is not one of this
+            machine.
+        PolicyError: The policy lacks a method.
         MissingExtraError: A package of the extra `serve` is missing.
         KeyboardInterrupt: By Ctrl-C, after all connections were closed.
     """
     require_extra()
-    server = _PolicyServer(policy, config or ServerConfig(), about or {})
+    server = _PolicyServer(policy, server_config(port=port, **settings), about or {})
     asyncio.run(server.run(ready or (lambda url: None), asyncio.Event()))
 
 
 @contextmanager
 def serve_in_thread(
     policy: Policy,
-    config: ServerConfig | None = None,
     *,
+    port: int = 0,
     about: Mapping[str, Any] | None = None,  # Any: plain values
+    **settings: Any,  # Any: of several kinds
 ) -> Iterator[str]:
     """Serve a policy in a thread of this process while the block runs.
 
     Args:
         policy: As for `serve`.
-        config: As for `serve`; by default on a free port.
+        port: As for `serve`; by default a free one.
         about: As for `serve`.
+        **settings: As for `serve`.
 
     Yields:
         The server's address.
 
     Raises:
         ConfigError: As for `serve`.
+        PolicyError: As for `serve`.
         MissingExtraError: As for `serve`.
     """
     require_extra()
-    server = _PolicyServer(policy, config or ServerConfig(port=0), about or {})
+    server = _PolicyServer(policy, server_config(port=port, **settings), about or {})
     url: Future[str] = Future()
     loop: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
 
@@ -123,6 +131,7 @@ class _PolicyServer:
     """
 
     def __init__(self, policy: Policy, config: ServerConfig, about: Mapping[str, Any]) -> None:
+        checked_policy(policy, "the policy is")
         self._config = config
         self._new_policy: Callable[[], Policy] = getattr(policy, "new_session", lambda: policy)
         self._max_connections = config.max_connections if hasattr(policy, "new_session") else 1
