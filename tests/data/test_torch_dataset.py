@@ -1,6 +1,7 @@
 """Demonstrations for PyTorch: the same batches for any number of workers, and a position that lasts."""
 
 import json
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,11 +10,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch.utils.data import DataLoader  # noqa: E402
+
 from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.batching import BatchOrder  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
-from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, tensors_of  # noqa: E402
-from openvima.errors import ConfigError  # noqa: E402
+from openvima.data.torch_dataset import BatchLoader, DemonstrationDataset, collate, tensors_of  # noqa: E402
+from openvima.errors import ConfigError, ShapeError  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,42 @@ def test_a_demonstration_becomes_tensors(demos: Dataset) -> None:
     assert set(item["prompt_images"]) == set(demo.prompt.images)
     assert item["prompt_images"][next(iter(demo.prompt.images))]["rgb_front"].shape == (3, 128, 256)
     assert DemonstrationDataset(demos, lambda demo: demo.seed)[5] == demo.seed
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_plain_loader_pads_demonstrations_of_different_lengths(demos: Dataset, workers: int) -> None:
+    items = DemonstrationDataset(demos.path)
+    batch = next(iter(DataLoader(items, batch_size=8, num_workers=workers)))
+    steps = max(demo.num_steps for demo in demos)
+    assert steps > min(demo.num_steps for demo in demos)
+    assert batch["rgb_top"].shape == (8, steps + 1, 3, 128, 256)
+    assert batch["pose1_rotation"].shape == (8, steps, 4)
+    assert batch["mask"].sum(1).tolist() == [demo.num_steps for demo in demos]
+    assert batch["prompt_mask"].sum(1).tolist() == [len(demo.prompt.images) for demo in demos]
+    assert batch["prompt"] == [demo.prompt.text for demo in demos]
+    row, demo = next((k, demo) for k, demo in enumerate(demos) if demo.num_steps < steps)
+    last = demo.num_steps
+    assert torch.equal(batch["segm_front"][row, : last + 1], torch.from_numpy(np.array(demo.segm["front"])))
+    assert (batch["segm_front"][row, last + 1 :] == 255).all()
+    assert (batch["pick_ids"][row, last:] == -1).all() and not batch["pose0_position"][row, last:].any()
+    for number, (name, image) in enumerate(demo.prompt.images.items()):
+        assert batch["prompt_names"][row][number] == name
+        assert (batch["prompt_rgb_top"][row, number].numpy() == image.rgb["top"]).all()
+
+
+def test_slices_are_data_sets(demos: Dataset) -> None:
+    items = DemonstrationDataset(demos, lambda demo: demo.seed)
+    seeds = [demo.seed for demo in demos]
+    assert list(items[2:7:2]) == seeds[2:7:2]
+    assert list(items[2:][1:3]) == seeds[3:5]
+    assert items[:3][-1] == seeds[2]
+    assert len(items[:100]) == len(items) == 8
+    with pytest.raises(IndexError, match="episode 3 of 3; count from 0 to 2"):
+        items[:3][3]
+    copied = pickle.loads(pickle.dumps(DemonstrationDataset(demos)[5:]))
+    assert torch.equal(copied[0]["rgb_top"], DemonstrationDataset(demos)[5]["rgb_top"])
+    with pytest.raises(ShapeError, match="at least one"):
+        collate([])
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")  # on a machine of two processors

@@ -1,17 +1,22 @@
 """Demonstrations for PyTorch: by number, or as a stream of batches that can go on where it stopped."""
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
+from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
+from torch.utils.data._utils.collate import default_collate_fn_map  # documented with `default_collate`
 
 from openvima.data.batching import BatchOrder
 from openvima.data.reader import Dataset as Demonstrations
 from openvima.data.records import Demonstration
-from openvima.errors import ConfigError
+from openvima.errors import ConfigError, ShapeError
 from openvima.scene import ACTION_SHAPES
+from openvima.scene.scene import BACKGROUND_ID
 
 Episode = TypeVar("Episode")
 # Episodes of a batch and its number to whatever the user's training step takes (Any).
@@ -21,30 +26,57 @@ Transform = Callable[[list[Episode], int], Any]
 class DemonstrationDataset(Dataset):
     """Whole demonstrations with their images, by number.
 
+    A plain `DataLoader` makes batches of them, with any number of workers: items of `tensors_of` are joined
+    by `collate`. A slice is a `DemonstrationDataset` of those demonstrations.
+
     Args:
-        demonstrations: The folder of demonstrations.
-        transform: Turns a demonstration into an item; by default `tensors_of`.
+        demonstrations: The folder of demonstrations, or its path.
+        transform: Turns a demonstration into an item; by default `tensors_of`. For workers that are spawned
+            it must be a function of a module or an object that can be pickled.
+
+    Raises:
+        DatasetError: The folder is no finished data set.
 
     Example:
-        >>> items = DemonstrationDataset(openvima.data.Dataset("demos"))
+        >>> items = DemonstrationDataset("demos")
         >>> items[0]["rgb_top"].shape
         torch.Size([2, 3, 128, 256])
+        >>> batch = next(iter(DataLoader(items[:100], batch_size=8)))
+        >>> batch["rgb_top"].shape
+        torch.Size([8, 4, 3, 128, 256])
     """
 
     def __init__(
-        self, demonstrations: Demonstrations, transform: Callable[[Demonstration], Any] | None = None
+        self,
+        demonstrations: Demonstrations | str | Path,
+        transform: Callable[[Demonstration], Any] | None = None,
     ) -> None:
-        self.demonstrations = demonstrations
+        given = demonstrations
+        self.demonstrations = given if isinstance(given, Demonstrations) else Demonstrations(given)
         self.transform = transform or tensors_of
+        self._rows = range(len(self.demonstrations))
 
     def __len__(self) -> int:
-        return len(self.demonstrations)
+        return len(self._rows)
 
-    def __getitem__(self, index: int) -> Any:  # Any: what `transform` returns
-        return self.transform(self.demonstrations[index])
+    def __getitem__(self, index: int | slice) -> Any:  # Any: what `transform` returns, or a part of these
+        if isinstance(index, slice):
+            part = copy(self)
+            part._rows = self._rows[index]
+            return part
+        try:
+            row = self._rows[index]
+        except IndexError:
+            last = len(self) - 1
+            raise IndexError(f"episode {index} of {len(self)}; count from 0 to {last}.") from None
+        return self.transform(self.demonstrations[row])
 
 
-def tensors_of(demo: Demonstration) -> dict[str, Any]:  # Any: tensors, texts and numbers
+class DemonstrationTensors(dict[str, Any]):  # Any: tensors, texts and numbers
+    """A demonstration as `tensors_of` returns it, of a type that `DataLoader` collates by `collate`."""
+
+
+def tensors_of(demo: Demonstration) -> DemonstrationTensors:
     """Return a demonstration of T steps as a dictionary of tensors.
 
     Returns:
@@ -53,20 +85,72 @@ def tensors_of(demo: Demonstration) -> dict[str, Any]:  # Any: tensors, texts an
         `pick_ids`, `place_ids` (T,) int64; `prompt`, the text; `prompt_images`, for each placeholder the
         same four images without the time axis; `task`, `seed` and `end_effector`.
     """
-    item: dict[str, Any] = {
-        "task": demo.task,
-        "seed": demo.seed,
-        "end_effector": demo.end_effector,
-        "prompt": demo.prompt.text,
-        "prompt_images": {name: _images(image.rgb, image.segm) for name, image in demo.prompt.images.items()},
+    item = DemonstrationTensors(
+        task=demo.task,
+        seed=demo.seed,
+        end_effector=demo.end_effector,
+        prompt=demo.prompt.text,
+        prompt_images={name: _images(image.rgb, image.segm) for name, image in demo.prompt.images.items()},
         **_images(demo.rgb, demo.segm),
-        "pick_ids": torch.tensor(demo.pick_ids, dtype=torch.int64),
-        "place_ids": torch.tensor(demo.place_ids, dtype=torch.int64),
-    }
+        pick_ids=torch.tensor(demo.pick_ids, dtype=torch.int64),
+        place_ids=torch.tensor(demo.place_ids, dtype=torch.int64),
+    )
     for key, width in ACTION_SHAPES.items():
         rows = np.array([getattr(action, key) for action in demo.actions], np.float32)
         item[key] = torch.from_numpy(rows.reshape(-1, width))
     return item
+
+
+def collate(items: Sequence[DemonstrationTensors]) -> dict[str, Any]:  # Any: tensors, texts and numbers
+    """Join B demonstrations to a batch; a plain `DataLoader` does so by itself.
+
+    Args:
+        items: As `tensors_of` returns them; the longest has T steps, the longest prompt P images.
+
+    Returns:
+        `rgb_front`, `rgb_top` (B, T + 1, 3, 128, 256) and `segm_front`, `segm_top` (B, T + 1, 128, 256)
+        uint8; `pose0_position`, `pose1_position` (B, T, 2) and `pose0_rotation`, `pose1_rotation` (B, T, 4)
+        float32; `pick_ids`, `place_ids` (B, T) int64; `mask` (B, T) bool, which steps exist;
+        `prompt_rgb_front`, `prompt_rgb_top` (B, P, 3, 128, 256) and `prompt_segm_front`, `prompt_segm_top`
+        (B, P, 128, 256) uint8; `prompt_mask` (B, P) bool, which prompt images exist. Lists of B entries:
+        `prompt`, `prompt_names` (names of the prompt images), `task`, `seed` and `end_effector`.
+        Padding is 0, in segmentations 255 (nothing), in ids −1.
+
+    Raises:
+        ShapeError: There are no items.
+    """
+    if not items:
+        raise ShapeError("collate got no demonstrations; give at least one.")
+    images = [list(item["prompt_images"].values()) for item in items]
+    batch: dict[str, Any] = {
+        **{name: [item[name] for item in items] for name in ("prompt", "task", "seed", "end_effector")},
+        "prompt_names": [list(item["prompt_images"]) for item in items],
+        "mask": _padded([torch.ones(len(item["pick_ids"]), dtype=torch.bool) for item in items], 0),
+        "prompt_mask": _padded([torch.ones(len(shown), dtype=torch.bool) for shown in images], 0),
+    }
+    for name in (name for name, value in items[0].items() if isinstance(value, torch.Tensor)):
+        batch[name] = _padded([item[name] for item in items], _padding(name))
+        if name.startswith(("rgb", "segm")):
+            blank = items[0][name][:0]
+            shown = [torch.stack([image[name] for image in found]) if found else blank for found in images]
+            batch[f"prompt_{name}"] = _padded(shown, _padding(name))
+    return batch
+
+
+def _padding(name: str) -> int:
+    return BACKGROUND_ID if name.startswith("segm") else -1 if name.endswith("_ids") else 0
+
+
+def _padded(tensors: list[torch.Tensor], value: int) -> torch.Tensor:
+    return pad_sequence(tensors, batch_first=True, padding_value=value)
+
+
+def _collate_items(batch: Sequence[DemonstrationTensors], *, collate_fn_map: Any = None) -> dict[str, Any]:
+    """The form in which `DataLoader` looks up how to collate a type; Any: see `collate`."""
+    return collate(batch)
+
+
+default_collate_fn_map[DemonstrationTensors] = _collate_items
 
 
 def _images(rgb: dict[str, np.ndarray], segm: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
