@@ -16,7 +16,7 @@ register_texture("zebra", np.tile(np.repeat(np.uint8([[[0]], [[255]]]), 8, axis=
 POOL = Pool(dragged_objects=("pyramid",), dragged_textures=("zebra",), base_objects=(), base_textures=())
 
 
-class OnTheLeft(NamedTuple):  # a goal is anything with `is_met`
+class OnTheRight(NamedTuple):  # a goal is anything with `is_met`
     object_id: int
 
     def is_met(self, scene: Scene) -> bool:
@@ -26,15 +26,17 @@ class OnTheLeft(NamedTuple):  # a goal is anything with `is_met`
         return AtPose(self.object_id, Pose.planar(0.5, 0.35), Tolerance(0.05))
 
 
-@register_task("put_left", family="own", template="Put {it} left.", oracle_max_steps=1, pools={"train": POOL})
+@register_task(
+    "to_right", family="own", template="Put {it} right.", oracle_max_steps=1, pools={"train": POOL}
+)
 def sample(table: TableSampler) -> Problem:
     """Sample a pyramid elsewhere."""
     it = table.place_one("pyramid", lambda: ("pyramid", "zebra"), reject=lambda p: p.pose.y > 0.1)
-    return Problem(table.scene(), Prompt.parse("Put {it} left.", it=ObjectImage(it)), (OnTheLeft(it.id),))
+    return Problem(table.scene(), Prompt.parse("Put {it} right.", it=ObjectImage(it)), (OnTheRight(it.id),))
 
 
 if __name__ == "__main__":
-    env = openvima.make("put_left")
+    env = openvima.make("to_right")
     env.reset(seed=0)
     *_, info = env.step(env.oracle_decision().action)
     print("solved" if info["success"] else info["reason"])

@@ -109,6 +109,7 @@ def test_registering_an_equal_object_again_changes_nothing_and_another_one_is_re
     ("name", "message"),
     [
         ("bowl", "object 'bowl' already"),
+        ("l shaped Block", "object 'L-shaped block' already"),
         ("BOWL", "object 'bowl' already"),
         ("", "1 … 40 characters"),
         ("a" * 41, "1 … 40 characters"),

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = {"observations": "joints_and_depth"}
+PAGES = {"observations": "joints_and_depth", "your_own_objects": "custom_object"}
 
 
 @pytest.mark.parametrize(("page", "example"), PAGES.items())

@@ -24,7 +24,9 @@ def gallery(*, out: Path, assets: str = "procedural") -> int:
     """
     from openvima.catalog import load_assets
     from openvima.render.gallery import write_gallery
+    from openvima.tasks import list_tasks
 
+    list_tasks()  # files of tasks may register objects and textures
     with progress_bar("pictures") as report:
         page, problems = write_gallery(out, load_assets(assets), report=report)
     for problem in problems:
@@ -74,9 +76,16 @@ def info() -> int:
     from openvima.catalog import OBJECTS, TEXTURES
     from openvima.catalog.cache import cache_dir
     from openvima.catalog.importing import imported_pack
+    from openvima.catalog.objects import REGISTERED_OBJECTS
+    from openvima.catalog.textures import REGISTERED_TEXTURES
+    from openvima.tasks import list_tasks
 
     pack = imported_pack()
     print(f"procedural  made by code: {len(OBJECTS)} objects, {len(TEXTURES)} textures")
+    list_tasks()  # files of tasks may register objects and textures
+    if own := [*REGISTERED_OBJECTS, *REGISTERED_TEXTURES]:
+        num_objects = len(REGISTERED_OBJECTS)
+        print(f"registered  {num_objects} objects, {len(own) - num_objects} textures: {', '.join(own)}")
     if pack is None:
         print("original    not imported; `openvima assets import CHECKOUT` reads it from a checkout")
     else:

@@ -22,6 +22,8 @@ from openvima.catalog import (
     tasks_at,
     texture_spec,
 )
+from openvima.catalog.objects import REGISTERED_OBJECTS
+from openvima.catalog.textures import REGISTERED_TEXTURES
 from openvima.errors import AssetError
 from openvima.html import render_page, require_extra
 from openvima.render.camera import VIEWS, View
@@ -47,6 +49,7 @@ _KINDS = {
     "box": "box of the sampled size",
     "compound": "put together from boxes",
     "mesh": "modelled shape of one size",
+    "registered": "registered mesh",
 }
 _CATEGORIES = {
     "plain": "Plain colours",
@@ -56,6 +59,7 @@ _CATEGORIES = {
     "swirl": "Swirls",
     "paisley": "Paisleys",
     "neutral": "Neutral",
+    "registered": "Registered",
 }
 _ROLES_OUTSIDE_POOLS = {"line": "the line that sweeps must not touch or cross"}
 
@@ -73,10 +77,11 @@ def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) ->
     """
     require_extra()
     artist = _Artist(out, Rasteriser(assets))
-    specs = [*TEXTURES.values(), texture_spec(NEUTRAL_TEXTURE)]
-    total = len(OBJECTS) + len(specs)
+    specs = [*TEXTURES.values(), texture_spec(NEUTRAL_TEXTURE), *REGISTERED_TEXTURES.values()]
+    object_specs = [*OBJECTS.values(), *REGISTERED_OBJECTS.values()]
+    total = len(object_specs) + len(specs)
     objects = []
-    for index, spec in enumerate(OBJECTS.values()):
+    for index, spec in enumerate(object_specs):
         objects.append(_object_card(artist, spec, index))
         if report:
             report(len(objects), total, spec.name)
@@ -90,8 +95,8 @@ def write_gallery(out: Path, assets: Assets, *, report: Report | None = None) ->
         pack=assets.name,
         levels=LEVELS,
         objects=objects,
-        textures=textures,
-        num_textures=len(TEXTURES),
+        textures={title: cards for title, cards in textures.items() if cards},
+        num_textures=len(specs) - 1,  # without the neutral one
     )
     return atomic_write_file(out / "index.html", page), tuple(dict.fromkeys(artist.problems))
 
@@ -146,7 +151,8 @@ def _object_card(artist: _Artist, spec: ObjectSpec, index: int) -> Card:
         "moved": _levels_where(lambda pool: spec.name in pool.dragged_objects),
         "base": _levels_where(lambda pool: spec.name in pool.base_objects),
     }
-    note = _ROLES_OUTSIDE_POOLS.get(spec.name, "") or ("" if any(rows.values()) else "used by no task")
+    unused = "" if any(rows.values()) or spec.kind == "registered" else "used by no task"
+    note = _ROLES_OUTSIDE_POOLS.get(spec.name, unused)
     return {
         "id": _slug(spec.name),
         "name": spec.name,
@@ -179,7 +185,7 @@ def _texture_card(artist: _Artist, spec: TextureSpec) -> Card:
     if spec.name == NEUTRAL_TEXTURE:
         note = "prompt images that show a shape only"
     else:
-        note = "" if any(rows.values()) else "used by no task"
+        note = "" if any(rows.values()) or spec.category == "registered" else "used by no task"
     return {
         "id": _slug(f"texture {spec.name}"),
         "name": spec.name,
@@ -200,7 +206,7 @@ def _extent(artist: _Artist, spec: ObjectSpec) -> str:
         return "unknown"
     lengths = np.ptp(vertices.reshape(-1, 3), axis=0)
     text = " × ".join(f"{100 * length:.1f}" for length in lengths) + " cm"
-    if spec.kind in ("box", "compound") and spec.size_min != spec.size_max:
+    if spec.kind in ("box", "compound", "registered") and spec.size_min != spec.size_max:
         text += f", sides from {100 * spec.size_min[0]:.0f} to {100 * spec.size_max[0]:.0f}"
     return text
 
