@@ -26,9 +26,7 @@ class OnTheRight(NamedTuple):  # a goal is anything with `is_met`
         return AtPose(self.object_id, Pose.planar(0.5, 0.35), Tolerance(0.05))
 
 
-@register_task(
-    "to_right", family="own", template="Put {it} right.", oracle_max_steps=1, pools={"train": POOL}
-)
+@register_task("right", family="own", template="Put {it} right.", oracle_max_steps=1, pools={"train": POOL})
 def sample(table: TableSampler) -> Problem:
     """Sample a pyramid elsewhere."""
     it = table.place_one("pyramid", lambda: ("pyramid", "zebra"), reject=lambda p: p.pose.y > 0.1)
@@ -36,7 +34,7 @@ def sample(table: TableSampler) -> Problem:
 
 
 if __name__ == "__main__":
-    env = openvima.make("to_right")
+    env = openvima.make("right")
     env.reset(seed=0)
     *_, info = env.step(env.oracle_decision().action)
     print("solved" if info["success"] else info["reason"])
