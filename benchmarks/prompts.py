@@ -1,9 +1,11 @@
 """How often text prompts are ambiguous, and whether a reader of the others finds the goal objects.
 
     python benchmarks/prompts.py [--tasks a,b] [--prompts text|text,paraphrased] [--episodes N] [--json FILE]
+    python benchmarks/prompts.py --results FILE [--multimodal FILE] [--json FILE]
 
 The reader gets the text and the records of the scene: of each object name, texture and pose. It knows the
-catalogue and the sentences of the 17 tasks, no image, no role and no goal.
+catalogue and the sentences of the 17 tasks, no image, no role and no goal. `--results` counts the episodes of
+an evaluation with text prompts by whether they are ambiguous, beside the same ones with published prompts.
 """
 
 import argparse
@@ -14,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openvima.catalog import OBJECTS, TEXTURES
+from openvima.evaluation import Results
 from openvima.scene import Episode, Placement, Scene
 from openvima.tasks import list_tasks, sample_episode, task_spec
 from openvima.tasks.sampling import takes_prompts
@@ -137,6 +140,48 @@ def measure(task: str, level: str, *, prompts: str, episodes: int) -> dict[str, 
     return {"episodes": episodes, "clear": len(clear), "understood": sum(map(is_understood, clear))}
 
 
+def score_by_ambiguity(results: Results, published: Results | None) -> list[dict[str, object]]:
+    """Count, for each row of an evaluation, ambiguous episodes and solved ones."""
+    prompts = str(results.config["prompts"])
+    rows: list[dict[str, object]] = []
+    for row in results.rows:
+        ambiguous = {
+            outcome.seed
+            for outcome in row.outcomes
+            if sample_episode(
+                row.task, level=row.level, seed=outcome.seed, domain="eval", prompts=prompts
+            ).problem.prompt.is_ambiguous
+        }
+        solved = {outcome.seed for outcome in row.outcomes if outcome.success}
+        there = published and published.row(row.policy, row.task, row.level)
+        rows.append(
+            {
+                "policy": row.policy,
+                "task": row.task,
+                "level": row.level,
+                "episodes": row.episodes,
+                "solved": row.successes,
+                "interval": [round(end, 4) for end in row.interval],
+                "ambiguous": len(ambiguous),
+                "ambiguous_solved": len(ambiguous & solved),
+                **({"multimodal_solved": there.successes} if there else {}),
+            }
+        )
+    return rows
+
+
+def _print_scores(rows: list[dict[str, object]]) -> None:
+    print("| task | level | multimodal | text | ambiguous | solved of these | of the others |")
+    print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
+    for row in rows:
+        episodes, solved, ambiguous, guessed = (
+            int(str(row[name])) for name in ("episodes", "solved", "ambiguous", "ambiguous_solved")
+        )
+        of_these = f"{guessed} | {solved - guessed}/{episodes - ambiguous}" if ambiguous else "– | –"
+        published = row.get("multimodal_solved", "–")
+        print(f"| {row['task']} | {row['level']} | {published} | {solved} | {ambiguous} | {of_these} |")
+
+
 def main() -> None:
     """Measure, print a table, and write it as JSON if asked."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -145,7 +190,16 @@ def main() -> None:
     parser.add_argument("--prompts", default="text", help="text, or text,paraphrased")
     parser.add_argument("--episodes", type=int, default=1000, help="of each task and level")
     parser.add_argument("--json", type=Path, help="file to write")
+    parser.add_argument("--results", type=Path, help="results.json of an evaluation with text prompts")
+    parser.add_argument("--multimodal", type=Path, help="results.json of the same episodes as published")
     options = parser.parse_args()
+    if options.results is not None:
+        published = Results.load(options.multimodal) if options.multimodal else None
+        rows = score_by_ambiguity(Results.load(options.results), published)
+        _print_scores(rows)
+        if options.json:
+            options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        return
     tasks = list_tasks() if options.tasks == "all" else options.tasks.split(",")
     counts = {
         task: {

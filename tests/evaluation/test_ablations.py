@@ -44,6 +44,19 @@ def same(a: RenderedPrompt, b: RenderedPrompt) -> bool:
     )
 
 
+@pytest.mark.parametrize("prompts", ["text", "mixed"])
+def test_descriptions_are_of_another_episode_where_images_would_be(prompts):
+    env = TabletopEnv("visual_manipulation", level="L2", domain="eval", prompts=prompts)
+    num_other = 0
+    for seed in range(5):
+        env.reset(seed=seed)
+        borrowed = ablate(env, OTHER_PROMPT_IMAGES).prompt
+        assert list(borrowed.images) == list(env.prompt.images)
+        assert borrowed.text.startswith("Put the ") and borrowed.text.count("{") == len(borrowed.images)
+        num_other += not same(borrowed, env.prompt)
+    assert num_other == 5
+
+
 @pytest.mark.parametrize("task", list_tasks())
 def test_ablations_of_one_episode_are_equal_whenever_they_are_drawn(task):
     env, _ = begun(task)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from openvima.env import EnvConfig
 from openvima.errors import (
     CheckpointError,
     ConfigError,
@@ -43,6 +44,16 @@ def test_all_takes_from_each_level_the_tasks_that_it_holds():
     assert ("sweep_without_exceeding", "L1") in pairs
     assert ("sweep_without_exceeding", "L3") not in pairs
     assert ("rotate", "L3") in pairs
+
+
+def test_all_leaves_out_tasks_without_a_text_form_where_prompts_are_text():
+    text = EnvConfig(prompts="text")
+    tasks = {task for task, _ in cells(EvaluationConfig(("oracle",), env_config=text))}
+    assert "rotate" in tasks and "rearrange" not in tasks
+    assert EvaluationConfig(("oracle",), env_config=text).record()["prompts"] == "text"
+    assert "prompts" not in EvaluationConfig(("oracle",)).record()
+    with pytest.raises(ConfigError, match="'rearrange' has no text form"):
+        cells(EvaluationConfig(("oracle",), ("rotate", "rearrange"), env_config=text))
 
 
 def test_a_named_task_is_left_out_only_at_levels_without_it():

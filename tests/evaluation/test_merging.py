@@ -64,6 +64,13 @@ def test_other_settings_stand_for_other_episodes_and_are_refused(results):
         merge({"a": results, "b": replace(results, config=config)})
 
 
+def test_other_prompts_are_refused_and_published_ones_need_no_name(results):
+    text = replace(results, config={**results.config, "prompts": "text"})
+    with pytest.raises(ConfigError, match=r"prompts is multimodal in a, text in b"):
+        merge({"a": results, "b": text})
+    assert merge({"a": text, "b": text}).results.config["prompts"] == "text"
+
+
 def test_other_versions_are_noted(results):
     newer = replace(results, versions={**results.versions, "mujoco": "2.0"})
     merged = merge({"a": results, "b": newer})

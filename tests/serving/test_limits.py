@@ -36,6 +36,21 @@ def prompt_with(text: str = "Look at {thing}.", **fields: Any) -> dict[str, Any]
     return {"text": text, "images": [{**sent["images"][0], **fields}]}
 
 
+def test_a_policy_that_reads_language_is_served_descriptions() -> None:
+    class Listener(Telltale):
+        def reset(self, prompts) -> None:
+            self.prompts = prompts
+
+    policy = Listener()
+    session = Session(policy, 64, "text")
+    request = session.read(pack({"type": "reset", "prompts": [encode_prompt(made_up_prompt(3))]}))
+    assert unpack(session.answer(request)) == {"type": "reset", "episodes": 1}
+    (prompt,) = policy.prompts
+    assert (prompt.text, prompt.images) == ("Look at the red swirl bowl, number 3.", {})
+    long = prompt_with(objects=[{"object_id": 2, "object": "x" * 201, "texture": "red"}])
+    assert "names of over 200 characters" in str(session.read(pack({"type": "reset", "prompts": [long]})))
+
+
 def records(*ids: int) -> list[dict[str, Any]]:  # Any: of a message
     return [{"object_id": number, "object": "bowl", "texture": "red"} for number in ids]
 
