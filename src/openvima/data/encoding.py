@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_origin
 
 import numpy as np
@@ -22,8 +23,10 @@ _MAX_FUNCTION = 200  # characters
 _WORD = re.compile(r"\w[\w .+-]{0,100}")
 _NAMES = COLUMNS.names
 _TYPES: dict[str, pa.ListType] = {name: COLUMNS.field(name).type for name in _NAMES}
-# Texts, records and single numbers are made at once: each call into Arrow costs some microseconds.
-_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS)]
+# Columns with few values, then other texts, records and numbers, which are made at once.
+_REPEATED = ("task", "level", "domain", "steps", "max_steps", "redraws", "success", "failure", "reason")
+_REPEATED = (*_REPEATED, "end_effector")
+_OTHER_NAMES = [name for name in _NAMES if name not in (*IMAGES, *NUMBERS, *_REPEATED)]
 _OTHERS = pa.struct([COLUMNS.field(name) for name in _OTHER_NAMES])
 
 SkipKind = Literal["failed", "unsolved", "no_action", "not_sampled"]
@@ -131,40 +134,74 @@ def _is_function(assets: str) -> bool:
     return len(assets) <= _MAX_FUNCTION and is_code(assets) and "/" not in assets and assets.isprintable()
 
 
-def encode(
-    demo: Demonstration,
-    skipped: Sequence[Skipped] = (),
-    *,
-    with_images: bool = True,
-    buffers: ImageBuffers | None = None,
-) -> pa.RecordBatch:
-    """Make one row of a demonstration.
+class Encoder:
+    """Makes rows of demonstrations, one at a time, in memory that it uses again.
+
+    Each call into Arrow costs some microseconds, so that arrays are kept together with the memory that they
+    show, which is filled anew for each row.
 
     Args:
-        demo: The demonstration.
-        skipped: Seeds tried just before it in vain.
+        schema: `COLUMNS`, perhaps with metadata.
         with_images: Store what the cameras saw and the prompt shows; the content hash counts them either way.
-        buffers: Memory for the images, good until it is used again; None gives them their own.
-
-    Returns:
-        A record batch of one row with the columns of `schema.COLUMNS`.
     """
-    columns = columns_of(demo, buffers)
-    others = {
-        **columns.records,
-        "content_hash": columns.content_hash,
-        "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
-    }
-    cells = dict(zip(_OTHER_NAMES, pa.array([others], type=_OTHERS).flatten(), strict=True))
-    for name, rows in columns.numbers.items():
-        if name == "joint_paths":
-            cells[name] = _paths_cell(rows, columns.path_lengths)
-        else:
-            cells[name] = _cell(_rows(rows, _TYPES[name].value_type), _TYPES[name])
-    for name, images in columns.images.items():
-        seen = images if with_images else images[:0]
-        cells[name] = _cell(_rows(seen, _TYPES[name].value_type), _TYPES[name])
-    return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=COLUMNS)
+
+    def __init__(self, schema: pa.Schema = COLUMNS, *, with_images: bool = True) -> None:
+        self._schema, self._with_images = schema, with_images
+        self._images = ImageBuffers()
+        self._kept: dict[tuple[str, int], tuple[np.ndarray, pa.ListArray]] = {}
+
+    def encode(self, demo: Demonstration, skipped: Sequence[Skipped] = ()) -> pa.RecordBatch:
+        """Make one row of a demonstration.
+
+        Args:
+            demo: The demonstration.
+            skipped: Seeds tried just before it in vain.
+
+        Returns:
+            A record batch of one row with the columns of `schema.COLUMNS`, good until the next call.
+        """
+        columns = columns_of(demo, self._images)
+        others = {
+            **columns.records,
+            "content_hash": columns.content_hash,
+            "skipped": [{"seed": s.seed, "kind": s.kind, "reason": s.reason} for s in skipped],
+        }
+        cells: dict[str, pa.Array] = {name: _value_cell(name, others[name]) for name in _REPEATED}
+        made = pa.array([others], type=_OTHERS)
+        cells |= {name: made.field(number) for number, name in enumerate(_OTHER_NAMES)}
+        for name, rows in columns.numbers.items():
+            if name == "joint_paths":
+                cells[name] = _paths_cell(rows, columns.path_lengths)
+            else:
+                cells[name] = self._number_cell(name, rows)
+        for name, images in columns.images.items():
+            cells[name] = self._image_cell(name, images if self._with_images else images[:0])
+        return pa.RecordBatch.from_arrays([cells[name] for name in _NAMES], schema=self._schema)
+
+    def _number_cell(self, name: str, rows: np.ndarray) -> pa.ListArray:
+        """A column of one row that lists numbers, which are copied."""
+        key = name, len(rows)
+        if key not in self._kept:
+            memory = np.empty_like(rows)
+            self._kept[key] = memory, _cell(_rows(memory, _TYPES[name].value_type), _TYPES[name])
+        memory, cell = self._kept[key]
+        np.copyto(memory, rows)
+        return cell
+
+    def _image_cell(self, name: str, images: np.ndarray) -> pa.ListArray:
+        """A column of one row that lists images; those of `ImageBuffers` lie where others lay before."""
+        key, memory = (name, len(images)), images.base
+        if memory is None or not self._images.owns(name, memory):
+            return _cell(_rows(images, _TYPES[name].value_type), _TYPES[name])
+        if key not in self._kept or self._kept[key][0] is not memory:
+            self._kept[key] = memory, _cell(_rows(images, _TYPES[name].value_type), _TYPES[name])
+        return self._kept[key][1]
+
+
+@lru_cache(maxsize=4096)
+def _value_cell(name: str, value: str | int | bool) -> pa.Array:
+    """A column of one row that holds a value which many rows share."""
+    return pa.array([value], type=COLUMNS.field(name).type)
 
 
 def _rows(rows: np.ndarray, dtype: pa.FixedSizeListType) -> pa.Array:

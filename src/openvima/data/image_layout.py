@@ -6,6 +6,8 @@ import numpy as np
 
 from openvima.data.schema import ARRAYS, IMAGE_SHAPE
 
+_NUM_PIXELS = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
+
 
 class ImageBuffers:
     """Reusable memory for the images of an episode: allocating costs more than filling."""
@@ -28,6 +30,10 @@ class ImageBuffers:
             self._arrays[name] = np.empty((count, *shape), np.uint8)
         return self._arrays[name][:count]
 
+    def owns(self, name: str, memory: np.ndarray) -> bool:
+        """Tell whether an array is the present memory of a column."""
+        return self._arrays.get(name) is memory
+
 
 def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.ndarray:
     """Copy images so that their colours come last.
@@ -38,8 +44,11 @@ def pixels(planes: np.ndarray | Sequence[np.ndarray], out: np.ndarray) -> np.nda
     """
     from openvima.data.kernels import join_colours  # Numba takes a moment to be imported
 
-    for image, joined in zip(planes, out, strict=True):
-        join_colours(np.ascontiguousarray(image).reshape(3, -1), joined.reshape(-1))
+    parts = [planes] if isinstance(planes, np.ndarray) else [image[np.newaxis] for image in planes]
+    joined, end = out.reshape(len(out), 3 * _NUM_PIXELS), 0
+    for part in parts:
+        start, end = end, end + len(part)
+        join_colours(np.ascontiguousarray(part).reshape(-1, 3, _NUM_PIXELS), joined[start:end])
     return out
 
 
@@ -55,6 +64,5 @@ def planes(pixels: np.ndarray) -> np.ndarray:
     from openvima.data.kernels import part_colours
 
     parted = np.empty((len(pixels), 3, *IMAGE_SHAPE), np.uint8)
-    num_pixels = IMAGE_SHAPE[0] * IMAGE_SHAPE[1]
-    part_colours(pixels.reshape(-1, 3 * num_pixels), parted.reshape(-1, 3, num_pixels))
+    part_colours(pixels.reshape(-1, 3 * _NUM_PIXELS), parted.reshape(-1, 3, _NUM_PIXELS))
     return parted

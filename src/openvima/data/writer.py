@@ -9,8 +9,7 @@ from typing import BinaryIO
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
-from openvima.data.encoding import ShardInfo, Skipped, encode
-from openvima.data.image_layout import ImageBuffers
+from openvima.data.encoding import Encoder, ShardInfo, Skipped
 from openvima.data.records import Demonstration
 from openvima.data.schema import COLUMNS
 
@@ -31,9 +30,8 @@ class ShardWriter:
 
     def __init__(self, path: Path, info: ShardInfo) -> None:
         self.path = path
-        self._info = info
-        self._buffers = ImageBuffers()
         self._schema = COLUMNS.with_metadata(info.to_metadata())
+        self._encoder = Encoder(self._schema, with_images=info.images)
         codec = pa.Codec(info.compression, compression_level=COMPRESSION_LEVELS.get(info.compression))
         options = pa.ipc.IpcWriteOptions(compression=codec, use_threads=False)
         self._closing = contextlib.ExitStack()
@@ -49,7 +47,7 @@ class ShardWriter:
             demo: The demonstration.
             skipped: Seeds tried just before it in vain.
         """
-        self.copy(encode(demo, skipped, with_images=self._info.images, buffers=self._buffers))
+        self._writer.write_batch(self._encoder.encode(demo, skipped))
 
     def copy(self, batch: pa.RecordBatch) -> None:
         """Append one episode as another shard holds it.

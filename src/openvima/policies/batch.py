@@ -25,6 +25,7 @@ class StoredImages(Protocol):
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of an image."""
+        ...
 
     def read_first(self, counts: Sequence[int], stack: np.ndarray) -> None:
         """Copy images, one demonstration after the other.

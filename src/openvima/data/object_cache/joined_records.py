@@ -76,7 +76,7 @@ class _Images(Iterable[np.ndarray]):
 
     def read_first(self, counts: Sequence[int], stack: np.ndarray) -> None:
         """Copy the first images of each episode, one episode after the other; see `StoredImages`."""
-        target, end = memoryview(stack.reshape(-1)), 0
+        target, end = stack.reshape(-1).data, 0
         columns = (self.entries[name].tolist() for name in ("images_start", "num_inputs", "inputs_checksum"))
         for (file, row), count, source, num_inputs, checksum in zip(
             self.places, counts, *columns, strict=True
@@ -88,7 +88,7 @@ class _Images(Iterable[np.ndarray]):
                 target[start:end] = file.content[source : source + num_bytes]
                 file.check(row, target[start:end], checksum)
             else:
-                target[start:end] = memoryview(file.images(row)[:count].reshape(-1))
+                target[start:end] = file.images(row)[:count].reshape(-1).data
 
 
 def _read_tables(places: Sequence[tuple[CacheFile, int]], entries: np.ndarray) -> list[np.ndarray]:
