@@ -5,7 +5,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGES = {"observations": "joints_and_depth", "your_own_objects": "custom_object"}
+PAGES = {
+    "observations": "joints_and_depth",
+    "your_own_objects": "custom_object",
+    "your_own_task": "custom_task",
+}
 
 
 @pytest.mark.parametrize(("page", "example"), PAGES.items())
