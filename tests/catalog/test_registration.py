@@ -23,14 +23,8 @@ from openvima.catalog import (
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
 from openvima.errors import AssetError, ConfigError, LevelError, ShapeError, UnknownObjectError
+from user_shapes import CORNERS, TRIANGLES
 
-CORNERS = np.array([(x, y, z) for x in (0, 3) for y in (0, 2) for z in (0, 1)])
-TRIANGLES = np.array(
-    [
-        *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
-        *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
-    ]
-)
 SIZE = (0.06, 0.04, 0.02)
 
 
@@ -270,6 +264,7 @@ def test_a_texture_is_read_from_a_png_file(tmp_path: Path) -> None:
         (png("RGBA", (8, 8)), "partly transparent"),
         (png("RGB", (2000, 1)), "2000 × 1 pixels"),
     ],
+    ids=("empty", "truncated", "transparent", "too large"),
 )
 def test_an_unfit_png_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     file = tmp_path / "news.png"

@@ -3,6 +3,8 @@
 Records name the function without its folder. They never run it: whoever reads one loads the assets first.
 """
 
+import os
+
 import numpy as np
 
 from openvima.catalog.geometry import Assets, Geometry, Vector3
@@ -10,7 +12,8 @@ from openvima.catalog.procedural import procedural_assets
 from openvima.errors import AssetError, echo
 from openvima.user_code import call_function, is_code, with_absolute_path, without_folder
 
-_LOADED: dict[str, "UserAssets"] = {}  # by the name in records
+_LOADED_VARIABLE = "OPENVIMA_LOADED_ASSETS"  # sources, one a line; worker processes inherit it
+_packs: dict[str, "UserAssets"] = {}  # by source
 
 
 class UserAssets:
@@ -53,17 +56,17 @@ def load_user_assets(source: str) -> UserAssets:
         AssetError: It returned something else, or registered something unfit.
     """
     whole = with_absolute_path(source)
-    known = _LOADED.get(without_folder(source))
-    if known is not None and known.source == whole:
-        return known
+    if whole in _packs:
+        return _packs[whole]
     made = call_function(whole, what="assets")
     if made is not None and not all(callable(getattr(made, name, None)) for name in ("geometry", "texture")):
         raise AssetError(
             f"assets is {source!r}, whose function returned a {type(made).__name__}; return None, or an "
             "object with the methods geometry and texture."
         )
-    pack = _LOADED[without_folder(source)] = UserAssets(whole, made or procedural_assets())
-    return pack
+    _packs[whole] = UserAssets(whole, made or procedural_assets())
+    os.environ[_LOADED_VARIABLE] = "\n".join(dict.fromkeys([*_loaded_sources(), whole]))
+    return _packs[whole]
 
 
 def recorded_assets(name: str) -> str:
@@ -73,15 +76,19 @@ def recorded_assets(name: str) -> str:
         name: As in the record.
 
     Raises:
-        AssetError: It names a function that has not been loaded in this process.
+        AssetError: It names a function that has not been loaded in this process or the one that started it.
     """
     if not is_code(name):
         return name
-    known = _LOADED.get(without_folder(name))
-    if known is None:
+    known = [source for source in _loaded_sources() if without_folder(source) == without_folder(name)]
+    if not known:
         shown = echo(name)
         raise AssetError(
             f"the record names assets {shown}, code that is not run without being asked for; pass --assets "
             f"with the path of {shown}, or call openvima.catalog.load_assets with it first."
         )
-    return known.source
+    return known[-1]
+
+
+def _loaded_sources() -> list[str]:
+    return os.environ.get(_LOADED_VARIABLE, "").splitlines()

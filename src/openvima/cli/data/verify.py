@@ -42,13 +42,10 @@ def verify(
     Returns:
         Exit status.
     """
-    from openvima.catalog.packs import load_assets
     from openvima.data.verification import VerifyConfig
     from openvima.data.verification import repair as repair_folder
     from openvima.data.verification import verify as verify_folder
 
-    if assets is not None:
-        load_assets(assets)
     config = VerifyConfig(_number(replay), seed=seed, assets=assets, workers=workers)
     with progress_bar("repairing" if repair else "verifying") as report:
         done = repair_folder(folder, config, report) if repair else None

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from openvima.catalog.packs import load_assets
 from openvima.data.manifest import (
     FAILED_FOLDER,
     INDEX_NAME,
@@ -18,6 +19,7 @@ from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.replay import replay
 from openvima.data.verification.shards import ShardFindings, ShardTask, check_shard
 from openvima.multiprocess import imap_unordered
+from openvima.user_code import is_code
 
 DEFAULT = VerifyConfig()
 
@@ -35,9 +37,12 @@ def verify(folder: str | Path, config: VerifyConfig = DEFAULT, report: Report | 
 
     Raises:
         DatasetError: There is no data set.
+        ConfigError: The assets are a function that is missing or fails.
         WorkerError: A worker died.
     """
     folder = Path(folder)
+    if config.assets is not None and is_code(config.assets):
+        load_assets(config.assets)
     check_failed(folder)
     found = _verify(folder, folder, config, report)
     failed = folder / FAILED_FOLDER

@@ -1,0 +1,138 @@
+"""Assets by the function that makes them; records name it and never run it."""
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from openvima.catalog import Pool, load_assets, registration, user_assets
+from openvima.catalog.user_assets import recorded_assets
+from openvima.data import Dataset, GenerateConfig, generate, rerender
+from openvima.data.verification import VerifyConfig, replay, verify
+from openvima.env import EnvConfig, TabletopEnv
+from openvima.errors import AssetError, ConfigError, UnknownObjectError
+from openvima.scene import AtPose, ObjectImage, Pose, Problem, Prompt, Tolerance
+from openvima.tasks import TableSampler, register_task, registry
+
+FILE = Path(__file__).parents[1] / "user_shapes.py"
+BAR = f"{FILE}:bar"
+
+
+@pytest.fixture(autouse=True)
+def restored(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    registry.list_tasks()  # loads them
+    monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
+    forget()
+    yield
+    forget()
+
+
+def forget() -> None:
+    """Undo what the functions did, as another process would find it."""
+    user_assets._packs.clear()
+    os.environ.pop(user_assets._LOADED_VARIABLE, None)
+    for cached in (rerender._rasteriser, replay._env):
+        cached.cache_clear()
+    for table in (registration.REGISTERED_OBJECTS, registration.REGISTERED_TEXTURES):
+        for name in [name for name in table if name.startswith("test ")]:
+            del table[name]
+    for key in [key for key in registration._ENTRIES if key[1].startswith("test ")]:
+        del registration._ENTRIES[key]
+
+
+def register_bar_task() -> None:
+    pools = {"train": Pool(("test bar",), (), ("test gradient",), ())}
+
+    @register_task("move_bar", family="own", template="Move {it}.", oracle_max_steps=1, pools=pools)
+    def sample(table: TableSampler) -> Problem:
+        draw = lambda: ("test bar", "test gradient")  # noqa: E731
+        bar = table.place_one("bar", draw, reject=lambda p: p.pose.y > 0)
+        goal = AtPose(bar.id, Pose.planar(0.5, 0.3), Tolerance(0.05))
+        return Problem(table.scene(), Prompt.parse("Move {it}.", it=ObjectImage(bar)), (goal,))
+
+
+def test_a_function_registers_assets_once_and_names_the_pack_without_its_folder() -> None:
+    pack = load_assets(BAR)
+    assert pack.name == "user_shapes.py:bar" and load_assets(BAR) is pack
+    assert pack.texture("test gradient").shape == (8, 8, 3) and pack.texture("blue").shape == (1, 1, 3)
+    assert pickle.loads(pickle.dumps(pack)) is pack
+    assert EnvConfig(assets=BAR).record()["assets"] == "user_shapes.py:bar"
+
+
+def test_a_function_may_return_a_pack_and_nothing_else() -> None:
+    assert load_assets(f"{FILE}:pack").name == "user_shapes.py:pack"
+    with pytest.raises(AssetError, match="returned a int; return None, or an object with the methods"):
+        load_assets(f"{FILE}:number")
+    with pytest.raises(ConfigError, match="no function 'nothing'"):
+        load_assets(f"{FILE}:nothing")
+
+
+def test_a_record_never_runs_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(FILE.parent)
+    with pytest.raises(AssetError, match=r"user_shapes\.py:bar, code that is not run"):
+        recorded_assets("user_shapes.py:bar")
+    assert "test bar" not in registration.REGISTERED_OBJECTS
+    load_assets(BAR)
+    assert recorded_assets("/elsewhere/user_shapes.py:bar") == BAR
+    assert [recorded_assets(name) for name in ("procedural", "original")] == ["procedural", "original"]
+
+
+def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register_bar_task()
+    config = GenerateConfig(tmp_path, ("move_bar",), 2, images=False, env_config=EnvConfig(assets=BAR))
+    folder = generate(config)
+    demo = Dataset(folder)[0]
+    assert demo.objects[0].object == "test bar" and demo.assets == "user_shapes.py:bar"
+    assert verify(folder, VerifyConfig()).is_clean
+    forget()
+    monkeypatch.chdir(FILE.parent)  # where the name of the record is a file's
+    with pytest.raises(AssetError, match="code that is not run"):
+        Dataset(folder)[0].rgb["front"]
+    found = verify(folder, VerifyConfig())
+    assert any("code that is not run" in note for note in found.notes)
+    with pytest.raises(AssetError, match="code that is not run"):
+        GenerateConfig.from_record(tmp_path, {**config.record()})
+    assert "test bar" not in registration.REGISTERED_OBJECTS
+    assert verify(folder, VerifyConfig(assets=BAR)).is_clean
+
+
+def test_an_object_that_is_not_registered_is_named_with_the_remedy() -> None:
+    register_bar_task()
+    env = TabletopEnv("move_bar")
+    with pytest.raises(UnknownObjectError, match=r"no object 'test bar'.*`register_object` adds one"):
+        env.reset(seed=0)
+
+
+@pytest.mark.slow
+def test_workers_load_task_files_and_functions(tmp_path: Path) -> None:
+    example = Path(__file__).parents[2] / "examples" / "custom_object.py"
+    out = tmp_path / "out"
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"""
+if __name__ == "__main__":
+    import pathlib
+    from openvima.env import EnvConfig
+    from openvima.evaluation import EvaluationConfig, Results, evaluate
+    config = EvaluationConfig(
+        ("oracle",), ("right",), ("train",), 4, batch=2, workers=2, out=pathlib.Path({str(out)!r}),
+        env_config=EnvConfig({BAR!r}),
+    )
+    print(Results.read(evaluate(config)).rows[0].successes)
+""",
+        encoding="utf-8",
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, registry.TASK_FILES_VARIABLE: str(example)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.strip() == "4", done.stderr
