@@ -4,6 +4,7 @@ import errno
 import importlib
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pytest
 from openvima import __version__
 from openvima.cli.main import VERBS, main
 from openvima.errors import ConfigError, ShardError
+from openvima.policies.tokenizer import WordTokenizer
 
 
 def fail_with(error: Exception) -> Callable[[Sequence[str]], int]:
@@ -104,6 +106,21 @@ def test_wrong_input_is_refused_before_any_work(
     assert main(words) == 2
     assert "\n" not in capsys.readouterr().err.strip()
     assert not list(tmp_path.iterdir())
+
+
+def test_words_that_a_policy_never_saw_are_one_line_and_the_verb_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(words: Sequence[str]) -> int:
+        WordTokenizer().encode("put the \x1b[2J quokka")
+        return 0
+
+    monkeypatch.setattr(importlib, "import_module", lambda name: SimpleNamespace(run=run))
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["tasks"]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("openvima: UnknownWordWarning: ") and "'quokka'" in line and line.isprintable()
 
 
 @pytest.mark.parametrize(

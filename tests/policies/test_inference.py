@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.errors import PolicyError, PromptError, ShapeError  # noqa: E402
+from openvima.errors import PolicyError, PromptError, ShapeError, UnknownWordWarning  # noqa: E402
 from openvima.perception.objects import GroundTruth, observe  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
@@ -322,9 +322,12 @@ def test_a_reset_without_prompts_is_refused(policy) -> None:
         policy.reset([])
 
 
-def test_a_word_that_nobody_taught_is_refused(policy, prompts) -> None:
-    with pytest.raises(PromptError, match="'juggle'"):
-        policy.reset([replace(prompts[0], text="Juggle " + prompts[0].text)])
+def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
+    prompt = replace(prompts[0], text="Juggle " + prompts[0].text)
+    with pytest.warns(UnknownWordWarning, match="never saw 'juggle'"):
+        policy.reset([prompt])
+    for session in (policy, policy.new_session()):
+        session.reset([replace(prompt, text=prompt.text + " Juggle!")])  # a warning would be an error
 
 
 def test_a_placeholder_without_an_image_is_refused(policy, prompts) -> None:

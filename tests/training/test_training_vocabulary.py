@@ -1,0 +1,101 @@
+"""The vocabulary of a run: the words of its prompts, kept by its checkpoints, extended by fine-tuning."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data import Dataset  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.errors import CheckpointError, UnknownWordWarning  # noqa: E402
+from openvima.policies import load_policy, preset  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.presets import PUBLISHED  # noqa: E402
+from openvima.policies.sizes import VOCABULARY_SIZE  # noqa: E402
+from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer, benchmark_vocabulary  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.building import build_learner, resolved  # noqa: E402
+from openvima.training.vocabulary import training_texts  # noqa: E402
+
+WORDS = {
+    *("rotate", "the", "degrees", ".", "put", "into", "sweep", "without", "exceeding"),
+    *("any", "one", "two", "three", "all"),
+}
+
+
+@pytest.fixture(scope="session")
+def begun() -> tuple[TabletopEnv, dict]:
+    """An environment after reset, and its observation."""
+    env = TabletopEnv("visual_manipulation")
+    return env, env.reset(seed=0)[0]
+
+
+@pytest.mark.parametrize("name", ["nano", "nano-bins", "small", *(f"{kind}-nano" for kind in PUBLISHED)])
+def test_every_preset_with_a_vocabulary_takes_new_words(name: str, begun) -> None:
+    env, observation = begun
+    sizes = preset(name)
+    vocabulary = Vocabulary().extended([env.prompt.text, "between"])
+    size = vocabulary.size_for(sizes.prompt.vocabulary_size)
+    assert size == VOCABULARY_SIZE
+    policy = NetworkPolicy(build_network(sizes, seed=0), tokenizer=WordTokenizer(vocabulary))
+    between, quokka = (
+        replace(env.prompt, text=f"{env.prompt.text} {word}") for word in ("Between", "Quokka")
+    )
+    policy.reset([between])
+    with pytest.warns(UnknownWordWarning, match="'quokka'"):
+        policy.reset([between, quokka])
+    assert all(action is not None for action in policy.act([observation] * 2))
+
+
+def test_the_vocabulary_is_that_of_the_prompts_and_is_compared_when_a_run_resumes(settings) -> None:
+    config = TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2})
+    run = train(config)
+    stored = next((run / "checkpoints").glob("2-*")) / TOKENIZER_FOLDER
+    vocabulary = Vocabulary.read(stored)
+    assert (
+        UNKNOWN in vocabulary.words and {"rotate", "into", "."} <= set(vocabulary.words) - {UNKNOWN} <= WORDS
+    )
+    assert load_policy(str(run)).processor.tokenizer.vocabulary == vocabulary  # type: ignore[attr-defined]
+    assert vocabulary.digest() in (run / "config.yaml").read_text(encoding="utf-8")
+
+    vocabulary.extended(["quokka"]).write(stored)
+    with pytest.raises(CheckpointError, match="another vocabulary, with"):
+        train(config)
+
+
+def test_fine_tuning_adds_new_words_to_those_of_the_checkpoint(settings, tmp_path: Path) -> None:
+    config = resolved(TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2}))
+    first = build_learner(config, ["put the red bowl"])
+    (tmp_path / "first").mkdir()
+    first.write(tmp_path / "first", first.state_dict())
+    again = replace(config, init_from=str(tmp_path / "first"))
+    second = build_learner(again, ["put it between"])
+    before, after = (learner.processor.tokenizer.vocabulary for learner in (first, second))
+    assert after.words == (*before.words, "between", "it") and after.texture_words == ("red",)
+    weights = second.network.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in first.network.state_dict().items())
+
+    many = [
+        f"x-{'abcdefghij'[n % 10]}{'abcdefghij'[n // 10 % 10]}{'abcdefghij'[n // 100]}" for n in range(500)
+    ]
+    third = build_learner(again, many)  # more than the reserve
+    words = third.network.prompt.words.weight
+    assert len(words) > VOCABULARY_SIZE and third.network.config.prompt.vocabulary_size == len(words)
+    assert torch.equal(words[:VOCABULARY_SIZE], first.network.prompt.words.weight)
+    assert torch.equal(third.network.query, first.network.query)
+
+
+def test_words_of_the_augmentation_are_in_the_vocabulary(data: Path, settings) -> None:
+    config = TrainingConfig.of(settings)
+    dataset = Dataset(data)
+    plain = Vocabulary().extended(training_texts(dataset, config.augmentation))
+    augmentation = replace(config.augmentation, rename_objects_prob=0.5, inverse_dynamics_prob=0.5)
+    augmented = Vocabulary().extended(training_texts(dataset, augmentation))
+    assert set(plain.words) - {UNKNOWN} <= WORDS
+    added = {"this", "is", "a", "dax", "blicket", "wug", "zup", "follow", "motion", ":"}
+    assert set(augmented.words) - set(plain.words) == added - set(plain.words)
+    assert added <= set(benchmark_vocabulary().words)
