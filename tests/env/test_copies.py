@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import openvima
+from full_repr import full_repr
 from openvima.env import make_vec
 from openvima.tasks import list_tasks
 from soak import random_action
@@ -29,14 +30,18 @@ def images(observation: dict[str, Any]) -> list[np.ndarray]:
 
 def steps(env: gymnasium.Env, rng: np.random.Generator, is_over: bool) -> list[int]:
     """Checksums of all that is seen of further random steps until the end, and of the next episode."""
-    seen = [repr(env.unwrapped.scene).encode(), env.unwrapped.joint_path.tobytes(), env.render().tobytes()]
+    seen = [
+        full_repr(env.unwrapped.scene).encode(),
+        env.unwrapped.joint_path.tobytes(),
+        env.render().tobytes(),
+    ]
     while not is_over:
         observation, *rest = env.step(random_action(rng, env.unwrapped.scene))
         seen += [image.tobytes() for image in images(observation)]
-        seen += [repr(rest).encode(), repr(env.unwrapped.scene).encode()]
+        seen += [full_repr(rest).encode(), full_repr(env.unwrapped.scene).encode()]
         is_over = rest[1] or rest[2]
     observation, info = env.reset()
-    seen += [repr(info).encode(), *(image.tobytes() for image in images(observation))]
+    seen += [full_repr(info).encode(), *(image.tobytes() for image in images(observation))]
     return [zlib.crc32(entry) for entry in seen]
 
 
@@ -55,12 +60,12 @@ def test_a_copy_of_a_used_environment_goes_on_as_it_does(task: str, copied: Call
 def test_a_copy_and_its_original_do_not_touch_each_other(copied: Callable) -> None:
     env = openvima.make("rotate")
     env.reset(seed=3)
-    before = repr(env.unwrapped.scene)
+    before = full_repr(env.unwrapped.scene)
     other = copied(env)
     decision = other.unwrapped.oracle_decision()
-    assert repr(decision) == repr(env.unwrapped.oracle_decision())
+    assert full_repr(decision) == full_repr(env.unwrapped.oracle_decision())
     assert other.step(decision.action.to_arrays())[1] == 1.0
-    assert repr(env.unwrapped.scene) == before
+    assert full_repr(env.unwrapped.scene) == before
     assert env.step(decision.action.to_arrays())[1] == 1.0
 
 
@@ -71,7 +76,7 @@ def test_vector_environments_in_one_process_are_copied(copied: Callable) -> None
     for each in (envs, other):
         each.action_space.seed(0)
     results = [each.step(each.action_space.sample()) for each in (envs, other)]
-    assert repr(results[0][1:]) == repr(results[1][1:])
+    assert full_repr(results[0][1:]) == full_repr(results[1][1:])
     pairs = zip(images(results[0][0]), images(results[1][0]), strict=True)
     assert all(np.array_equal(one, two) for one, two in pairs)
     assert not any(

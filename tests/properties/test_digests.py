@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from full_repr import full_repr
 from openvima.tasks import list_tasks, sample_episode, task_spec
 
 RECORD = Path(__file__).parents[1] / "golden" / "episode_digests.json"
@@ -22,7 +23,7 @@ def digest(task: str, level: str) -> str:
     """Digest of the first problems, numbers rounded to a micrometre so that it holds on every machine."""
     total = hashlib.sha256()
     for seed in range(NUM_SEEDS):
-        text = repr(sample_episode(task, level=level, seed=seed, domain="eval").problem)
+        text = full_repr(sample_episode(task, level=level, seed=seed, domain="eval").problem)
         text = text.replace("prerequisites=", "oracle_first=")  # the field's name in the recorded digests
         total.update(_FLOAT.sub(lambda match: f"{float(match[0]) + 0.0:.6f}", text).encode())
     return total.hexdigest()[:16]

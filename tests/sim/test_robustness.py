@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from full_repr import full_repr
 from openvima.scene import Action
 from openvima.sim import World
 from sim_tables import ASSETS, random_action, random_table, table
@@ -54,7 +55,7 @@ def digest() -> str:
         world = World(random_table(rng, ("suction", "spatula")[seed % 2]), ASSETS)
         for _ in range(3):
             execution = world.execute(random_action(rng, world.scene))
-            content.update(repr((world.scene, execution.grasped, execution.num_ticks)).encode())
+            content.update(full_repr((world.scene, execution.grasped, execution.num_ticks)).encode())
             content.update(execution.joint_path.tobytes())
     return content.hexdigest()
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from openvima.brief import brief_repr
 from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import LEVELS
 from openvima.catalog.user_assets import recorded_assets
@@ -86,6 +87,8 @@ class GenerateConfig:
     address: str | None = None
     shard_range: tuple[int, int] | None = None
     force: bool = False
+
+    __repr__ = brief_repr
 
     def __post_init__(self) -> None:
         problems = [

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from openvima.brief import brief_repr
 from openvima.data.planning import Block
 from openvima.multiprocess import Counts
 
@@ -40,6 +41,8 @@ class GenerationProgress:
     """
 
     tasks: tuple[TaskProgress, ...]
+
+    __repr__ = brief_repr
 
     @property
     def done(self) -> int:

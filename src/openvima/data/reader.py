@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from openvima.brief import MAX_CHARACTERS, cut
 from openvima.data.checksums import Envelope, Span
 from openvima.data.manifest import (
     INDEX_NAME,
@@ -21,6 +22,7 @@ from openvima.data.records import Demonstration, Step
 from openvima.data.schema import VIEWS
 from openvima.data.shard import Shard, remedy
 from openvima.errors import DatasetError, unknown_name
+from openvima.html import notebook_html
 
 
 class Dataset:
@@ -56,6 +58,15 @@ class Dataset:
         self._spans = [self.index.column(name).to_numpy() for name in ("offset", "num_bytes", "crc32")]
         self._shards: dict[str, Shard] = {}
         _check_shards(self.path, sorted(self._names))
+
+    def __repr__(self) -> str:
+        tasks = ", ".join(self.tasks or self.manifest["tasks"])
+        return cut(f"Dataset({str(self.path)!r}, {len(self):,} demonstrations: {tasks})", MAX_CHARACTERS)
+
+    def _repr_html_(self) -> str | None:
+        found = self.index.group_by("task").aggregate([([], "count_all"), ("steps", "sum")]).to_pylist()
+        counts = {entry["task"]: (entry["count_all"], entry["steps_sum"]) for entry in found}
+        return notebook_html("dataset", dataset=self, counts=dict(sorted(counts.items())))
 
     def __len__(self) -> int:
         return len(self._rows)

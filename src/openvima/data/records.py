@@ -14,8 +14,10 @@ import numpy as np
 import xxhash
 
 from openvima import __version__
+from openvima.brief import brief_repr
 from openvima.data.image_layout import ImageBuffers, pixels
 from openvima.data.schema import VIEWS
+from openvima.html import notebook_html
 from openvima.scene import (
     ACTION_SHAPES,
     END_EFFECTORS,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:  # reading needs no simulation
     from openvima.env import TabletopEnv
 
 
+_MOST_FRAMES = 6  # in a notebook
 _JSON = json.JSONEncoder(sort_keys=True)
 
 
@@ -84,6 +87,13 @@ class Demonstration:
     assets: str
     versions: dict[str, str]
 
+    __repr__ = brief_repr
+
+    def _repr_html_(self) -> str | None:
+        view = next(iter(self.rgb), None)
+        frames = [] if view is None else list(self.rgb[view][:_MOST_FRAMES])
+        return notebook_html("demonstration", demo=self, frames=frames)
+
     @property
     def num_steps(self) -> int:
         """Number of actions, T."""
@@ -117,6 +127,8 @@ class Step:
 
     observation: dict[str, Any]  # Any: nested dictionaries
     action: Action
+
+    __repr__ = brief_repr
 
 
 @dataclass(frozen=True, slots=True, eq=False)

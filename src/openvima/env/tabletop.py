@@ -10,11 +10,13 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
+from openvima.html import notebook_html
 from openvima.render import channels_last
 from openvima.render.camera import VIEWS, View
 from openvima.render.rasteriser import Image, Rasteriser
@@ -55,6 +57,8 @@ class VideoFrame:
 
     scene: Scene
     joints: np.ndarray
+
+    __repr__ = brief_repr
 
 
 @dataclass(slots=True, eq=False)
@@ -191,6 +195,21 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         if task_options:
             with suppress(SamplingError):  # another seed may succeed
                 self._sample(0)  # the task checks its options
+
+    def __repr__(self) -> str:
+        run = self._run
+        state = "no episode" if run is None else f"seed {run.episode.seed}, {run.num_steps} steps"
+        return f"TabletopEnv({self.task!r}, level={self.level!r}, domain={self.domain!r}; {state})"
+
+    def _repr_html_(self) -> str | None:
+        facts, run = [self.task, f"level {self.level}"], self._run
+        if run is None:
+            facts.append("no episode: call reset()")
+            return notebook_html("environment", facts=facts, prompt=None)
+        over = run.outcome.reason or ("solved" if run.outcome.success else "")
+        facts += [f"{run.episode.domain} seed {run.episode.seed}", f"{run.num_steps} steps taken", over]
+        views = {view: image.rgb for view, image in self._images().items()}
+        return notebook_html("environment", facts=facts, prompt=self.prompt, views=views)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

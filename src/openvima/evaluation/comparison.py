@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Literal
 
+from openvima.brief import brief_repr
 from openvima.errors import ConfigError, UnknownPolicyError, unknown_name
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
@@ -110,6 +111,8 @@ class Comparison:
     levels: tuple[Difference, ...]
     overall: Difference
     unpaired: int
+
+    __repr__ = brief_repr
 
     @property
     def means(self) -> tuple[Difference, ...]:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from openvima.brief import brief_repr
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
@@ -87,6 +88,8 @@ class EvaluationConfig:
     engine: Engine = "processes"
     address: str | None = None
     trust_code: bool = False
+
+    __repr__ = brief_repr
 
     def __post_init__(self) -> None:
         problems = [

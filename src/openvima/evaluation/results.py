@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
+from openvima.brief import MAX_CHARACTERS, brief_repr, cut
 from openvima.errors import DatasetError
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
+from openvima.html import notebook_html
 
 SCHEMA = 1
 FILE_NAME = "results.json"
@@ -65,6 +67,8 @@ class Row:
     oracle_max_steps: int
     outcomes: tuple[EpisodeOutcome, ...]
     ablation: str = ""
+
+    __repr__ = brief_repr
 
     @property
     def episodes(self) -> int:
@@ -167,6 +171,20 @@ class Results:
     versions: dict[str, str] = field(default_factory=dict)
     policies: dict[str, dict[str, Any]] = field(default_factory=dict)  # plain JSON values
     actions_sha256: str = ""
+
+    def __repr__(self) -> str:
+        rates: dict[str, list[str]] = {}
+        for mean in self.level_means():
+            name = f"{mean.policy}, {mean.ablation}" if mean.ablation else mean.policy
+            rates.setdefault(name, []).append(f"{100 * mean.mean:.1f} % on {mean.level}")
+        shown = "; ".join(f"{name}: {', '.join(means)}" for name, means in rates.items())
+        episodes = sum(row.episodes for row in self.rows)
+        return cut(f"Results({episodes:,} episodes of {len(self.tasks())} tasks; {shown})", MAX_CHARACTERS)
+
+    def _repr_html_(self) -> str | None:
+        means = self.means()
+        names = dict.fromkeys((policy, ablation) for policy, ablation, _ in means)
+        return notebook_html("results", results=self, means=means, names=list(names))
 
     def policy_names(self) -> list[str]:
         """Names of the policies, in the order of the rows."""

@@ -1,13 +1,15 @@
 """HTML pages: one stylesheet and one Jinja environment for reports, galleries and data pages."""
 
 import base64
+import io
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from openvima.errors import MissingExtraError
+from openvima.errors import MissingExtraError, PromptError
 
 if TYPE_CHECKING:
+    import numpy as np
     from jinja2 import Environment
 
 _FOLDER = Path(__file__).parent
@@ -30,6 +32,43 @@ def render_page(template: str, **values: object) -> str:
         MissingExtraError: Jinja is not installed.
     """
     return _environment().get_template(f"{template}.html.j2").render(values)
+
+
+def notebook_html(template: str, **values: object) -> str | None:
+    """Render a template of the folder `notebook`, for `_repr_html_`.
+
+    Args:
+        template: Name of a file in `templates/notebook`, without ".html.j2".
+        values: Variables of the template.
+
+    Returns:
+        An HTML fragment. None, so that notebooks show the text representation, without Jinja, and where a
+        prompt cannot be read.
+    """
+    try:
+        return render_page(f"notebook/{template}", **values)
+    except (MissingExtraError, PromptError):
+        return None
+
+
+def thumbnail_uri(rgb: "np.ndarray", mask: "np.ndarray | None" = None, height: int = 64) -> str:
+    """Encode an image as a small data URI.
+
+    Args:
+        rgb: Shape (3, H, W), uint8.
+        mask: Pixels to cut out with their surroundings, shape (H, W), bool; None keeps all.
+        height: In pixels.
+    """
+    from PIL import Image
+
+    pixels = rgb.transpose(1, 2, 0)
+    if mask is not None and mask.any():
+        rows, columns = (mask.any(axis=axis).nonzero()[0] for axis in (1, 0))
+        pixels = pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    width = max(1, round(pixels.shape[1] * height / pixels.shape[0]))
+    stream = io.BytesIO()
+    Image.fromarray(pixels.copy()).resize((width, height), Image.Resampling.LANCZOS).save(stream, "PNG")
+    return data_uri(stream.getvalue())
 
 
 def require_extra() -> None:
@@ -70,4 +109,5 @@ def _environment() -> "Environment":
     )
     environment.filters["breakable"] = breakable
     environment.globals["data_uri"] = data_uri
+    environment.globals["thumbnail_uri"] = thumbnail_uri
     return environment

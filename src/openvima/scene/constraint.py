@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, TypeAlias
 
+from openvima.brief import brief_repr
 from openvima.scene.goal import AtPose, Condition, Goal, Zone, block_points, object_of
 from openvima.scene.scene import Scene
 
@@ -23,6 +24,8 @@ class StepContext:
     open_before: tuple[int, ...]
     open_goals: tuple[int, ...]
     scene: Scene
+
+    __repr__ = brief_repr
 
     def describe(self, goal_index: int) -> str:
         """Name the object of a goal, or the goal if it names no object."""
@@ -61,6 +64,8 @@ class DistractorsApart:
     at_end: bool = False
     goals: tuple[int, ...] | None = None
 
+    __repr__ = brief_repr
+
     def violation(self, context: StepContext) -> str:
         """Say which distractor is where it must not be."""
         concerned = range(len(context.goals)) if self.goals is None else self.goals
@@ -96,6 +101,8 @@ class ZoneKeptClear:
     object_ids: tuple[int, ...]
     zone: Zone
 
+    __repr__ = brief_repr
+
     def is_met(self, scene: Scene) -> bool:
         """Whether the zone is clear."""
         return _first_in(self.zone, self.object_ids, scene) is None
@@ -126,6 +133,8 @@ class NeverTouches:
     zone: Zone
     name: str
 
+    __repr__ = brief_repr
+
     def is_met(self, scene: Scene) -> bool:
         """Whether no block touches the zone now."""
         return _first_in(self.zone, self.object_ids, scene) is None
@@ -149,6 +158,8 @@ class InOrder:
     """
 
     goals: tuple[int, ...]
+
+    __repr__ = brief_repr
 
     def violation(self, context: StepContext) -> str:
         """Say which object came too early."""

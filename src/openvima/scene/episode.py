@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
+from openvima.brief import brief_repr
 from openvima.errors import SceneError
+from openvima.html import notebook_html
 from openvima.scene.constraint import Constraint
 from openvima.scene.goal import AtPose, Goal, is_condition
 from openvima.scene.prompt import Prompt
@@ -38,6 +40,8 @@ class Problem:
     num_required: int | None = None
     prerequisites: tuple[AtPose, ...] = ()
     oracle_max_steps: int | None = None
+
+    __repr__ = brief_repr
 
     def __post_init__(self) -> None:
         for goal in self.goals:
@@ -85,6 +89,11 @@ class Episode:
     oracle_max_steps: int
     max_steps: int
     num_redraws: int = 0
+
+    __repr__ = brief_repr
+
+    def _repr_html_(self) -> str | None:
+        return notebook_html("episode", episode=self, parts=self.problem.prompt.described_parts())
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from openvima.brief import brief_repr
 from openvima.errors import PromptError, echo
+from openvima.html import notebook_html
 from openvima.scene.scene import Placement, Scene
 
 FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
@@ -27,6 +29,9 @@ class ObjectImage:
     placement: Placement
     magnification: float = 1.0
 
+    def __str__(self) -> str:
+        return f"{self.placement.texture} {self.placement.object}"
+
 
 @dataclass(frozen=True, slots=True)
 class SceneImage:
@@ -36,6 +41,11 @@ class SceneImage:
     """
 
     scene: Scene
+
+    __repr__ = brief_repr
+
+    def __str__(self) -> str:
+        return f"scene of {', '.join(f'{p.texture} {p.object}' for p in self.scene.placements)}"
 
     @staticmethod
     def of(placements: Sequence[Placement]) -> "SceneImage":
@@ -93,6 +103,20 @@ class Prompt:
     text: str
     images: tuple[tuple[str, PromptFill], ...]
     is_ambiguous: bool = field(default=False, repr=False)  # published digests are of the repr
+
+    __repr__ = brief_repr
+
+    def _repr_html_(self) -> str | None:
+        return notebook_html("prompt", parts=self.described_parts())
+
+    def described_parts(self) -> list[str | tuple[str, str]]:
+        """Return text pieces, and for each image its name and what it will show, in reading order."""
+        shown = {name: str(fill) for name, fill in self.images}
+        return [
+            (piece, shown.get(piece, piece)) if place % 2 else piece.strip()
+            for place, piece in enumerate(_PLACEHOLDER.split(self.text))
+            if piece.strip()
+        ]
 
     @staticmethod
     def parse(template: str, **fills: PromptFill | str | int) -> "Prompt":
@@ -154,6 +178,8 @@ class PromptImage:
     segm: dict[str, np.ndarray]
     objects: tuple[ObjectRecord, ...]
 
+    __repr__ = brief_repr
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedPrompt:
@@ -166,6 +192,11 @@ class RenderedPrompt:
 
     text: str
     images: dict[str, PromptImage]
+
+    __repr__ = brief_repr
+
+    def _repr_html_(self) -> str | None:
+        return notebook_html("rendered_prompt", prompt=self)
 
     def sequence(self) -> list[str | PromptImage]:
         """Return the prompt as one interleaved sequence of text pieces and images, in reading order.

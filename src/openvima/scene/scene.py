@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from openvima.brief import brief_repr
 from openvima.catalog.geometry import Vector3
 from openvima.errors import SceneError
 from openvima.scene.pose import Pose
@@ -57,6 +58,8 @@ class Scene:
 
     placements: tuple[Placement, ...]
     end_effector: EndEffector = "suction"
+
+    __repr__ = brief_repr
 
     def __post_init__(self) -> None:
         ids = [placement.id for placement in self.placements]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import cast
 
+from openvima.brief import brief_repr
 from openvima.scene import Outcome, Problem, Scene, StepConstraint, StepContext, in_workspace
 from openvima.scene.goal import is_condition, is_monitored, object_of, unmet_reason
 
@@ -18,6 +19,8 @@ class Progress:
 
     open_goals: tuple[int, ...]
     violation: str = ""
+
+    __repr__ = brief_repr
 
 
 def begin(problem: Problem) -> Progress:

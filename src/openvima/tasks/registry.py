@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from openvima.brief import brief_repr
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.registration import with_registered
 from openvima.errors import LevelError, UnknownTaskError, unknown_name
@@ -49,6 +50,8 @@ class TaskSpec:
     summary: str
     sample: SampleFunction
     distractors_allowed: bool = False
+
+    __repr__ = brief_repr
 
     @property
     def levels(self) -> tuple[Level, ...]:
