@@ -111,8 +111,10 @@ def test_wrong_input_is_refused_before_any_work(
 def test_words_that_a_policy_never_saw_are_one_line_and_the_verb_goes_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    tokenizer = WordTokenizer()
+
     def run(words: Sequence[str]) -> int:
-        WordTokenizer().encode("put the \x1b[2J quokka")
+        tokenizer.encode("put the \x1b[2J quokka")
         return 0
 
     monkeypatch.setattr(importlib, "import_module", lambda name: SimpleNamespace(run=run))
