@@ -12,6 +12,7 @@ from openvima.env.checked_values import entries, known_object, number, pair, sho
 from openvima.env.composed_objects import MAX_ANGLE_DEG, WORKSPACE, outline
 from openvima.errors import SceneError, unknown_name
 from openvima.scene import AtPose, EndEffector, Goal, InZone, Placement, Pose, Tolerance, Zone, in_workspace
+from openvima.scene.goal import is_condition
 from openvima.tasks.into_base import TOLERANCE
 from openvima.tasks.rotation import TOLERANCE_DEG, rotation_goal
 
@@ -38,7 +39,7 @@ def composed_goals(
 
 
 def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, assets: Assets) -> Goal:
-    if hasattr(given, "is_met"):
+    if is_condition(given):
         return given
     if isinstance(given, Mapping):
         named = dict(given)
@@ -64,7 +65,8 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     try:
         return make(*bound.args, **bound.kwargs)
     except SceneError as error:
-        raise SceneError(f"{label} ({name}): {error}") from None
+        moved = bound.arguments["a"]
+        raise SceneError(f"{label} ({name}, {moved.texture} {moved.object}): {error}") from None
 
 
 def _usage(name: str) -> str:
@@ -75,10 +77,10 @@ def _usage(name: str) -> str:
     return f"({', '.join([name, *shown_ones])})"
 
 
-def _on(a: Placement, b: Placement, *, assets: Assets) -> Goal:
-    """The position of a is within 0.1 m of that of b, as in the tasks."""
+def _in(a: Placement, b: Placement, *, assets: Assets) -> Goal:
+    """The position of a is within 0.1 m of that of b, as in the tasks; so a is in b or on it."""
     if a.id == b.id:
-        raise SceneError(f"{a.texture} {a.object} cannot be on itself; name two objects.")
+        raise SceneError(f"{a.texture} {a.object} cannot be in itself; name two objects.")
     return AtPose(a.id, b.pose, TOLERANCE, relative_to=b.id)
 
 
@@ -100,7 +102,7 @@ def _rotated(a: Placement, degrees: object, *, assets: Assets) -> Goal:
     """The object a is rotated in place, clockwise, within 15 degrees."""
     angle_deg = number(degrees, "degrees", -360, 360)
     if abs(math.remainder(angle_deg, 360)) <= TOLERANCE_DEG:
-        raise SceneError(f"degrees is {angle_deg:g}; more than {TOLERANCE_DEG} are needed, the tolerance.")
+        raise SceneError(f"degrees is {angle_deg:g}; it must be more than {TOLERANCE_DEG}, the tolerance.")
     return rotation_goal(a, angle_deg, position_m=TOLERANCE.position_m)
 
 
@@ -118,7 +120,7 @@ def _swept_into(a: Placement, b: Placement, *, assets: Assets) -> Goal:
 
 
 _GOALS: dict[str, Callable[..., Goal]] = {
-    "on": _on,
+    "in": _in,
     "at": _at,
     "rotated": _rotated,
     "swept_into": _swept_into,

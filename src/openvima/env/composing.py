@@ -18,7 +18,7 @@ from openvima.tasks.table import TableSampler
 
 COMPOSED = "composed"  # task of composed episodes
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
-DEFAULT_MAX_STEPS = 10
+DEFAULT_MAX_STEPS, MAX_STEPS_WITHOUT_GOALS = 10, 3
 MAX_STEPS = 1000
 _POOL = Pool((), (), (), ())
 
@@ -29,7 +29,7 @@ def compose(
     *,
     images: Mapping[str, Any] | None = None,
     goals: Sequence[Any] = (),
-    max_steps: int = DEFAULT_MAX_STEPS,
+    max_steps: int | None = None,
     end_effector: str = "suction",
     assets: str | Path | Assets = "procedural",
 ) -> Episode:
@@ -44,10 +44,10 @@ def compose(
             `(object, texture)` of the catalogue; the path of a PNG file with an object on white; or a list of
             objects for an image of a whole scene, each as in `objects` or `(handle, (x, y))` for an object of
             the scene somewhere else.
-        goals: Goals in the order of the oracle: `("on", a, b)`, `("at", a, (x, y))`,
+        goals: Goals in the order of the oracle: `("in", a, b)`, which holds on b too, `("at", a, (x, y))`,
             `("rotated", a, degrees)` clockwise, `("swept_into", a, b)`; or goals of `openvima.scene`. Without
             goals the episode ends at the step limit only.
-        max_steps: Step limit, 1 … 1000.
+        max_steps: Step limit, 1 … 1000; by default 10, and 3 without goals.
         end_effector: "suction", or "spatula" for sweeps.
         assets: Asset pack.
 
@@ -87,7 +87,9 @@ def composed(values: Mapping[str, Any], *, assets: Assets, photo: Callable[[str]
     if unknown := [key for key in values if key not in COMPOSE_KEYS]:
         raise SceneError(unknown_name("key of a scene:", unknown[0], COMPOSE_KEYS))
     end_effector = _end_effector(values.get("end_effector", "suction"))
-    max_steps = values.get("max_steps", DEFAULT_MAX_STEPS)
+    max_steps = values.get("max_steps")
+    if max_steps is None:
+        max_steps = DEFAULT_MAX_STEPS if values.get("goals") else MAX_STEPS_WITHOUT_GOALS
     if type(max_steps) is not int or not 1 <= max_steps <= MAX_STEPS:
         raise SceneError(f"max_steps is {shown(max_steps)}; give a whole number from 1 to {MAX_STEPS}.")
     table = TableSampler(np.random.default_rng(0), _POOL, assets=assets, end_effector=end_effector)

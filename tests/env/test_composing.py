@@ -1,0 +1,178 @@
+"""Composed episodes: what is placed where, and what is refused with which words."""
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import openvima
+from compose import outcome_of, random_scene
+from openvima import SceneObject, compose
+from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownObjectError, UnknownTextureError
+from openvima.perception.objects import observe_prompt_image
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import AtPose, InZone, ObjectImage, PhotoImage, SceneImage
+
+OBJECTS = [("heart", "red swirl", (0.5, -0.2)), ("bowl", "green", (0.5, 0.2))]
+PROMPT = "Put the {a} into the {b}."
+
+
+def refusal(*args: object, **kwargs: object) -> str:
+    with pytest.raises(OpenVimaError) as caught:
+        compose(*args, **kwargs)  # type: ignore[arg-type]  # wrong on purpose
+    return str(caught.value)
+
+
+def test_objects_rest_on_the_table_in_their_order_and_bases_are_fixed() -> None:
+    heart, bowl = compose(OBJECTS, PROMPT).problem.scene.placements
+    assert (heart.id, heart.object, heart.texture, heart.fixed) == (5, "heart", "red swirl", False)
+    assert (bowl.id, bowl.fixed) == (6, True)
+    block = compose([("block", "red", (0.5, 0.0))], "Look.").problem.scene.placements[0]
+    assert block.pose.z == pytest.approx(0.034)
+
+
+def test_all_forms_of_objects_mean_the_same() -> None:
+    by_name = {
+        "x": ("heart", "red", (0.5, 0.0), 30),
+        "y": {"object": "pan", "texture": "blue", "position": [0.5, 0.3]},
+    }
+    records = [
+        SceneObject("heart", "red", (0.5, 0.0), 30, name="x"),
+        SceneObject("pan", "blue", (0.5, 0.3), name="y"),
+    ]
+    assert compose(by_name, "Put {x} into {y}.") == compose(records, "Put {x} into {y}.")
+    assert compose(records, "Look.").problem.scene.placements[0].pose.yaw_rad == pytest.approx(np.pi / 6)
+
+
+def test_scale_and_fixed_can_be_given() -> None:
+    given = [SceneObject("bowl", "red", (0.5, 0.0), scale=0.8, fixed=False)]
+    (bowl,) = compose(given, "Look.").problem.scene.placements
+    assert bowl.scale == (0.8, 0.8, 0.8) and not bowl.fixed
+
+
+@pytest.mark.parametrize(
+    ("objects", "words"),
+    [
+        ([("heart", "red", (0.8, 0.1))], ["'a' (red heart)", "(0.8, 0.1)", "0.25 … 0.75 m"]),
+        ([("heart", "red", (0.74, 0.1))], ["'a' (red heart)", "with its edge", "0.25 … 0.75 m"]),
+        (
+            [*OBJECTS, ("star", "blue", (0.52, 0.2))],
+            ["'c' (blue star)", "'b' (green bowl)", "cm²", "0 is allowed"],
+        ),
+        ([("heart", "red", (float("nan"), 0.1))], ["object 0 ('a'): position is [nan, 0.1]", "finite"]),
+        ([("heart", "red", (0.5, 0.1), 1e9)], ["yaw_deg is 1000000000.0", "-3600 to 3600"]),
+        ([SceneObject("heart", "red", (0.5, 0.1), scale=9)], ["scale is 9", "0.5 to 2"]),
+        ([("heart", "red")], ["object 0 ('a') has 2 entries", "(object, texture, (x, y)[, yaw_deg])"]),
+        ([], ["0 objects", "1 to 64"]),
+        ([SceneObject("pan", "red", (0.5, 0.1), name="../x")], ["'../x'", "letters"]),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_object_and_limit(objects: list, words: list[str]) -> None:
+    message = refusal(objects, "Look.")
+    assert all(word in message for word in words), message
+
+
+def test_unknown_names_get_hints() -> None:
+    with pytest.raises(
+        UnknownObjectError, match=r"object 0 \('a'\): there is no object 'hart'. Did you mean 'heart'"
+    ):
+        compose([("hart", "red", (0.5, 0.0))], "Look.")
+    with pytest.raises(UnknownTextureError, match="Did you mean 'red swirl'"):
+        compose([("heart", "red swrl", (0.5, 0.0))], "Look.")
+    assert "placeholder 'c'" in refusal(OBJECTS, "Put {c}.") and "a, b" in refusal(OBJECTS, "Put {c}.")
+    assert "there is no placeholder in the prompt for image 'c'" in refusal(OBJECTS, PROMPT, images={"c": 0})
+
+
+def test_prompt_images_come_from_the_scene_the_catalogue_and_whole_scenes() -> None:
+    images = {
+        "x": 0,
+        "y": ("pan", "blue"),
+        "z": [("a", (0.5, 0.2)), ("b", (0.5, 0.2)), ("star", "red", (0.4, -0.3))],
+    }
+    problem = compose(OBJECTS, "From {x} and {y} to {z} or {b}.", images=images).problem
+    fills = dict(problem.prompt.images)
+    assert list(fills) == ["x", "y", "z", "b"]
+    assert isinstance(fills["x"], ObjectImage) and fills["x"].placement == problem.scene.placements[0]
+    assert isinstance(fills["y"], ObjectImage) and fills["y"].placement.object == "pan"
+    assert isinstance(fills["z"], SceneImage)
+    heart, bowl, _ = fills["z"].scene.placements
+    assert bowl.pose.z > heart.pose.z  # it lies on top
+    assert "image 'z', object 0: there is no object 'q'" in refusal(
+        OBJECTS, "{z}", images={"z": [("q", (0.5, 0.2))]}
+    )
+
+
+def test_a_photo_is_cut_to_its_object_and_shown_like_an_object(tmp_path: Path) -> None:
+    picture = Image.new("RGB", (640, 480), "white")
+    picture.paste((200, 30, 30), (100, 100, 300, 200))
+    picture.save(tmp_path / "photo.png")
+    problem = compose(OBJECTS, "Put {x} into {b}.", images={"x": tmp_path / "photo.png"}).problem
+    photo = dict(problem.prompt.images)["x"]
+    assert isinstance(photo, PhotoImage) and (photo.width, photo.height) == (48, 24)
+    image = Rasteriser(openvima.make("rotate").unwrapped.assets).prompt(problem.prompt).images["x"]
+    seen = observe_prompt_image(image)
+    assert seen.boxes[:, 0].tolist() == [[127, 75, 23, 47], [127, 62, 23, 47]]
+    assert image.kind == "object" and (image.rgb["top"][0] == 200).sum() == 48 * 24
+
+
+def test_photos_that_show_nothing_are_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (9, 9), "white").save(tmp_path / "white.png")
+    with pytest.raises(InputFileError, match=r"image 'x': photo .*white.png' is all white"):
+        compose(OBJECTS, "Put {x}.", images={"x": tmp_path / "white.png"})
+
+
+def test_goals_by_name() -> None:
+    given = [
+        ("in", "a", "b"),
+        ("at", "a", (0.6, 0.1)),
+        ("at", "a", (0.6, 0.1), 90),
+        {"goal": "rotated", "a": 0, "degrees": 60},
+    ]
+    inside, at, turned, rotated = compose(OBJECTS, PROMPT, goals=given).problem.goals
+    assert isinstance(inside, AtPose) and (inside.object_id, inside.relative_to) == (5, 6)
+    assert isinstance(at, AtPose) and at.target.position[:2] == (0.6, 0.1) and at.tolerance.yaw_rad is None
+    assert isinstance(turned, AtPose) and turned.target.yaw_rad == pytest.approx(np.pi / 2)
+    assert isinstance(rotated, AtPose) and rotated.target.yaw_rad == pytest.approx(-np.pi / 3)
+    table = [("small block", "red", (0.65, 0.1)), ("three-sided rectangle", "blue", (0.4, 0.0), -90)]
+    (swept,) = compose(
+        table, "Sweep.", goals=[("swept_into", "a", "b")], end_effector="spatula"
+    ).problem.goals
+    assert isinstance(swept, InZone) and swept.zone.size_x == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (("under", "a", "b"), ["there is no goal 'under'", "(in, a, b)", "(at, a, position, [yaw_deg])"]),
+        (("in", "a"), ["goal 0", "(in, a, b)"]),
+        (("in", "a", "z"), ["there is no object 'z'", "a, b"]),
+        (("in", "a", "a"), ["itself"]),
+        (("at", "a", (0.9, 0.0)), ["(at, red swirl heart)", "0.25 … 0.75 m"]),
+        (("rotated", "a", 3), ["degrees is 3", "15"]),
+        (("swept_into", "a", "b"), ["spatula"]),
+    ],
+)
+def test_wrong_goals_are_refused_with_the_allowed_ones(goal: tuple, words: list[str]) -> None:
+    message = refusal(OBJECTS, PROMPT, goals=[goal])
+    assert all(word in message for word in words), message
+
+
+def test_the_step_limit_is_given_or_a_default() -> None:
+    assert compose(OBJECTS, PROMPT).max_steps == 3
+    assert compose(OBJECTS, PROMPT, goals=[("in", "a", "b")]).max_steps == 10
+    assert compose(OBJECTS, PROMPT, max_steps=7).max_steps == 7
+    assert "1 to 1000" in refusal(OBJECTS, PROMPT, max_steps=0)
+
+
+@pytest.mark.parametrize("prompt", ["", "x" * 1001, "two\nlines", None, "\x1b[2J"])
+def test_prompts_are_one_line_of_limited_length(prompt: object) -> None:
+    with pytest.raises(SceneError, match="1 to 1000 characters"):
+        compose(OBJECTS, prompt)  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_random_scenes_are_played_or_refused_by_object_and_limit(tmp_path: Path) -> None:
+    rng, env = random.Random(7), openvima.TabletopEnv("visual_manipulation")
+    outcomes = [outcome_of(random_scene(rng), rng, env, tmp_path) for _ in range(12)]
+    assert set(outcomes) == {"played", "refused"}, outcomes

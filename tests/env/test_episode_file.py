@@ -1,0 +1,113 @@
+"""Episodes as files: nothing is lost, and what is hostile is refused."""
+
+import random
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+import openvima
+from compose import answer_to, hostile_file, valid_files
+from openvima.errors import ConfigError, InputFileError, SceneError
+from openvima.evaluation import play
+from openvima.scene import Scene
+from openvima.tasks import list_tasks, sample_episode, task_spec
+
+HAND_WRITTEN = """
+prompt: Put the {photo} into the {bowl}.
+objects:
+  block: [block, red, [0.5, -0.2]]
+  bowl: {object: bowl, texture: green, position: [0.5, 0.2]}
+images: {photo: block.png}
+goals:
+  - [in, block, bowl]
+"""
+
+
+class AnywhereGoal:
+    def is_met(self, scene: Scene) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("task", list_tasks())
+def test_a_sampled_episode_is_equal_after_saving_and_loading(task: str, tmp_path: Path) -> None:
+    episode = sample_episode(task, level=task_spec(task).levels[-1], seed=1)
+    for suffix in (".yaml", ".json"):
+        assert openvima.load_episode(openvima.save_episode(episode, tmp_path / f"e{suffix}")) == episode
+
+
+@pytest.mark.parametrize("task", ["rotate", "novel_adj", "rearrange_then_restore", "sweep_without_exceeding"])
+def test_a_loaded_episode_is_played_bit_for_bit_alike(task: str, tmp_path: Path) -> None:
+    episode = sample_episode(task, seed=3)
+    loaded = openvima.load_episode(openvima.save_episode(episode, tmp_path / "episode.yaml"))
+    first, second = play(episode, "oracle"), play(loaded, "oracle")
+    assert first.outcome.success
+    assert (first.actions, first.scene, first.outcome) == (second.actions, second.scene, second.outcome)
+
+
+def test_a_composed_episode_with_all_kinds_of_images_survives(tmp_path: Path) -> None:
+    Image.new("RGB", (80, 50), "red").save(tmp_path / "block.png")
+    (tmp_path / "scene.yaml").write_text(HAND_WRITTEN, encoding="utf-8")
+    episode = openvima.load_episode(tmp_path / "scene.yaml")
+    again = openvima.save_episode(episode, tmp_path / "elsewhere" / "saved.json")
+    assert openvima.load_episode(again) == episode  # with the photo
+
+
+def test_reset_takes_episodes_files_and_values(tmp_path: Path) -> None:
+    env = openvima.TabletopEnv("rotate")
+    values = {"objects": [["heart", "red", [0.5, 0.0]]], "prompt": "Lift the {a}."}
+    path = openvima.save_episode(openvima.compose(**values), tmp_path / "scene.json")
+    for given in (openvima.compose(**values), path, str(path), values):
+        _, info = env.reset(options={"episode": given})
+        assert (info["task"], info["prompt"]) == ("composed", "Lift the {a}.")
+    with pytest.raises(ConfigError, match="option 'episode' is a int"):
+        env.reset(options={"episode": 3})
+    with pytest.raises(InputFileError, match="needs an episode file"):
+        env.reset(options={"episode": {**values, "images": {"a": "x.png"}}})
+
+
+def test_goals_of_ones_own_cannot_be_saved(tmp_path: Path) -> None:
+    episode = openvima.compose([("heart", "red", (0.5, 0.0))], "Look.", goals=[AnywhereGoal()])
+    with pytest.raises(
+        InputFileError, match="AnywhereGoal cannot be saved in a file; allowed are AtPose, InZone"
+    ):
+        openvima.save_episode(episode, tmp_path / "scene.yaml")
+    with pytest.raises(InputFileError, match=r"must end in \.yaml, \.yml, \.json"):
+        openvima.save_episode(episode, tmp_path / "scene.txt")
+
+
+def test_photos_outside_the_folder_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "inside").mkdir()
+    Image.new("RGB", (8, 5), "red").save(tmp_path / "block.png")
+    (tmp_path / "inside" / "link.png").symlink_to(tmp_path / "block.png")
+    for name in ("../block.png", str(tmp_path / "block.png"), "link.png"):
+        file = tmp_path / "inside" / "scene.yaml"
+        file.write_text(HAND_WRITTEN.replace("block.png", name), encoding="utf-8")
+        with pytest.raises(InputFileError, match=r"scene\.yaml: image 'photo': .* inside the folder"):
+            openvima.load_episode(file)
+
+
+def test_the_message_names_the_field(tmp_path: Path) -> None:
+    episode = sample_episode("rotate", seed=0)
+    path = openvima.save_episode(replace(episode, max_steps=4), tmp_path / "episode.yaml")
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("position_m: 0.1", "position_m: .nan"), encoding="utf-8")
+    with pytest.raises(
+        InputFileError, match=r"goals\[0\]\.tolerance\.position_m is nan; it must be a number"
+    ):
+        openvima.load_episode(path)
+    path.write_text(text.replace("letter", "lettre", 1), encoding="utf-8")
+    with pytest.raises(openvima.errors.UnknownObjectError, match="Did you mean 'letter"):
+        openvima.load_episode(path)
+    path.write_text(text.replace("size: [", "size: [7", 1), encoding="utf-8")
+    with pytest.raises(SceneError, match=r"scene, object 5: size .* is not like that of"):
+        openvima.load_episode(path)
+
+
+def test_hostile_files_are_refused(tmp_path: Path) -> None:
+    rng, files = random.Random(5), valid_files()
+    (tmp_path / "inside").mkdir()
+    for _ in range(12):
+        attack, path = hostile_file(files, rng, tmp_path / "inside")
+        assert answer_to(path) == "refused", (attack, path.read_bytes()[:2000])

@@ -1,0 +1,81 @@
+"""Playing single episodes: results, policies of all kinds, and recordings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima import compose
+from openvima.cli.main import main
+from openvima.env import save_episode
+from openvima.errors import PolicyError, UnknownPolicyError
+from openvima.evaluation import play
+from openvima.policies import RandomPolicy
+from openvima.scene import Action
+
+OBJECTS = [("block", "red", (0.5, -0.2)), ("bowl", "green", (0.5, 0.2))]
+PROMPT = "Put the {a} into the {b}."
+
+
+class FirstIntoSecond:
+    """Picks at (0.5, -0.2) and places at (0.5, 0.2)."""
+
+    def reset(self, prompts):
+        self.prompts = prompts
+
+    def act(self, observations):
+        return [Action.planar((0.5, -0.2), (0.5, 0.2), 0.0).to_arrays() for _ in observations]
+
+
+class NoAction(FirstIntoSecond):
+    """Gives an action outside the workspace."""
+
+    def act(self, observations):
+        (action,) = super().act(observations)
+        return [action | {"pose0_position": np.float32([9, 9])}]
+
+
+def test_an_object_and_the_oracle_solve_a_composed_episode() -> None:
+    episode = compose(OBJECTS, PROMPT, goals=[("in", "a", "b")])
+    for policy in (FirstIntoSecond(), "oracle"):
+        result = play(episode, policy, frames=True)
+        assert result.outcome.success and result.steps == len(result.actions) == 1
+        assert [frame.shape for frame in result.frames] == [(256, 256, 3)] * 2
+        assert result.scene[5].pose.planar_distance(episode.problem.scene[6].pose) < 0.1
+
+
+def test_without_goals_the_step_limit_ends_the_episode() -> None:
+    result = play(compose(OBJECTS, PROMPT, max_steps=2), FirstIntoSecond())
+    assert result.steps == 2 and not result.outcome.is_over
+    assert result.outcome.reason == "the step limit is reached; the episode has no goals"
+    assert "no goals" in play(compose(OBJECTS, PROMPT), "oracle").outcome.reason
+
+
+def test_an_invalid_action_ends_the_episode_with_its_message() -> None:
+    result = play(compose(OBJECTS, PROMPT), NoAction())
+    assert result.steps == 0 and "pose0_position is (9" in result.outcome.reason
+
+
+def test_policies_by_name_and_what_is_none() -> None:
+    episode = compose(OBJECTS, PROMPT, max_steps=1)
+    assert play(episode, "random").steps == play(episode, RandomPolicy()).steps == 1
+    with pytest.raises(UnknownPolicyError):
+        play(episode, "no-such-policy")
+    with pytest.raises(PolicyError, match=r"is a int; it needs reset\(prompts\)"):
+        play(episode, 3)  # type: ignore[arg-type]  # wrong on purpose
+
+
+@pytest.mark.slow
+def test_demo_records_an_episode_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("av")
+    scene = save_episode(compose(OBJECTS, PROMPT, goals=[("in", "a", "b")]), tmp_path / "scene.yaml")
+    assert main(["demo", "--episode", str(scene), "--out", str(tmp_path / "x.mp4")]) == 0
+    assert "by oracle: solved; 1 step" in capsys.readouterr().out
+    assert (tmp_path / "x.mp4").stat().st_size > 1000
+
+
+def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo"]) == 2 and main(["demo", "rotate", "--episode", "x.yaml"]) == 2
+    assert "either a TASK or --episode FILE" in capsys.readouterr().err
+    assert main(["demo", "--episode", "missing.yaml"]) == 2
+    assert "missing.yaml" in capsys.readouterr().err
