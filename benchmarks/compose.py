@@ -96,8 +96,8 @@ def outcome_of(values: Values, rng: random.Random, env: openvima.TabletopEnv, fo
     try:
         episode = openvima.compose(**values)
     except OpenVimaError as error:
-        is_told = NAMED.search(str(error)) and LIMIT.search(str(error))
-        return "refused" if is_told else f"refused without object or limit: {error}"
+        is_explained = NAMED.search(str(error)) and LIMIT.search(str(error))
+        return "refused" if is_explained else f"refused without object or limit: {error}"
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     try:

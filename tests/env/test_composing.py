@@ -10,6 +10,7 @@ from PIL import Image
 import openvima
 from compose import outcome_of, random_scene
 from openvima import SceneObject, compose
+from openvima.catalog import load_assets
 from openvima.errors import InputFileError, OpenVimaError, SceneError, UnknownObjectError, UnknownTextureError
 from openvima.perception.objects import observe_prompt_image
 from openvima.render.rasteriser import Rasteriser
@@ -111,7 +112,7 @@ def test_a_photo_is_cut_to_its_object_and_shown_like_an_object(tmp_path: Path) -
     problem = compose(OBJECTS, "Put {x} into {b}.", images={"x": tmp_path / "photo.png"}).problem
     photo = dict(problem.prompt.images)["x"]
     assert isinstance(photo, PhotoImage) and (photo.width, photo.height) == (48, 24)
-    image = Rasteriser(openvima.make("rotate").unwrapped.assets).prompt(problem.prompt).images["x"]
+    image = Rasteriser(load_assets("procedural")).prompt(problem.prompt).images["x"]
     seen = observe_prompt_image(image)
     assert seen.boxes[:, 0].tolist() == [[127, 75, 23, 47], [127, 62, 23, 47]]
     assert image.kind == "object" and (image.rgb["top"][0] == 200).sum() == 48 * 24
