@@ -194,8 +194,8 @@ def main() -> None:
     parser.add_argument("--multimodal", type=Path, help="results.json of the same episodes as published")
     options = parser.parse_args()
     if options.results is not None:
-        published = Results.load(options.multimodal) if options.multimodal else None
-        rows = score_by_ambiguity(Results.load(options.results), published)
+        published = Results.read(options.multimodal) if options.multimodal else None
+        rows = score_by_ambiguity(Results.read(options.results), published)
         _print_scores(rows)
         if options.json:
             options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

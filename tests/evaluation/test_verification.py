@@ -41,6 +41,13 @@ def test_every_outcome_is_confirmed_and_marked(copy):
     assert json.loads((copy / VERIFICATION_NAME).read_text())["sha256"] == found.sha256
 
 
+def test_text_prompts_of_all_tasks_are_confirmed(tmp_path):
+    text = EnvConfig(prompts="text")
+    evaluate(EvaluationConfig(("random",), levels=("L1",), episodes=1, out=tmp_path, env_config=text))
+    found = verify_results(tmp_path)
+    assert (found.problems, found.episodes) == ((), 8)
+
+
 def test_the_mark_belongs_to_the_results_that_were_confirmed(copy):
     verify_results(copy)
     path = copy / "results.json"

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -25,6 +26,7 @@ SCENES_ONLY = {"follow_order", "rearrange", "rearrange_then_restore", "scene_und
 COMPARING = {"novel_adj", "novel_adj_and_noun"}  # by height in half of the episodes
 WITH_TEXT = sorted(set(list_tasks()) - SCENES_ONLY)
 NUM_EPISODES = 10
+PAGE = Path(__file__).parents[2] / "docs" / "prompts.md"
 
 
 def test_all_tasks_but_those_with_scenes_alone_have_a_text_form() -> None:
@@ -168,3 +170,9 @@ def test_rendered_prompts_are_described_alike() -> None:
     assert described(prompt, "mixed").text == described(prompt, "mixed").text
     with pytest.raises(PromptError, match="image a has names of over 200"):
         described(RenderedPrompt("{a}", {"a": image("a", ObjectRecord(2, "x" * 300, "red"))}), "text")
+
+
+@pytest.mark.parametrize("task", WITH_TEXT)
+def test_the_page_quotes_the_text_of_each_task(task: str) -> None:
+    text = sample_episode(task, seed=3, prompts="text").problem.prompt.text
+    assert f"| `{task}` | {text} |" in PAGE.read_text(encoding="utf-8")

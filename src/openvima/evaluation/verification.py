@@ -18,6 +18,7 @@ from openvima.evaluation.runner import Report
 from openvima.evaluation.versions import versions
 from openvima.input_files import read_text
 from openvima.multiprocess import imap_unordered
+from openvima.tasks.prompts import MULTIMODAL
 
 VERIFICATION_NAME = "verification.json"
 _MAX_BYTES = 1 << 28
@@ -144,7 +145,12 @@ def _row_problems(results: Results) -> Iterator[str]:
     """Compare the rows with the settings: no task, level or seed is missing, added or doubled."""
     config = results.config
     whole = EvaluationConfig(
-        ("oracle",), (*config["tasks"],), (*config["levels"],), int(config["episodes"]), int(config["seed"])
+        ("oracle",),
+        (*config["tasks"],),
+        (*config["levels"],),
+        int(config["episodes"]),
+        int(config["seed"]),
+        env_config=EnvConfig(prompts=config.get("prompts", MULTIMODAL)),
     )
     expected = {(task, level) for task, level in cells(whole)}
     seeds = list(range(whole.seed, whole.seed + whole.episodes))
