@@ -323,9 +323,10 @@ def test_a_reset_without_prompts_is_refused(policy) -> None:
 
 
 def test_a_word_that_nobody_taught_is_named_once_for_all_sessions_of_a_policy(policy, prompts) -> None:
-    prompt = replace(prompts[0], text="Juggle " + prompts[0].text)
-    with pytest.warns(UnknownWordWarning, match="never saw 'juggle'"):
+    prompt = replace(prompts[0], text=f"Juggle {prompts[0].text} Wildly!")
+    with pytest.warns(UnknownWordWarning, match="never saw 'juggle', 'wildly' in") as caught:
         policy.reset([prompt])
+    assert len(caught) == 1
     for session in (policy, policy.new_session()):
         session.reset([replace(prompt, text=prompt.text + " Juggle!")])  # a warning would be an error
 

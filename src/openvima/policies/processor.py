@@ -393,7 +393,11 @@ class Processor:
         tokens: list[tuple[int, int, int]] = []  # word, entry, part
         starts, order, count = np.cumsum([0, *counts]), [], 0
         sizes: list[int] = []  # rows of each image
-        for piece in split_prompt(text):
+        pieces = split_prompt(text)
+        self.tokenizer.encode(
+            " ".join(piece for piece in pieces if isinstance(piece, str))
+        )  # warns once of all
+        for piece in pieces:
             if isinstance(piece, str):
                 tokens += [(word, WORD, 0) for word in self.tokenizer.encode(piece)]
                 continue

@@ -228,9 +228,9 @@ class WordTokenizer:
         near = difflib.get_close_matches(new[0], self._ids, n=1)
         last = " Further unknown words are not named." if len(self._warned) == _MAX_WARNED else ""
         warnings.warn(
-            f"the policy never saw {echo(', '.join(map(repr, new)), _MAX_SHOWN)} in training and reads the "
-            f"prompt without what they mean.{f' Did you mean {near[0]!r}?' if near else ''} Train on "
-            f"prompts with these words, or use other ones.{last}",
+            f"the policy never saw {echo(', '.join(map(repr, new)), _MAX_SHOWN)} in training and does "
+            f"not know what they mean.{f' Did you mean {near[0]!r}?' if near else ''} Use other words, or train "
+            f"it on prompts with these.{last}",
             UnknownWordWarning,
             stacklevel=2,
         )
