@@ -226,11 +226,12 @@ class WordTokenizer:
             return
         self._warned.update(new)
         near = difflib.get_close_matches(new[0], self._ids, n=1)
+        shown = echo(", ".join(map(repr, new)), _MAX_SHOWN)
         last = " Further unknown words are not named." if len(self._warned) == _MAX_WARNED else ""
+        hint = f" Did you mean {near[0]!r}?" if near else ""
         warnings.warn(
-            f"the policy never saw {echo(', '.join(map(repr, new)), _MAX_SHOWN)} in training and does "
-            f"not know what they mean.{f' Did you mean {near[0]!r}?' if near else ''} Use other words, or train "
-            f"it on prompts with these.{last}",
+            f"the prompt has words that the policy never saw in training: {shown}.{hint} Use other words, or "
+            f"train it on prompts with these.{last}",
             UnknownWordWarning,
             stacklevel=2,
         )
