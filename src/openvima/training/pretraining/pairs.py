@@ -13,13 +13,13 @@ import torch
 
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
-from openvima.catalog.partitions import Pool, pool
+from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
 from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
-from openvima.tasks import sample_episode
+from openvima.tasks import sample_episode, task_spec
 from openvima.training.augmentation.appearance_randomization import with_random_appearance
 from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
 from openvima.training.augmentation.hard_negatives import with_hard_negatives
@@ -133,14 +133,17 @@ def render_pairs(
     """
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
-    shades = {name for task in tasks for name in pool(task, "train").dragged_textures}
+    pools = {task: task_spec(task).pool("train") for task in tasks}
+    shades = {name for names in pools.values() for name in names.dragged_textures}
     indices: dict[tuple, int] = {}
     rows: list[tuple] = []
     for number in range(num_scenes):
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
         episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
-        scene = _retextured(episode.problem.scene, pool(task, "train"), np.random.default_rng(episode_seed))
+        scene = _retextured(
+            episode.problem.scene, task_spec(task).pool("train"), np.random.default_rng(episode_seed)
+        )
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
         scene = augmentation(scene, shades, rasteriser.assets, rng)
@@ -233,10 +236,13 @@ def _retextured(scene: Scene, textures: Pool, rng: np.random.Generator) -> Scene
     """
     size = max(2, len(scene.placements) - 1)
     palettes = {
-        fixed: rng.choice(names, size=size, replace=False) if names else ()
+        fixed: rng.choice(names, size=min(size, len(names)), replace=False) if names else ()
         for fixed, names in ((False, textures.dragged_textures), (True, textures.base_textures))
     }
-    placements = [replace(p, texture=str(rng.choice(palettes[p.fixed]))) for p in scene.placements]
+    placements = [
+        replace(p, texture=str(rng.choice(palettes[p.fixed]))) if len(palettes[p.fixed]) else p
+        for p in scene.placements
+    ]
     return replace(scene, placements=tuple(placements))
 
 
