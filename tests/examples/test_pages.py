@@ -6,6 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
+    "compose": "compose_a_scene",
     "observations": "joints_and_depth",
     "prompts": "language_prompts",
     "your_own_objects": "custom_object",
