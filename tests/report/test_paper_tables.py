@@ -113,3 +113,10 @@ def test_means_over_fewer_tasks_than_others_say_so(results):
 def test_a_single_episode_is_counted_in_the_singular(results):
     row = replace(results.rows[0], outcomes=results.rows[0].outcomes[:1])
     assert "1 episode a task." in paper_tables(replace(results, rows=(row,)))[0].caption
+
+
+def test_other_prompts_are_named_and_not_compared_with_published_ones(results: Results) -> None:
+    text = replace(results, config={**results.config, "prompts": "text"})
+    assert "(published)" in markdown(paper_tables(results))
+    first = markdown(paper_tables(text)[:1])
+    assert "(published)" not in first and "Prompts: text." in first

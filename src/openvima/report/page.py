@@ -57,7 +57,7 @@ def write_report(
         clips: Recorded episodes.
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
-        with_published: Whether to show published numbers of the same tasks.
+        with_published: Whether to show published numbers of the same tasks, unless prompts have another form.
 
     Returns:
         The file.
@@ -68,6 +68,7 @@ def write_report(
     """
     if comparisons is None:
         comparisons = compare_pairs(results, default_pairs(results))
+    with_published = with_published and published.is_comparable(results)
     records = [*([metrics] if metrics else []), *runs]
     page = render_page(
         "report",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
-from openvima.report.published import leading_models, published_coverage, published_rows
+from openvima.report.published import is_comparable, leading_models, published_coverage, published_rows
 from openvima.report.text import ablation_name, counted
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
@@ -82,7 +82,7 @@ def paper_tables(
     Args:
         results: The evaluation.
         comparisons: Policies to compare.
-        published: Whether to add published level means, over the same tasks.
+        published: Whether to add published level means of the same tasks, unless prompts have another form.
     """
     means = results.means()
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
@@ -130,7 +130,8 @@ def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
         f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
         f"{_made_of(results)}"
     )
-    elsewhere = published_rows(results, leading_models(), keep_marks=False) if published else []
+    comparable = published and is_comparable(results)
+    elsewhere = published_rows(results, leading_models(), keep_marks=False) if comparable else []
     if elsewhere:
         for number, (name, cells) in enumerate(elsewhere):
             lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))
@@ -220,7 +221,9 @@ def _made_of(results: Results, policy: str | None = None) -> str:
     """Say how many episodes a number is made of."""
     rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
     episodes = sorted({row.episodes for row in rows})
-    return f"{episodes[0]:,} to " * (len(episodes) > 1) + f"{counted(episodes[-1], 'episode')} a task."
+    prompts = "" if is_comparable(results) else f" Prompts: {results.config['prompts']}."
+    number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
+    return f"{number} a task.{prompts}"
 
 
 def _markdown_table(table: Table) -> str:

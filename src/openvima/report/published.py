@@ -7,6 +7,7 @@ from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
+from openvima.tasks.prompts import MULTIMODAL
 
 # The only model whose success by task was published for all levels.
 BESIDE = ("VIMA", "200M")
@@ -86,6 +87,11 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
     by_task = (model.model, model.size, model.data_fraction) == (*BESIDE, 1)
     known = by_task and tasks and rates.keys() >= set(tasks)
     return sum(rates[task] for task in tasks) / len(tasks) if known else None
+
+
+def is_comparable(results: Results) -> bool:
+    """Whether prompts have the published form; success with others is another quantity."""
+    return results.config.get("prompts", MULTIMODAL) == MULTIMODAL
 
 
 def published_rows(
