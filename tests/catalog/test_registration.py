@@ -23,23 +23,15 @@ from openvima.catalog import (
 from openvima.catalog.geometry import CollisionHull
 from openvima.catalog.original import OriginalAssets
 from openvima.errors import AssetError, ConfigError, LevelError, ShapeError, UnknownObjectError
-from user_shapes import CORNERS, TRIANGLES
+from user_shapes import CORNERS, TRIANGLES, boxes, restored_assets
 
 SIZE = (0.06, 0.04, 0.02)
 
 
 @pytest.fixture(autouse=True)
 def restored() -> Iterator[None]:
-    tables: list[dict[Any, Any]] = [
-        registration._ENTRIES,
-        registration.REGISTERED_OBJECTS,
-        registration.REGISTERED_TEXTURES,
-    ]
-    before = [dict(table) for table in tables]
-    yield
-    for table, content in zip(tables, before, strict=True):
-        table.clear()
-        table.update(content)
+    with restored_assets():
+        yield
 
 
 def register_brick(name: str = "brick", **changes: Any) -> None:
@@ -83,10 +75,10 @@ def test_an_inverted_mesh_is_turned_inside_out() -> None:
 
 
 def test_the_bodies_of_a_hollow_are_those_of_its_collision_mesh(tmp_path: Path) -> None:
-    raised = CORNERS + np.array((0, 0, 0.5))
-    arrays = np.concatenate([CORNERS, raised]), np.concatenate([TRIANGLES, TRIANGLES + 8])
+    arrays = boxes(((0, 0, 0), (3, 2, 1)), ((0, 0, 0.5), (3, 2, 1.5)))
     file = tmp_path / "parts.obj"
-    file.write_text(f"o floor\n{obj_text()}\no wall\n{obj_text(raised, TRIANGLES + 8)}\n")
+    upper = obj_text(arrays[0][8:], TRIANGLES + 8)
+    file.write_text(f"o floor\n{obj_text()}\no wall\n{upper}\n")
     for number, collision in enumerate((file, arrays)):
         register_brick(f"tray {number}", collision=collision)
         assert len(load_assets().geometry(f"tray {number}", SIZE).collision) == 2

@@ -47,6 +47,7 @@ class ObjectSpec:
         kit_scale: Scale s of a kit object: a nominal width of 0.08 s and a height of 0.02 s; None otherwise.
         aliases: Other names for paraphrased instructions; not valid names.
         novel_names: Further names that no task uses yet.
+        container: Registered as something to put others into.
     """
 
     name: str
@@ -64,6 +65,7 @@ class ObjectSpec:
     kit_scale: float | None = None
     aliases: tuple[str, ...] = ()
     novel_names: tuple[str, ...] = ()
+    container: bool = False
 
 
 def _fixed_size(

@@ -43,7 +43,6 @@ class _Entry:
     image: np.ndarray | None = None
     tasks: tuple[str, ...] = ()
     levels: tuple[Level, ...] = ()
-    container: bool = False
 
 
 _ENTRIES: dict[tuple[str, str], _Entry] = {}  # by "object" or "texture", and name
@@ -82,7 +81,7 @@ def register_object(
         double_sided: Draw both sides of a mesh that is not closed.
         mass_kg: Mass.
         friction: Coulomb friction against the table.
-        container: Others are put into it: it is a base of the pools of `tasks`, fixed to the table.
+        container: Others are put into it: it is a base of the pools of `tasks`, and fixed to the table.
         tasks: Tasks of your own to whose pools it is added, not published ones. A task file may also name it
             in its pools directly.
         levels: Levels of these pools.
@@ -126,11 +125,12 @@ def register_object(
         mass_kg=float(mass_kg),
         friction=float(friction),
         aliases=tuple(aliases),
+        container=container,
     )
     arrays = (user_mesh.visual.vertices, user_mesh.visual.normals, user_mesh.visual.uvs, *user_mesh.parts)
     pools = (tuple(tasks), tuple(levels))
-    digest = _digest(repr((spec, pools, container)), *arrays)
-    entry = _Entry(digest, mesh=user_mesh, tasks=pools[0], levels=pools[1], container=container)
+    digest = _digest(repr((spec, pools)), *arrays)
+    entry = _Entry(digest, mesh=user_mesh, tasks=pools[0], levels=pools[1])
     if _is_new("object", name, entry):
         REGISTERED_OBJECTS[name] = spec
     return spec
@@ -191,7 +191,7 @@ def with_registered(pool: Pool, task: str, level: Level) -> Pool:
     added = {n: entry for n, entry in entries.items() if task in entry.tasks and level in entry.levels}
     if not added:
         return pool
-    bases = [name for name, entry in added.items() if entry.container]
+    bases = [name for name in added if REGISTERED_OBJECTS[name].container]
     others = [name for name in added if name not in bases]
     return replace(
         pool,

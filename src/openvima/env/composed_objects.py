@@ -160,12 +160,13 @@ def add_object(table: TableSampler, given: SceneObject, handles: Mapping[str, Pl
 
 def put(table: TableSampler, given: SceneObject, *, on_top: bool = False) -> Placement:
     """Place an object at rest on the table, or on top of the objects below."""
+    spec = object_spec(given.object)
     return table.add(
         given.object,
         given.texture,
-        size=object_spec(given.object).size_max,
+        size=spec.size_max,
         pose=Pose.planar(*given.position, math.radians(given.yaw_deg)),
-        fixed=given.object in FIXED_OBJECTS if given.fixed is None else given.fixed,
+        fixed=(given.object in FIXED_OBJECTS or spec.container) if given.fixed is None else given.fixed,
         scale=(given.scale, given.scale, given.scale),
         on_top=on_top,
     )

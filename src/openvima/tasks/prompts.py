@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from openvima.catalog import NEUTRAL_TEXTURE, OBJECTS
+from openvima.catalog.objects import REGISTERED_OBJECTS
 from openvima.errors import ConfigError, PromptError, echo, unknown_name
 from openvima.scene import ObjectImage, ObjectRecord, Placement, Prompt, RenderedPrompt, Scene
 
@@ -107,7 +108,7 @@ def _nouns(
 
 
 def _names(item: Placement | ObjectRecord) -> tuple[str, ...]:
-    spec = OBJECTS.get(item.object)
+    spec = OBJECTS.get(item.object) or REGISTERED_OBJECTS.get(item.object)
     return (item.object, *(spec.aliases if spec else ()))
 
 
