@@ -7,6 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = {
     "compose": "compose_a_scene",
+    "explain": "explain_a_decision",
     "observations": "joints_and_depth",
     "prompts": "language_prompts",
     "your_own_objects": "custom_object",

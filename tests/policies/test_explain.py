@@ -9,9 +9,9 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import PolicyError  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.explanation import Explanation, bin_positions  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.render import TOP, unproject  # noqa: E402
+from openvima.scene.explanation import Explanation, bin_positions  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 NAMES = ("nano", "small", "nano-bins", "vima-nano")
@@ -87,8 +87,8 @@ def check_pointers(explanation: Explanation) -> None:
     def turned(vector, yaw):
         return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ vector
 
-    for chances in (explanation.objects, explanation.places):
-        assert sum(each.probability for each in chances) == pytest.approx(1)
+    for probabilities in (explanation.objects, explanation.places):
+        assert sum(each.probability for each in probabilities) == pytest.approx(1)
     assert explanation.yaw_probabilities.sum() == pytest.approx(1)
     picked = max(explanation.objects, key=lambda each: each.probability)
     np.testing.assert_allclose(picked.grasp, explanation.action["pose0_position"], atol=1e-6)
@@ -130,8 +130,8 @@ def test_sampled_choices_are_explained_as_they_were_drawn(demos) -> None:
     for action, explanation in zip(actions[:3], explanations[:3], strict=True):
         grasps = [each.grasp for each in explanation.objects]
         assert any(np.allclose(grasp, action["pose0_position"], atol=1e-6) for grasp in grasps)
-        chances = [each.probability for each in explanation.objects]
-        assert max(chances) - min(chances) < 0.2  # as hot as that nothing is preferred
+        probabilities = [each.probability for each in explanation.objects]
+        assert max(probabilities) - min(probabilities) < 0.2  # as hot as that nothing is preferred
 
 
 def test_the_bundled_policy_attends_to_what_it_picks_and_to_where_it_goes() -> None:

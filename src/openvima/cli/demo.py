@@ -21,6 +21,7 @@ def main(
     device: str = "cpu",
     boxes: str | None = None,
     trust_code: bool = False,
+    explain: bool = False,
 ) -> int:
     """Record one episode: the prompt above, the table and the arm below.
 
@@ -45,6 +46,8 @@ def main(
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
         trust_code: Run the code that a run folder names, as that of a learner of your own does.
+        explain: Draw beside the video what the policy considers at each step: probabilities of objects,
+            places and rotations, and attention to the prompt. For openvima-small, nano, small and vima-*.
 
     Returns:
         Exit status; it does not tell whether the task was solved.
@@ -76,6 +79,7 @@ def main(
             device=device,
             boxes=boxes or "",
             trust_code=trust_code,
+            explain=explain,
         )
     assert task is not None  # as checked
     env_config = EnvConfig(assets, compat, difficulty, prompts)
@@ -93,7 +97,7 @@ def main(
     )
     env = env_config.make(task, level, domain="user", realtime=True)
     title = f"{task} · {level} · seed {seed} · {Path(policy).name}"
-    outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title)
+    outcome = record_episode(env, load_rollout_policy(batch), seed, out, title=title, explain=explain)
     ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
     steps = "1 step" if outcome.steps == 1 else f"{outcome.steps} steps"
     print(f"{out}: {task}, seed {seed}, by {policy}: {ended}; {steps}")

@@ -15,6 +15,7 @@ from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout import play as roll_out
 from openvima.evaluation.rollout_policies import (
     Decision,
+    Explainer,
     Observation,
     PromptedRolloutPolicy,
     RolloutPolicy,
@@ -64,6 +65,7 @@ def play(
     boxes: str = "",
     trust_code: bool = False,
     title: str | None = None,
+    explain: bool = False,
 ) -> PlayResult:
     """Play one episode, composed or sampled.
 
@@ -79,6 +81,7 @@ def play(
         boxes: Detector instead of the true boxes, as for `openvima demo --boxes`; only with a name.
         trust_code: Run the code that a run folder names.
         title: Caption of the video; by default task and policy.
+        explain: Draw what the policy considered beside the video.
 
     Returns:
         Actions, outcome and final scene.
@@ -105,7 +108,7 @@ def play(
     else:
         name = policy if isinstance(policy, str) else type(policy).__name__
         caption = f"{episode.task} · {Path(name).name}" if title is None else title
-        ended = record_episode(env, watcher, episode, Path(video), title=caption)
+        ended = record_episode(env, watcher, episode, Path(video), title=caption, explain=explain)
     return PlayResult(
         episode,
         watcher.actions(ended.steps),
@@ -145,6 +148,10 @@ class _Watcher:
     def near_ties(self) -> Sequence[bool]:
         """Return those of the policy."""
         return self._policy.near_ties()
+
+    def explainer(self) -> Explainer:
+        """Return that of the policy."""
+        return self._policy.explainer()
 
 
 def _load(

@@ -1,5 +1,6 @@
 """Rolling out single episodes on video, or as one image of start and end."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,12 @@ from PIL import Image, ImageDraw
 
 from openvima.atomic_io import atomic_write_file
 from openvima.env.tabletop import TabletopEnv
+from openvima.errors import PolicyError
 from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import begin_episode, play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, RolloutPolicy
 from openvima.scene import Episode
+from openvima.scene.explanation import Explanation
 from openvima.video.clips import png
 from openvima.video.prompt_strip import MUTED, PAPER, draw_prompt_strip, font
 from openvima.video.recorder import ENLARGE, EpisodeRecorder, SceneRenderer
@@ -27,6 +30,7 @@ def record_episode(
     title: str = "",
     with_prompt: bool = True,
     enlarge: int = ENLARGE,
+    explain: bool = False,
 ) -> EpisodeOutcome:
     """Roll out one episode and record it in real time.
 
@@ -38,15 +42,35 @@ def record_episode(
         title: Caption below the scene; no caption if empty.
         with_prompt: Whether to draw the prompt above the scene.
         enlarge: Factor on the benchmark's images.
+        explain: Whether to draw what the policy considered beside the scene, at the default size.
 
     Returns:
         How the episode ended.
+
+    Raises:
+        PolicyError: The policy explains nothing.
     """
+    explainer = _explainer(policy) if explain else None
     begin_episode(env, start)
-    with EpisodeRecorder(env, path, title=title, with_prompt=with_prompt, enlarge=enlarge) as recorder:
+    with EpisodeRecorder(
+        env, path, title=title, with_prompt=with_prompt, enlarge=enlarge, explain=explainer
+    ) as recorder:
         (outcome,) = play([env], [start], policy, after_step=recorder.record_step)
         recorder.record_outcome(outcome.success if env.episode.problem.goals else None, outcome.steps)
     return outcome
+
+
+def _explainer(policy: RolloutPolicy) -> Callable[[], Explanation]:
+    """Return the function that explains the last action in the only episode of a policy."""
+    explain_all = policy.explainer()
+
+    def explain() -> Explanation:
+        (explanation,) = explain_all()
+        if explanation is None:
+            raise PolicyError("explain() of the policy returned None for an episode that goes on.")
+        return explanation
+
+    return explain
 
 
 def save_episode_image(

@@ -1,7 +1,7 @@
 """Rollout policies: the oracle, which reads the environment, and policies, which read observations."""
 
 import importlib.util
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Protocol
@@ -12,15 +12,18 @@ from openvima.errors import OpenVimaError, OracleError, PolicyError
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.policies.base import POLICIES_THAT_EXPLAIN
 from openvima.policies.own_code import checked_policy
 from openvima.policies.sources import is_own_code
 from openvima.scene import Action
+from openvima.scene.explanation import Explanation
 from openvima.serving.client import RemotePolicy
 from openvima.serving.protocol import is_remote
 from openvima.user_code import described
 
 _MAX_SEEDS = 16  # that an error lists
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
+Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
 Decision = Mapping[str, Any] | Action | OracleError | None
 
 
@@ -42,6 +45,14 @@ class RolloutPolicy(Protocol):
         """Say of each environment whether rounding may have chosen its last action; empty if not known."""
         ...
 
+    def explainer(self) -> Explainer:
+        """Return what explains the last actions.
+
+        Raises:
+            PolicyError: Nothing does.
+        """
+        ...
+
 
 class OracleRolloutPolicy:
     """The scripted oracle, which knows the scene."""
@@ -61,6 +72,10 @@ class OracleRolloutPolicy:
     def near_ties(self) -> Sequence[bool]:
         """Return nothing: the oracle has no scores."""
         return ()
+
+    def explainer(self) -> Explainer:
+        """Raise an error: the oracle reads the scene."""
+        raise PolicyError(f"the oracle has no explain(). {POLICIES_THAT_EXPLAIN}")
 
 
 class PromptedRolloutPolicy:
@@ -138,6 +153,18 @@ class PromptedRolloutPolicy:
             raise
         except Exception as error:
             raise PolicyError(f"{self._name} raised {described(error)}, in {_episodes(envs)}.") from error
+
+    def explainer(self) -> Explainer:
+        """Return the method with which the policy explains its last actions.
+
+        Raises:
+            PolicyError: It has none.
+        """
+        explain = getattr(self._policy, "explain", None)
+        if explain is None:
+            kind = type(self._policy).__name__
+            raise PolicyError(f"a policy of kind {kind} has no explain(). {POLICIES_THAT_EXPLAIN}")
+        return explain
 
     def near_ties(self) -> Sequence[bool]:
         """Return those of the policy, if it reports any, as `NetworkPolicy` does."""

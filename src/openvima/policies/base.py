@@ -21,7 +21,7 @@ class Policy(Protocol):
     """Anything that maps prompt and history to actions, for several episodes at once.
 
     Optional: `modalities` names what observations hold, as `TabletopEnv` takes it; evaluations provide that.
-    `explain()`, called after `act`, returns an `openvima.policies.explanation.Explanation` for each episode,
+    `explain()`, called after `act`, returns an `openvima.scene.explanation.Explanation` for each episode,
     None for those that have ended; `openvima demo --explain` draws them. Policy servers read two more:
     `new_session()` returns a policy with episodes of its own, and `prompt_limits` is its `PromptLimits`.
     """

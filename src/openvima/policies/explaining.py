@@ -1,5 +1,6 @@
 """Explanations of a network's last step, out of its trace."""
 
+import math
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -8,7 +9,6 @@ import torch
 from openvima.perception.objects import ObjectViews
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.batch import WORD, PromptBatch
-from openvima.policies.explanation import Explanation, ObjectProbability, PlaceProbability
 from openvima.policies.nn.actions import ACTION_PARTS
 from openvima.policies.nn.step_trace import StepTrace
 from openvima.policies.pointer.candidates import KINDS
@@ -17,6 +17,7 @@ from openvima.policies.pointer.geometry import bin_to_yaw
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
 from openvima.scene import RenderedPrompt
+from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
 from openvima.video.prompt_strip import prompt_pieces
 
 COMPONENTS = tuple(
@@ -76,7 +77,8 @@ def explain_row(
             for index, (x, y) in enumerate(trace.positions_BC2[row].tolist())
             if trace.masks_BC[row, index]
         ),
-        bin_to_yaw(torch.arange(len(yaws)), len(yaws), torch.float64).numpy(),
+        (bin_to_yaw(torch.arange(len(yaws)), len(yaws), torch.float64).numpy() + math.pi) % (2 * math.pi)
+        - math.pi,
         yaws,
     )
 

@@ -16,13 +16,13 @@ from openvima.policies.base import POLICIES_THAT_EXPLAIN, Policy, prompt_hash
 from openvima.policies.batch import HistoryBatch
 from openvima.policies.checkpoint import load_network, save_checkpoint
 from openvima.policies.devices import usable_device
-from openvima.policies.explanation import Explanation
 from openvima.policies.nn.actions import ACTION_PARTS, ACTION_WIDTH, DecodingStrategy, greedy, sampling
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import PROMPT_LIMITS, Processor
 from openvima.policies.t5 import tokenizer_for
 from openvima.policies.tokenizer import Tokenizer
 from openvima.scene import RenderedPrompt
+from openvima.scene.explanation import Explanation
 
 # Pairs of tokens within a prompt, over a padded batch: 16 prompts of 256 tokens, 64 of 128. Attention scores
 # take memory for each.

@@ -1,5 +1,7 @@
 """Multimodal prompts as images for people: words and thumbnails in reading order."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,6 +20,7 @@ EDGE: Colour = (208, 213, 220)
 MUTED: Colour = (91, 100, 114)
 _CLOSING = ".,;:!?)"  # no space before these
 _ENLARGE = 4  # supersampling of thumbnails
+_ROW_HEIGHT = 18  # pixels of a row of attention
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,7 @@ def draw_prompt_strip(
     font_size: int = 22,
     paper: Colour = PAPER,
     ink: Colour = INK,
+    weights: Sequence[tuple[Colour, np.ndarray]] = (),
 ) -> np.ndarray:
     """Draw a prompt as a strip of words and thumbnails, wrapped to a width.
 
@@ -78,6 +82,8 @@ def draw_prompt_strip(
         font_size: Font size in pixels.
         paper: Background colour.
         ink: Text colour.
+        weights: Attention to draw below the words and images, one row each: its colour, and a weight from 0
+            to 1 for each piece; one more weight stands for the end of the prompt.
 
     Returns:
         Shape (height, `width`, 3), uint8; the height is even and follows from the number of lines.
@@ -85,12 +91,15 @@ def draw_prompt_strip(
     margin = max(6, font_size // 2)
     typeface = font(font_size)
     pieces = [_piece(part, image_height, typeface, font_size) for part in prompt_pieces(prompt)]
+    if any(len(row) > len(pieces) for _, row in weights):
+        pieces.append(_piece("(end)", image_height, typeface, font_size))
     lines = _wrap(_fitting(pieces, width - 2 * margin), width - 2 * margin)
     heights = [max(piece.height for piece in line) for line in lines]
-    total = sum(heights) + margin * (len(lines) + 1)
+    attended = _ROW_HEIGHT * len(weights) + (4 if weights else 0)
+    total = sum(heights) + margin * (len(lines) + 1) + attended * len(lines)
     strip = Image.new("RGB", (width, total + total % 2), paper)
     draw = ImageDraw.Draw(strip)
-    top = margin
+    top, number = margin, 0
     for line, height in zip(lines, heights, strict=True):
         left = margin
         for index, piece in enumerate(line):
@@ -100,9 +109,28 @@ def draw_prompt_strip(
                 draw.text((left, middle), piece.content, font=typeface, fill=ink, anchor="lm")
             else:
                 strip.paste(piece.content, (left, middle - piece.height // 2))
+            for row, (colour, shares) in enumerate(weights):
+                corner = (left, top + height + 4 + _ROW_HEIGHT * row)
+                _draw_weight(draw, corner, piece.width, colour, float(shares[number]))
             left += piece.width
-        top += height + margin
+            number += 1
+        top += height + margin + attended
     return np.asarray(strip)
+
+
+def _draw_weight(
+    draw: ImageDraw.ImageDraw, corner: tuple[int, int], width: int, colour: Colour, weight: float
+) -> None:
+    """Draw a weight as a box, the darker the larger, with its percentage where there is space."""
+    left, top = corner
+    shade = math.sqrt(min(max(weight, 0.0), 1.0))  # small weights stay visible
+    fill = tuple(round(255 + (part - 255) * shade) for part in colour)
+    draw.rectangle((left, top, left + width - 1, top + _ROW_HEIGHT - 3), fill=fill)
+    text, typeface = f"{100 * weight:.0f} %", font(12, bold=True)
+    if weight >= 0.01 and typeface.getlength(text) <= width:
+        ink = PAPER if shade > 0.6 else INK
+        middle = (left + width / 2, top + _ROW_HEIGHT / 2 - 1)
+        draw.text(middle, text, font=typeface, fill=ink, anchor="mm")
 
 
 @cache

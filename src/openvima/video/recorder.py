@@ -1,6 +1,8 @@
 """Recording an episode: the prompt as a strip, below it the front view with the arm, below it a caption."""
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +11,17 @@ from PIL import Image, ImageDraw
 from openvima.env.tabletop import FRAMES_PER_SECOND, TabletopEnv, VideoFrame
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Scene
+from openvima.scene.explanation import Explanation
 from openvima.sim.arm_view import arm_drawables
 from openvima.sim.ur5 import HOME
 from openvima.video.encoder import VideoWriter
-from openvima.video.prompt_strip import MUTED, PAPER, Colour, draw_prompt_strip, font
+from openvima.video.explanation import COLOURS, draw_panel
+from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, draw_prompt_strip, font
 
 ENLARGE = 3  # 768 × 384 pixels
 _STILL_START_S, _STILL_END_S = 0.8, 1.4  # time to read the prompt and the outcome
+_STILL_DECISION_S = 1.5  # time to read an explanation
+_GAP = 8  # pixels between scene and explanation
 _GOOD, _BAD = (24, 121, 78), (180, 35, 24)
 
 
@@ -55,6 +61,8 @@ class EpisodeRecorder:
         title: Caption below the scene; no caption if empty.
         with_prompt: Whether to draw the prompt above the scene.
         enlarge: Factor on the benchmark's images.
+        explain: How the policy explains its last action; its explanation is drawn beside the scene, which is
+            then 768 pixels wide, and attention below the prompt. None leaves both out.
     """
 
     def __init__(
@@ -65,18 +73,34 @@ class EpisodeRecorder:
         title: str = "",
         with_prompt: bool = True,
         enlarge: int = ENLARGE,
+        explain: Callable[[], Explanation] | None = None,
     ) -> None:
+        enlarge = enlarge if explain is None else ENLARGE
         self._renderer, self._title, self._width = SceneRenderer(env, enlarge), title, 256 * enlarge
-        self._strip = draw_prompt_strip(env.prompt, width=self._width) if with_prompt else None
+        self._path, self._explain = path, explain
+        self._panel: np.ndarray | None = None
+        self._strip: np.ndarray | None = None
+        self._video: VideoWriter | None = None
         self._last = VideoFrame(env.scene, HOME)
-        first = self._compose(_caption(title, self._width))
-        self._video = VideoWriter(path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND)
-        self._video.write(first, repeat=math.ceil(_STILL_START_S * FRAMES_PER_SECOND))
+        if explain is not None:
+            return  # what the frames hold besides the scene follows from the first explanation
+        if with_prompt:
+            self._strip = draw_prompt_strip(env.prompt, width=self._width)
+        self._start()
 
     def record_step(self, env: TabletopEnv) -> None:
-        """Append the frames of the environment's last step."""
+        """Append the frames of the environment's last step, with an explanation after a still of it."""
+        if self._explain is not None:
+            explanation = self._explain()
+            if self._video is None:
+                nothing = {kind: 0 * row for kind, row in explanation.attention.items()}
+                self._draw_explanation(env, replace(explanation, attention=nothing), is_decided=False)
+                self._start()
+            self._draw_explanation(env, explanation)
+            still = self._compose(_caption(self._title, self._width))
+            self._write(still, _STILL_DECISION_S)
         for self._last in env.frames:
-            self._video.write(self._compose(_caption(self._title, self._width)))
+            self._write(self._compose(_caption(self._title, self._width)))
 
     def record_outcome(self, success: bool | None, steps: int) -> None:
         """Append a still of the last frame with the outcome in the caption; None: without goals."""
@@ -84,17 +108,52 @@ class EpisodeRecorder:
         outcome = taken if success is None else f"solved in {taken}" if success else "not solved"
         colour = MUTED if success is None else _GOOD if success else _BAD
         caption = _caption(self._title, self._width, outcome, colour)
-        self._video.write(self._compose(caption), repeat=math.ceil(_STILL_END_S * FRAMES_PER_SECOND))
+        self._write(self._compose(caption), _STILL_END_S)
 
     def _compose(self, caption: np.ndarray | None) -> np.ndarray:
         scene = self._renderer.draw(self._last.scene, self._last.joints)
+        if self._panel is not None:
+            parts = [scene] if caption is None else [scene, caption]
+            scene, caption = _beside(np.concatenate(parts), self._panel), None
         return np.concatenate([part for part in (self._strip, scene, caption) if part is not None])
+
+    def _draw_explanation(
+        self, env: TabletopEnv, explanation: Explanation, *, is_decided: bool = True
+    ) -> None:
+        """Draw the panel beside the scene, and the strip above both, with attention below the prompt."""
+        self._panel = draw_panel(self._last.scene, env.assets, explanation if is_decided else None)
+        weights = [(COLOURS.get(kind, INK), row) for kind, row in explanation.attention.items()]
+        if not explanation.bins:  # policies that point attend to objects and their names, never to the end
+            weights = [(colour, row[:-1]) for colour, row in weights]
+        width = self._width + _GAP + self._panel.shape[1]
+        self._strip = draw_prompt_strip(env.prompt, width=width, weights=weights)
+
+    def _start(self) -> None:
+        """Open the video, and write a still of the start."""
+        first = self._compose(_caption(self._title, self._width))
+        self._video = VideoWriter(
+            self._path, first.shape[1], first.shape[0], frames_per_second=FRAMES_PER_SECOND
+        )
+        self._video.write(first, repeat=math.ceil(_STILL_START_S * FRAMES_PER_SECOND))
+
+    def _write(self, frame: np.ndarray, seconds: float = 0.0) -> None:
+        assert self._video is not None, "record_step comes first"
+        self._video.write(frame, repeat=max(1, math.ceil(seconds * FRAMES_PER_SECOND)))
 
     def __enter__(self) -> "EpisodeRecorder":
         return self
 
     def __exit__(self, *exception) -> None:
-        self._video.__exit__(*exception)
+        if self._video is not None:
+            self._video.__exit__(*exception)
+
+
+def _beside(scene: np.ndarray, panel: np.ndarray) -> np.ndarray:
+    """Put the panel right of the scene, both from the top, on white."""
+    both = np.full((max(len(scene), len(panel)), scene.shape[1] + _GAP + panel.shape[1], 3), 255, np.uint8)
+    both[: len(scene), : scene.shape[1]] = scene
+    both[: len(panel), scene.shape[1] + _GAP :] = panel
+    return both
 
 
 def _caption(title: str, width: int, outcome: str = "", colour: Colour = MUTED) -> np.ndarray | None:

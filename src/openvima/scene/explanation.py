@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW
+from openvima.scene.action import WORKSPACE_HIGH, WORKSPACE_LOW
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Explanation:
             point, "decoder" (mean over the heads of the last layer) for policies over bins.
         objects: The objects in view.
         places: The place candidates.
-        yaw_rad: Rotations to choose from, counter-clockwise seen from above, shape (R,).
+        yaw_rad: Rotations to choose from, counter-clockwise seen from above, −π up to π, shape (R,).
         yaw_probabilities: How probable each was, given object and place, shape (R,).
         bins: Component of the action, such as "pose0_position.x", to the probabilities of its bins. With an
             autoregressive head they are given the components before.

@@ -1,0 +1,286 @@
+"""Explanations as images for people: what a policy considered, over the table as the top camera sees it.
+
+Orange stands for the pick, blue for the place. The prompt's shading is drawn by `prompt_strip`.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from openvima.catalog.geometry import Assets
+from openvima.render import TOP, channels_last, project
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Scene
+from openvima.scene.explanation import Explanation, ObjectProbability, PlaceProbability
+from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, font
+
+ENLARGE = 2
+WIDTH, HEIGHT = TOP.width * ENLARGE, TOP.height * ENLARGE + 160  # pixels of a panel
+PICK: Colour = (214, 96, 0)
+PLACE: Colour = (0, 104, 201)
+COLOURS: dict[str, Colour] = {"pick": PICK, "place": PLACE, "decoder": (104, 64, 160)}
+_LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
+_SAME_PLACE_M = 0.02  # candidates this near to each other are drawn as one
+_LEAST_FULL_BAR = 0.1  # a distribution without a higher peak does not fill its histogram
+_HOT = 0.02  # probability of a cell of the heat map that is drawn in full colour
+_KINDS = {
+    "first step": "as at the start",
+    "prompt": "as in the prompt",
+    "grid": "free spot",
+}
+
+
+def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) -> np.ndarray:
+    """Draw what a policy considered in a scene.
+
+    Args:
+        scene: The scene before the action.
+        assets: Asset pack of the objects.
+        explanation: What it considered; None before the first decision.
+
+    Returns:
+        Shape (`HEIGHT`, `WIDTH`, 3), uint8: the table from above, below it the most probable choices.
+    """
+    image = Rasteriser(assets).scene(scene, views=("top",), enlarge=ENLARGE)["top"]
+    panel = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    panel[: TOP.height * ENLARGE] = channels_last(image.rgb)
+    if explanation is not None and explanation.bins:
+        _tint_heat_maps(panel, explanation)
+    elif explanation is not None:
+        _tint_objects(panel, image.segm, explanation.objects)
+    canvas = Image.fromarray(panel)
+    draw = ImageDraw.Draw(canvas)
+    if explanation is None:
+        draw.text((12, HEIGHT - 96), "before the first decision", font=font(15), fill=MUTED, anchor="lm")
+        return np.asarray(canvas)
+    places = _merged(explanation.places)
+    for place in reversed(places):
+        _draw_place(draw, place)
+    _draw_action(draw, explanation)
+    _draw_labels(draw, explanation.objects, places)
+    whose = "the decoder's last layer" if explanation.bins else "pick (upper row) and place"
+    legend = f"below the prompt: attention of {whose}"
+    draw.text((12, HEIGHT - 16), legend, font=font(13), fill=MUTED, anchor="lm")
+    top = TOP.height * ENLARGE
+    if explanation.bins:
+        _draw_histograms(draw, explanation, top)
+    else:
+        names = {placement.id: f"{placement.object}, {placement.texture}" for placement in scene.placements}
+        picks = sorted(explanation.objects, key=lambda each: -each.probability)[:3]
+        rows = [(each.probability, names.get(each.object_id, "object")) for each in picks]
+        _draw_choices(draw, (12, top), "pick", rows)
+        rows = [(each.probability, _name_of(each, explanation.objects, names)) for each in places[:3]]
+        _draw_choices(draw, (WIDTH // 2 + 12, top), "place", rows)
+        if len(explanation.yaw_rad):
+            _draw_rotation(draw, explanation, top + 88)
+    return np.asarray(canvas)
+
+
+def _tint_objects(panel: np.ndarray, segm: np.ndarray, objects: Sequence[ObjectProbability]) -> None:
+    """Colour objects by the probability of picking them, and outline them."""
+    for each in sorted(objects, key=lambda each: each.probability):
+        mask = segm == each.object_id
+        if each.object_id < 0:
+            mask = _box_mask(each, segm.shape)
+        inner = mask.copy()
+        for axis in (0, 1):
+            inner &= np.roll(mask, 2, axis) & np.roll(mask, -2, axis)
+        _blend(panel[: len(mask)], PICK, 0.75 * each.probability * mask)
+        _blend(panel[: len(mask)], PICK, (each.probability >= _LEAST_SHOWN) * (mask & ~inner))
+
+
+def _box_mask(each: ObjectProbability, shape: tuple[int, ...]) -> np.ndarray:
+    mask = np.zeros(shape, bool)
+    if "top" in each.boxes:
+        x, y, height, width = (ENLARGE * value for value in each.boxes["top"])
+        mask[y - height // 2 : y + height // 2, x - width // 2 : x + width // 2] = True
+    return mask
+
+
+def _tint_heat_maps(panel: np.ndarray, explanation: Explanation) -> None:
+    """Colour the table by the probabilities of both positions."""
+    rows, columns = np.indices((TOP.height * ENLARGE, WIDTH))
+    for pose, colour in (("pose0", PICK), ("pose1", PLACE)):
+        heat = explanation.heat_map(pose)
+        x = 0.25 + 0.5 * np.arange(len(heat) + 1) / len(heat)
+        y = -0.5 + np.arange(heat.shape[1] + 1) / heat.shape[1]
+        edge_rows = project(np.stack([x, np.zeros_like(x), np.zeros_like(x)], -1), TOP)[:, 1] * ENLARGE
+        edge_columns = project(np.stack([np.full_like(y, 0.5), y, np.zeros_like(y)], -1), TOP)[:, 0] * ENLARGE
+        i, j = np.searchsorted(edge_rows, rows) - 1, np.searchsorted(edge_columns, columns) - 1
+        is_inside = (i >= 0) & (i < len(heat)) & (j >= 0) & (j < heat.shape[1])
+        probabilities = np.where(is_inside, heat[i.clip(0, len(heat) - 1), j.clip(0, heat.shape[1] - 1)], 0)
+        _blend(panel[: len(rows)], colour, 0.8 * np.sqrt(np.minimum(probabilities / _HOT, 1)))
+
+
+def _blend(image: np.ndarray, colour: Colour, alpha: np.ndarray) -> None:
+    weight = np.asarray(alpha, np.float64)[..., None]
+    image[:] = np.rint(image * (1 - weight) + np.array(colour) * weight)
+
+
+def _merged(places: Sequence[PlaceProbability]) -> list[PlaceProbability]:
+    """Join candidates at one place under the most probable one's kind, the most probable first."""
+    joined: list[PlaceProbability] = []
+    for each in sorted(places, key=lambda each: -each.probability):
+        for index, other in enumerate(joined):
+            if math.dist(each.position, other.position) < _SAME_PLACE_M:
+                total = each.probability + other.probability
+                joined[index] = PlaceProbability(other.kind, other.position, total)
+                break
+        else:
+            joined.append(each)
+    return sorted(joined, key=lambda each: -each.probability)
+
+
+def _pixel(position: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    column, row = ENLARGE * project(np.array([float(position[0]), float(position[1]), 0.0]), TOP)
+    return float(column), float(row)
+
+
+def _draw_place(draw: ImageDraw.ImageDraw, place: PlaceProbability) -> None:
+    x, y = _pixel(place.position)
+    radius = 3 + 8 * math.sqrt(place.probability)
+    shown = place.probability >= _LEAST_SHOWN
+    for grow, colour in ((2, (255, 255, 255)), (0, PLACE if shown else (150, 180, 210))):
+        size = radius + grow
+        if shown or not grow:
+            draw.ellipse((x - size, y - size, x + size, y + size), outline=colour, width=3 if shown else 1)
+
+
+def _draw_action(draw: ImageDraw.ImageDraw, explanation: Explanation) -> None:
+    """Draw an arrow from pick to place, or around a point where the object is only rotated."""
+    start, end = (_pixel(explanation.action[f"{pose}_position"]) for pose in ("pose0", "pose1"))
+    yaw = _yaw(explanation.action["pose1_rotation"]) - _yaw(explanation.action["pose0_rotation"])
+    yaw = (yaw + math.pi) % (2 * math.pi) - math.pi
+    if math.dist(start, end) >= 24:
+        points = [start, end]
+    elif abs(yaw) > 0.01:
+        side = math.pi if start[0] > WIDTH - 60 else 0.0  # labels are above and below
+        angles = np.linspace(side + yaw / 2, side - yaw / 2, 24)  # rows count downwards
+        points = [(start[0] + 48 * math.cos(a), start[1] + 48 * math.sin(a)) for a in angles]
+    else:
+        return
+    tip, before = np.array(points[-1]), np.array(points[-2])
+    forward = (tip - before) / np.linalg.norm(tip - before)
+    side = np.array([-forward[1], forward[0]])
+    neck = tip - 14 * forward
+    shaft = [points[0], tuple(neck)] if len(points) == 2 else points[:-1]
+    for colour, border in ((INK, 2), (PAPER, 0)):  # a white arrow with a dark border
+        draw.line([(float(x), float(y)) for x, y in shaft], fill=colour, width=4 + 2 * border, joint="curve")
+        wide = 7 + 1.5 * border
+        head = [tip + 2 * border * forward, neck - border * forward + wide * side]
+        head.append(neck - border * forward - wide * side)
+        draw.polygon([(float(x), float(y)) for x, y in head], fill=colour)
+
+
+def _yaw(quaternion: np.ndarray) -> float:
+    x, y, z, w = (float(value) for value in quaternion)
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _draw_labels(
+    draw: ImageDraw.ImageDraw, objects: Sequence[ObjectProbability], places: Sequence[PlaceProbability]
+) -> None:
+    for each in objects:
+        if each.probability >= _LEAST_SHOWN and "top" in each.boxes:
+            x, y, height, _ = (ENLARGE * value for value in each.boxes["top"])
+            row = y - height / 2 - 2 if y - height / 2 > 20 else y + height / 2 + 20
+            _label(draw, (x, row), each.probability, PICK, "md")
+    for place in places:
+        if place.probability >= _LEAST_SHOWN:
+            x, y = _pixel(place.position)
+            row, anchor = (y + 13, "ma") if y < TOP.height * ENLARGE - 34 else (y - 13, "md")
+            _label(draw, (x, row), place.probability, PLACE, anchor)
+
+
+def _label(
+    draw: ImageDraw.ImageDraw, at: tuple[float, float], probability: float, colour: Colour, anchor: str
+) -> None:
+    text = percent(probability)
+    x = min(max(at[0], 26), WIDTH - 26)
+    draw.text(
+        (x, at[1]),
+        text,
+        font=font(16, bold=True),
+        fill=colour,
+        anchor=anchor,
+        stroke_width=3,
+        stroke_fill=PAPER,
+    )
+
+
+def percent(probability: float) -> str:
+    """Return a probability in percent, as a label."""
+    return f"{100 * probability:.0f} %"
+
+
+def _name_of(place: PlaceProbability, objects: Sequence[ObjectProbability], names: dict[int, str]) -> str:
+    """Return what is at a place candidate, in words."""
+    if place.kind != "in view":
+        return _KINDS[place.kind]
+    x, y = _pixel(place.position)
+    near = [each for each in objects if "top" in each.boxes]
+    if not near:
+        return "object in view"
+    nearest = min(near, key=lambda each: math.dist((x / ENLARGE, y / ENLARGE), each.boxes["top"][:2]))
+    return names.get(nearest.object_id, "object in view")
+
+
+def _draw_choices(
+    draw: ImageDraw.ImageDraw, corner: tuple[int, int], kind: str, rows: Sequence[tuple[float, str]]
+) -> None:
+    left, top = corner
+    draw.text((left, top + 14), kind, font=font(15, bold=True), fill=COLOURS[kind], anchor="lm")
+    for number, (probability, name) in enumerate(rows):
+        y = top + 34 + 19 * number
+        draw.rectangle((left + 48, y - 6, left + 48 + 40 * probability, y + 6), fill=COLOURS[kind])
+        draw.text((left + 42, y), percent(probability), font=font(13), fill=INK, anchor="rm")
+        draw.text((left + 94, y), _shortened(name, WIDTH // 2 - 112), font=font(13), fill=INK, anchor="lm")
+
+
+def _shortened(text: str, width: int) -> str:
+    while font(13).getlength(text) > width:
+        text = text.removesuffix("…")[:-1] + "…"
+    return text
+
+
+def _draw_rotation(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int) -> None:
+    """Draw the distribution of the rotation, from half a turn clockwise to half a turn counter-clockwise."""
+    yaw, best = explanation.yaw_rad, int(explanation.yaw_probabilities.argmax())
+    angle = round(math.degrees(yaw[best]))
+    direction = "clockwise" if angle < 0 else "counter-clockwise" if angle > 0 else ""
+    text = f"rotation {abs(angle)}° {direction}".rstrip()
+    draw.text((12, top + 12), text, font=font(13, bold=True), fill=PLACE, anchor="lm")
+    probability = percent(explanation.yaw_probabilities[best])
+    draw.text((12, top + 29), probability, font=font(13), fill=INK, anchor="lm")
+    left, right, base = 250, WIDTH - 30, top + 22
+    draw.line((left, base, right, base), fill=MUTED)
+    for value, probability in zip(yaw, explanation.yaw_probabilities, strict=True):
+        x = left + (right - left) * (math.pi - value) / (2 * math.pi)
+        if probability >= _LEAST_SHOWN / 4:
+            draw.rectangle((x - 2, base - 20 * probability, x + 2, base), fill=PLACE)
+    for x, label in ((left, "180°"), ((left + right) / 2, "0°"), (right, "−180°")):
+        draw.text((x, base + 3), label, font=font(12), fill=MUTED, anchor="ma")
+
+
+def _draw_histograms(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int) -> None:
+    """Draw the marginal distribution of every component of the action."""
+    titles = ("x", "y", "qx", "qy", "qz", "qw")
+    width = (WIDTH - 64) // len(titles)
+    for number, probabilities in enumerate(explanation.bins.values()):
+        row, column = divmod(number, len(titles))
+        kind = ("pick", "place")[row]
+        left, base = 60 + width * column, top + 70 + 48 * row
+        if not row:
+            at = (left + width / 2 - 4, top + 10)
+            draw.text(at, titles[column], font=font(13), fill=MUTED, anchor="mm")
+        if not column:
+            draw.text((10, base - 16), kind, font=font(14, bold=True), fill=COLOURS[kind], anchor="lm")
+        bars = width - 12
+        draw.line((left, base, left + bars, base), fill=MUTED)
+        for k, probability in enumerate(probabilities / max(probabilities.max(), _LEAST_FULL_BAR)):
+            x0, x1 = left + bars * k / len(probabilities), left + bars * (k + 1) / len(probabilities) - 1
+            draw.rectangle((x0, base - 24 * probability, max(x0, x1), base), fill=COLOURS[kind])
+        peak = percent(probabilities.max())
+        draw.text((left + bars, base - 27), peak, font=font(12), fill=INK, anchor="rd")
