@@ -231,7 +231,7 @@ def test_published_tasks_keep_their_pools() -> None:
 
 
 def test_an_unknown_object_is_told_how_to_be_registered() -> None:
-    with pytest.raises(UnknownObjectError, match="`register_object` adds one of your own"):
+    with pytest.raises(UnknownObjectError, match="your own need `register_object`"):
         object_spec("brick")
 
 

@@ -15,6 +15,8 @@ from openvima.data import Dataset, GenerateConfig, generate, rerender
 from openvima.data.verification import VerifyConfig, replay, verify
 from openvima.env import EnvConfig, TabletopEnv
 from openvima.errors import AssetError, ConfigError, UnknownObjectError
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.verification import verify_results
 from openvima.scene import AtPose, ObjectImage, Pose, Problem, Prompt, Tolerance
 from openvima.tasks import TableSampler, register_task, registry
 
@@ -81,6 +83,19 @@ def test_a_record_never_runs_code(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [recorded_assets(name) for name in ("procedural", "original")] == ["procedural", "original"]
 
 
+def test_results_never_run_code(tmp_path: Path) -> None:
+    register_bar_task()
+    config = EvaluationConfig(
+        ("oracle",), ("move_bar",), ("train",), 1, out=tmp_path, env_config=EnvConfig(assets=BAR)
+    )
+    evaluate(config)
+    assert verify_results(tmp_path).is_verified  # loaded in this process
+    forget()
+    with pytest.raises(AssetError, match="code that is not run"):
+        verify_results(tmp_path)
+    assert verify_results(tmp_path, assets=BAR).is_verified
+
+
 def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,7 +120,7 @@ def test_demonstrations_of_own_assets_are_read_drawn_anew_and_replayed(
 def test_an_object_that_is_not_registered_is_named_with_the_remedy() -> None:
     register_bar_task()
     env = TabletopEnv("move_bar")
-    with pytest.raises(UnknownObjectError, match=r"no object 'test bar'.*`register_object` adds one"):
+    with pytest.raises(UnknownObjectError, match=r"no object 'test bar'.*your own need `register_object`"):
         env.reset(seed=0)
 
 

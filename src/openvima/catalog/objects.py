@@ -270,7 +270,8 @@ def object_spec(name: str) -> ObjectSpec:
         return OBJECTS.get(name) or REGISTERED_OBJECTS[name]
     except (KeyError, TypeError):
         hint = (
-            "`openvima.catalog.OBJECTS` holds the 31 built-in ones; `register_object` adds one of your own."
+            "`openvima.catalog.OBJECTS` holds the 31 built-in ones; your own need `register_object`, in "
+            "a file of OPENVIMA_TASK_FILES or for --assets."
         )
         known = (*OBJECTS, *REGISTERED_OBJECTS)
         raise UnknownObjectError(unknown_name("object", name, known, hint)) from None

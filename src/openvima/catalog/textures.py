@@ -162,7 +162,8 @@ def texture_spec(name: str) -> TextureSpec:
         return TEXTURES.get(name) or REGISTERED_TEXTURES[name]
     except (KeyError, TypeError):
         hint = (
-            "`openvima.catalog.TEXTURES` holds the 82 built-in ones; `register_texture` adds one of your own."
+            "`openvima.catalog.TEXTURES` holds the 82 built-in ones; your own need `register_texture`, in "
+            "a file of OPENVIMA_TASK_FILES or for --assets."
         )
         known = (*TEXTURES, *REGISTERED_TEXTURES)
         raise UnknownTextureError(unknown_name("texture", name, known, hint)) from None

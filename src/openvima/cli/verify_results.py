@@ -28,7 +28,8 @@ def main(
     Args:
         folder: Folder of an evaluation, with results.json and actions.arrow.
         workers: Number of processes.
-        assets: Folder of the original benchmark's assets, for results obtained with them.
+        assets: Folder of the original benchmark's assets, or FILE.py:FUNCTION, for results obtained with
+            them.
         as_json: Print the result as JSON.
 
     Returns:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.atomic_io import atomic_write_file
+from openvima.catalog.user_assets import recorded_assets
 from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, OpenVimaError, echo
 from openvima.evaluation.actions import ActionReplay, read_actions
@@ -78,12 +79,14 @@ def verify_results(
     Args:
         folder: Folder with `results.json` and `actions.arrow`.
         workers: Processes.
-        assets: Folder of the original asset pack, for results obtained with it.
+        assets: Folder of the original asset pack, or MODULE:FUNCTION or FILE.py:FUNCTION, for results
+            obtained with them.
         report: Called with episodes done, episodes in all and a note.
 
     Raises:
         DatasetError: A file is missing, unreadable, or of an evaluation of other versions of the simulator.
         ConfigError: `workers` is out of range, or there are no such assets.
+        AssetError: The results name a function as their assets; pass it as `assets`.
     """
     path = folder / FILE_NAME
     try:
@@ -178,11 +181,13 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
 
 
 def _env_config(results: Results, assets: str | None) -> EnvConfig:
-    """Settings of the environments; assets are recorded without their path."""
+    """Settings of the environments; assets are recorded without their path, and functions are not run."""
     known = {field.name for field in fields(EnvConfig)}
     given = {name: value for name, value in results.config.items() if name in known}
     if assets is not None:
         given["assets"] = assets
+    elif "assets" in given:
+        given["assets"] = recorded_assets(given["assets"])
     return EnvConfig(**given)
 
 
