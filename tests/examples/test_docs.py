@@ -24,7 +24,7 @@ def test_the_code_of_the_page_runs_from_top_to_bottom(
         if kind.strip() == "no-run":  # needs downloads; its imports are tried all the same
             code = "\n".join(line for line in code.splitlines() if line.startswith("from "))
         exec(compile(code, str(PAGE), "exec"), names)
-    assert {"sampling", "results", "MyDetector", "load_t5"} <= names.keys()
+    assert {"sampling", "MyDetector", "load_t5"} <= names.keys()
 
 
 def test_the_tables_of_sizes_are_those_of_the_presets() -> None:

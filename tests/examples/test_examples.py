@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from openvima.data import Dataset
-from openvima.evaluation import score
-from openvima.policies import RandomPolicy
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.evaluation import EvaluationConfig, Results, evaluate, score
+from openvima.evaluation.sources import PolicySource
+from openvima.policies import RandomPolicy, load_policy
 from openvima.tasks import list_tasks, registry
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-# Run in tests of their own: one goes on until it is stopped, the other wants to be trained.
-APART = ("policy_server", "custom_learner")
+# Run in tests of their own: one goes on until it is stopped, others have names or want to be trained.
+APART = ("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy")
 
 
 @pytest.mark.parametrize(
@@ -33,13 +34,32 @@ def test_the_example_runs_and_is_short(
     assert "olved" in capsys.readouterr().out
 
 
-def test_the_custom_policy_reads_the_prompt_and_inherits_from_nothing() -> None:
-    policy = runpy.run_path(str(EXAMPLES[0].with_name("custom_policy.py")))["NearestColour"]
-    assert policy.__mro__ == (policy, object)
-    tasks = ("visual_manipulation", "rotate")
-    results = score({"mine": policy(), "random": RandomPolicy()}, tasks=tasks, levels=("L2",), episodes=6)
-    mine, random = results.level_means()
+def test_the_policy_of_ones_own_reads_the_prompt_and_inherits_from_nothing() -> None:
+    policy = load_policy(f"{EXAMPLES[0].with_name('score_my_policy.py')}:make")
+    assert type(policy).__mro__ == (type(policy), object)
+    cells = {"tasks": ("visual_manipulation",), "levels": ("L2",), "episodes": 6}
+    mine, random = score({"mine": policy, "random": RandomPolicy()}, **cells).level_means()
     assert mine.mean >= 0.8 and random.mean <= 0.2
+
+
+@pytest.mark.slow
+def test_the_network_of_ones_own_is_trained_and_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("torch")
+    for name in ("own_network.py", "own_training_loop.py"):
+        text = EXAMPLES[0].with_name(name).read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 40
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    generate(GenerateConfig(out=Path("demos"), tasks=("visual_manipulation",), episodes=4))
+    subprocess.run([sys.executable, "own_training_loop.py", "demos", "2"], check=True)
+    config = EvaluationConfig(("own_network.py:make",), ("visual_manipulation",), ("L1",), episodes=2)
+    results = Results.read(evaluate(config))
+    assert results.rows[0].episodes == 2 and not results.invalid_actions()
+    trained = results.policies["own_network"]
+    Path("own_network.pt").unlink()
+    assert PolicySource("own", "own_network.py:make").record()["weights_sha256"] != trained["weights_sha256"]
 
 
 @pytest.mark.slow

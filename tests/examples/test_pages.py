@@ -11,7 +11,9 @@ PAGES = {
     "observations": "joints_and_depth",
     "prompts": "language_prompts",
     "your_own_objects": "custom_object",
+    "your_own_policy": "score_my_policy",
     "your_own_task": "custom_task",
+    "your_own_training": "own_training_loop",
 }
 
 
