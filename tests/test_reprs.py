@@ -25,7 +25,7 @@ MAX_CHARACTERS = 1000
 def large(hint: Any) -> Any:
     """Return a value of a type, with many items where the type leaves their number open."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if is_dataclass(hint):
+    if isinstance(hint, type) and is_dataclass(hint):
         return large_record(hint)
     if origin in (typing.Union, types.UnionType):
         return max((large(arg) for arg in args), key=lambda value: len(repr(value)))
@@ -112,7 +112,7 @@ def test_names_are_escaped_and_numbers_shown(shown: dict[str, Any]) -> None:
     assert "mine &lt;b&gt;, x" in shown["results"]._repr_html_()
     assert "a &lt;b&gt;" in shown["dataset"]._repr_html_()
     prompt = Prompt("Say <i> {a}.", shown["prompt"].images[:0])
-    assert "Say &lt;i&gt;" in prompt._repr_html_()
+    assert "Say &lt;i&gt;" in (prompt._repr_html_() or "")
 
 
 @pytest.mark.parametrize("kind", KINDS)

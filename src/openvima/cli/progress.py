@@ -3,7 +3,6 @@
 Where stderr is no terminal, both are lines: one at each stage, one a minute and one at the end.
 """
 
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -124,7 +123,8 @@ def plain_lines(
     def report(done: int, total: int, note: str, new: int | None = None) -> None:
         nonlocal stage, shown_s, pace
         now_s, before = clock(), stage
-        stage = re.sub(r"[^a-z].*", "", note.lower())  # its first word
+        word = note.partition(" ")[0].rstrip(":,")
+        stage = word if any(map(str.isalpha, word)) else ""
         if stage != before:
             pace = Pace(clock)
         pace.update(done if new is None else new)

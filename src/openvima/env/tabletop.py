@@ -198,7 +198,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     def __repr__(self) -> str:
         run = self._run
-        state = "no episode" if run is None else f"seed {run.episode.seed}, {run.num_steps} steps"
+        state = "no episode" if run is None else f"seed {run.episode.seed}, step {run.num_steps}"
         return f"TabletopEnv({self.task!r}, level={self.level!r}, domain={self.domain!r}; {state})"
 
     def _repr_html_(self) -> str | None:
@@ -207,7 +207,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             facts.append("no episode: call reset()")
             return notebook_html("environment", facts=facts, prompt=None)
         over = run.outcome.reason or ("solved" if run.outcome.success else "")
-        facts += [f"{run.episode.domain} seed {run.episode.seed}", f"{run.num_steps} steps taken", over]
+        facts += [f"{run.episode.domain} seed {run.episode.seed}", f"step {run.num_steps}", over]
         views = {view: image.rgb for view, image in self._images().items()}
         return notebook_html("environment", facts=facts, prompt=self.prompt, views=views)
 

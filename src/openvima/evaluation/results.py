@@ -179,7 +179,7 @@ class Results:
             rates.setdefault(name, []).append(f"{100 * mean.mean:.1f} % on {mean.level}")
         shown = "; ".join(f"{name}: {', '.join(means)}" for name, means in rates.items())
         episodes = sum(row.episodes for row in self.rows)
-        return cut(f"Results({episodes:,} episodes of {len(self.tasks())} tasks; {shown})", MAX_CHARACTERS)
+        return cut(f"Results(episodes: {episodes:,}; tasks: {len(self.tasks())}; {shown})", MAX_CHARACTERS)
 
     def _repr_html_(self) -> str | None:
         means = self.means()
