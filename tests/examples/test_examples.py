@@ -14,6 +14,7 @@ from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.evaluation.sources import PolicySource
 from openvima.policies import RandomPolicy, load_policy
 from openvima.tasks import list_tasks, registry
+from user_shapes import restored_assets
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 # Run in tests of their own: one goes on until it is stopped, others have names or want to be trained.
@@ -30,7 +31,8 @@ def test_the_example_runs_and_is_short(
     list_tasks()  # loads them, so that what an example registers goes when the test ends
     monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
     assert len(example.read_text(encoding="utf-8").splitlines()) <= 70
-    runpy.run_path(str(example), run_name="__main__")
+    with restored_assets():
+        runpy.run_path(str(example), run_name="__main__")
     assert "olved" in capsys.readouterr().out
 
 
