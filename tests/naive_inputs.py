@@ -42,21 +42,21 @@ class PromptInput:
             stands.
         parts: Which of its tokens stands there, shape (L,), int64: the view, front before top; the number of
             the token, with frames; 0 where one token shows both views.
-        names_texture: Which words name a texture, shape (L,), bool.
         mask: Which places count, shape (L,), bool; not those of objects hidden in their view.
         objects: All objects of all images, one row an appearance in the text.
         numbers: Which image shows each of them, counted from 0 in reading order, shape (S,), int64.
         in_scene: Whether that is an image of the table, shape (S,), bool.
+        names_texture: Which words name a texture, shape (L,), bool; None if none does.
     """
 
     words: np.ndarray
     entries: np.ndarray
     parts: np.ndarray
-    names_texture: np.ndarray
     mask: np.ndarray
     objects: ObjectViews
     numbers: np.ndarray
     in_scene: np.ndarray
+    names_texture: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +141,7 @@ class NaiveProcessor:
         in_scene = np.array(kinds, np.bool_)[numbers]
         named = np.isin(words, self.tokenizer.texture_ids)
         return PromptInput(
-            words, entries, parts, named, mask, ObjectViews.concatenated(images), numbers, in_scene
+            words, entries, parts, mask, ObjectViews.concatenated(images), numbers, in_scene, named
         )
 
     def start_episode(self) -> "NaiveEpisode":
@@ -254,7 +254,7 @@ def batch_prompts(prompts: Sequence[PromptInput], crops: Sequence[np.ndarray]) -
         numbered = prompt.entries + first + prompt.parts * total
         images[row, :size] = np.where(prompt.entries == WORD, WORD, numbered)
         mask[row, :size] = prompt.mask
-        named[row, :size] = prompt.names_texture
+        named[row, :size] = False if prompt.names_texture is None else prompt.names_texture
         first += len(prompt.objects)
     objects = [prompt.objects for prompt in prompts]
     return PromptBatch(
