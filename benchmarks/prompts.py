@@ -17,7 +17,7 @@ from pathlib import Path
 
 from openvima.catalog import OBJECTS, TEXTURES
 from openvima.evaluation import Results
-from openvima.scene import Episode, Placement, Scene
+from openvima.scene import AtPose, Episode, InZone, Placement, Scene
 from openvima.tasks import list_tasks, sample_episode, task_spec
 from openvima.tasks.sampling import takes_prompts
 
@@ -128,8 +128,9 @@ def is_understood(episode: Episode) -> bool:
         reading = read(problem.prompt.text, problem.scene)
     except (ValueError, IndexError):
         return False
-    moved = {goal.object_id for goal in problem.goals}
-    relative = {goal.relative_to for goal in problem.goals} - {None, *moved}
+    goals = [goal for goal in problem.goals if isinstance(goal, AtPose | InZone)]
+    moved = {goal.object_id for goal in goals}
+    relative = {goal.relative_to for goal in goals} - {None, *moved}
     return reading.moved == moved and relative <= reading.others
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from openvima.data import Dataset, GenerateConfig, VerifyConfig, generate, verify
+from openvima.data.subsets import MergeConfig, merge
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, DatasetError
 from small_data_sets import edit_manifest
@@ -14,9 +15,9 @@ TEXT = EnvConfig(prompts="text")
 SHARD = "rotate-train-00000.arrow"
 
 
-def config(out: Path, env_config: EnvConfig = TEXT, **changes: bool) -> GenerateConfig:
+def config(out: Path, env_config: EnvConfig = TEXT, images: bool = True) -> GenerateConfig:
     return GenerateConfig(
-        out=out, tasks=("rotate",), episodes=2, shard_size=2, env_config=env_config, **changes
+        out=out, tasks=("rotate",), episodes=2, shard_size=2, env_config=env_config, images=images
     )
 
 
@@ -61,6 +62,28 @@ def test_a_shard_of_other_prompts_is_found(folders: tuple[Path, Path], tmp_path:
     edit_manifest(folder, lambda manifest: manifest["config"].pop("prompts"))
     problems = verify(folder, VerifyConfig(replay=0)).problems
     assert any("prompts is text, in the manifest multimodal" in str(problem) for problem in problems)
+
+
+def test_episodes_that_two_forms_leave_equal_are_merged_once(tmp_path: Path) -> None:
+    every, half = (
+        generate(
+            GenerateConfig(
+                out=tmp_path / p, tasks=("rearrange",), episodes=2, env_config=EnvConfig(prompts=p)
+            )
+        )
+        for p in ("multimodal", "mixed")
+    )
+    with pytest.raises(DatasetError, match="2 of 4 episodes repeat others"):
+        merge(MergeConfig((every, half), tmp_path / "refused"))
+    merged = merge(MergeConfig((every, half), tmp_path / "merged", duplicates="skip"))
+    assert len(Dataset(merged)) == 2
+
+
+def test_forms_that_differ_are_merged(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    merged = merge(MergeConfig(folders, tmp_path / "merged"))
+    assert len(Dataset(merged)) == 4
+    found = verify(merged, VerifyConfig(replay=None))
+    assert not found.problems and found.num_replayed == 4
 
 
 def test_all_means_the_tasks_with_a_text_form(tmp_path: Path) -> None:

@@ -155,16 +155,23 @@ def _without_duplicates(parts: Sequence[_Part], *, skip: bool) -> list[_Part]:
 
 
 def _first_of_each(parts: Sequence[_Part]) -> tuple[np.ndarray, pa.Table]:
-    """Whether each episode is the first of its name and setup, shape (N,), bool; and their names."""
+    """Whether each episode is the first of its name and setup, shape (N,), bool; and their names.
+
+    Where only the prompts of two setups differ, episodes of equal content count as of one.
+    """
     setups: dict[tuple[object, ...], int] = {}
-    tables = []
+    tables, numbers, hashes = [], [], []
     for part in parts:
         info = part.info
-        env_config = (info.assets, info.compat, info.difficulty, info.prompts)
-        setup = setups.setdefault(env_config, len(setups))
-        rows = part.dataset.index.select(_NAME).take(part.episodes)
-        tables.append(rows.append_column("setup", pa.array(np.full(len(rows), setup))))
-    names = pa.concat_tables(tables)
+        env_config = (info.assets, info.compat, info.difficulty)
+        setup = setups.setdefault((*env_config, info.prompts), len(setups))
+        rows = part.dataset.index.select((*_NAME, "content_hash")).take(part.episodes)
+        tables.append(rows.drop_columns("content_hash"))
+        numbers.append(np.full(len(rows), setup))
+        hashes += [f"{env_config} {content}" for content in rows.column("content_hash").to_pylist()]
+    _, firsts_of_content, content = np.unique(hashes, return_index=True, return_inverse=True)
+    setup_of_content = np.concatenate(numbers)[firsts_of_content]
+    names = pa.concat_tables(tables).append_column("setup", pa.array(setup_of_content[content]))
     numbered = names.append_column("place", pa.array(np.arange(len(names))))
     firsts = numbered.group_by(names.column_names, use_threads=False).aggregate([("place", "min")])
     first = np.zeros(len(names), bool)
