@@ -65,6 +65,7 @@ def test_scale_and_fixed_can_be_given() -> None:
         ([("heart", "red", (float("nan"), 0.1))], ["object 0 ('a'): position is [nan, 0.1]", "finite"]),
         ([("heart", "red", (0.5, 0.1), 1e9)], ["yaw_deg is 1000000000.0", "-3600 to 3600"]),
         ([SceneObject("heart", "red", (0.5, 0.1), scale=9)], ["scale is 9", "0.5 to 2"]),
+        ([("red", "heart", (0.5, 0.1))], ["'red' is a texture", "the object comes first"]),
         ([("heart", "red")], ["object 0 ('a') has 2 entries", "(object, texture, (x, y)[, yaw_deg])"]),
         ([], ["0 objects", "1 to 64"]),
         ([SceneObject("pan", "red", (0.5, 0.1), name="../x")], ["'../x'", "letters"]),
@@ -148,6 +149,7 @@ def test_goals_by_name() -> None:
     [
         (("under", "a", "b"), ["there is no goal 'under'", "(in, a, b)", "(at, a, position, [yaw_deg])"]),
         (("in", "a"), ["goal 0", "(in, a, b)"]),
+        ("in", ["goal 0 is 'in'; give a list of goals", "(in, a, b)"]),
         (("in", "a", "z"), ["there is no object 'z'", "a, b"]),
         (("in", "a", "a"), ["itself"]),
         (("at", "a", (0.9, 0.0)), ["(at, red swirl heart)", "0.25 … 0.75 m"]),
@@ -155,7 +157,7 @@ def test_goals_by_name() -> None:
         (("swept_into", "a", "b"), ["spatula"]),
     ],
 )
-def test_wrong_goals_are_refused_with_the_allowed_ones(goal: tuple, words: list[str]) -> None:
+def test_wrong_goals_are_refused_with_the_allowed_ones(goal: object, words: list[str]) -> None:
     message = refusal(OBJECTS, PROMPT, goals=[goal])
     assert all(word in message for word in words), message
 

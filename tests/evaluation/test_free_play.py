@@ -77,5 +77,7 @@ def test_demo_records_an_episode_file(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_demo_takes_a_task_or_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo"]) == 2 and main(["demo", "rotate", "--episode", "x.yaml"]) == 2
     assert "either a TASK or --episode FILE" in capsys.readouterr().err
+    assert main(["demo", "--episode", "x.yaml", "--seed", "3"]) == 2
+    assert "leave them out" in capsys.readouterr().err
     assert main(["demo", "--episode", "missing.yaml"]) == 2
     assert "missing.yaml" in capsys.readouterr().err

@@ -57,6 +57,10 @@ def main(
 
     if (task is None) == (episode is None):
         raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
+    if episode is not None and (seed, level, difficulty, prompts) != (0, None, "easy", "multimodal"):
+        raise ConfigError(
+            "an episode file says all of --seed, --level, --difficulty and --prompts; leave them out."
+        )
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
         raise ConfigError(f"--out is {str(out)!r}; videos are MP4 files; give a name that ends in .mp4.")

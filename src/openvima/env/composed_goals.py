@@ -41,12 +41,14 @@ def composed_goals(
 def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, assets: Assets) -> Goal:
     if is_condition(given):
         return given
+    allowed = f"Allowed: {'; '.join(_usage(known) for known in _GOALS)}."
     if isinstance(given, Mapping):
         named = dict(given)
         name, arguments = named.pop("goal", None), ()
+    elif isinstance(given, Sequence) and given and not isinstance(given, str):
+        (name, *arguments), named = entries(given, label), {}
     else:
-        (name, *arguments), named = entries(given, label) or (None,), {}
-    allowed = f"Allowed: {'; '.join(_usage(known) for known in _GOALS)}."
+        raise SceneError(f"{label} is {shown(given)}; give a list of goals. {allowed}")
     if not isinstance(name, str) or name not in _GOALS:
         shown_name = name if isinstance(name, str) else shown(name)
         raise SceneError(f"{label}: {unknown_name('goal', shown_name, _GOALS, allowed)}")

@@ -8,7 +8,7 @@ from typing import Any  # of whatever type a user gives; checked here
 
 import numpy as np
 
-from openvima.catalog import OBJECT_SETS, Assets, object_spec, texture_spec
+from openvima.catalog import OBJECT_SETS, OBJECTS, TEXTURES, Assets, object_spec, texture_spec
 from openvima.env.checked_values import entries, number, pair, shown
 from openvima.errors import SceneError, UnknownNameError, unknown_name
 from openvima.perception.objects import MAX_OBJECTS
@@ -131,6 +131,10 @@ def checked_appearance(object_name: object, texture: object, label: str) -> tupl
     """
     if not isinstance(object_name, str) or not isinstance(texture, str):
         raise SceneError(f"{label} is {shown(object_name)} of texture {shown(texture)}; give two names.")
+    if object_name in TEXTURES and texture in OBJECTS:
+        raise SceneError(
+            f"{label}: {object_name!r} is a texture and {texture!r} an object; the object comes first."
+        )
     try:
         return object_spec(object_name).name, texture_spec(texture).name
     except UnknownNameError as error:

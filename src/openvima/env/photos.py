@@ -28,8 +28,11 @@ def read_photo(file: Path) -> PhotoImage:
     try:
         with open_regular(file) as stream:
             content = stream.read(MAX_PNG_BYTES + 1)
+    except InputFileError:
+        raise
     except (OSError, ValueError) as error:
-        raise InputFileError(f"photo {str(file)!r} cannot be read: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputFileError(f"photo {str(file)!r} cannot be read: {reason}.") from None
     if len(content) > MAX_PNG_BYTES:
         raise InputFileError(f"photo {str(file)!r} has more than {MAX_PNG_BYTES:,} bytes, the most allowed.")
     pixels = _on_white(content, file)

@@ -81,6 +81,9 @@ class PhotoImage:
                 f"it must have {3 * self.width * self.height}."
             )
 
+    def __str__(self) -> str:
+        return f"photo of {self.width} × {self.height} pixels"
+
     def pixels(self) -> np.ndarray:
         """Return the picture, shape (height, width, 3), uint8."""
         return np.frombuffer(self.rgb, np.uint8).reshape(self.height, self.width, 3)
