@@ -1,6 +1,6 @@
 """Examples, their order, and their augmentation."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,6 +15,8 @@ from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.training.augmentation.false_positives import augmented  # noqa: E402
+from openvima.training.dataset import StoredEpisode  # noqa: E402
+from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     ExampleSource,
     Parts,
@@ -241,3 +243,31 @@ def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_se
     assert images.shape[1:] == (3, 64, 128)
     batch = collate_examples(processor, examples)
     assert augmented(batch, "frames", probability=1.0, rngs=rngs_of(examples)) is batch
+
+
+def tensors_of(record) -> list[np.ndarray]:
+    values = [getattr(record, field.name) for field in fields(record)]
+    parts = [tensors_of(value) if is_dataclass(value) else [value] for value in values if value is not None]
+    return [np.asarray(value) for part in parts for value in part]
+
+
+@pytest.mark.parametrize("with_images", [False, True])
+@pytest.mark.parametrize("layout", ["objects", "views"])
+@pytest.mark.parametrize("probability", [None, 0.0, 0.5])
+def test_demonstrations_read_together_give_the_same_batch(data, with_images, layout, probability):
+    training, _ = split_examples(
+        open_object_cache(Dataset(data)), validation_fraction=0.3, validation_episodes=9
+    )
+    unread, read = ([training[index] for index in (5, 1, 1, 8)] for _ in range(2))
+    for example in read:
+        assert example.episode.num_steps == example.num_steps
+    collate = PolicyCollate(Processor(layout), probability or 0.0, with_images=with_images)
+    ours, theirs = (
+        tensors_of(collate(each, None if probability is None else rngs_of(each))) for each in (unread, read)
+    )
+    contents = [example.content for example in unread]
+    assert not any(isinstance(content, StoredEpisode) and content.is_read for content in contents)
+    assert len(ours) == len(theirs) > 20
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.dtype == other.dtype
+        assert np.array_equal(one, other)

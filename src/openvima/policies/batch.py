@@ -27,13 +27,18 @@ class StoredImages(Protocol):
         """Shape of an image."""
         ...
 
-    def read_first(self, counts: Sequence[int], stack: np.ndarray) -> None:
-        """Copy images, one demonstration after the other.
+    def read_first(self, counts: Sequence[int], starts: Sequence[int], stack: np.ndarray) -> None:
+        """Copy the first images of demonstrations.
 
         Args:
-            counts: How many of the first images of each demonstration.
-            stack: Where to, exactly as many, (K, 3, height, width), uint8, contiguous.
+            counts: How many of each demonstration.
+            starts: Their places in the stack.
+            stack: Where to, (K, 3, height, width), uint8, contiguous.
         """
+
+    def read(self, number: int) -> np.ndarray:
+        """Return all images of one demonstration."""
+        ...
 
 
 WORD = -1  # object index at a position that holds a word
@@ -144,10 +149,13 @@ class Batch(TensorRecord):
         first, last = numbers[starts], numbers[ends]  # of the new numbers, the first excluded
         # Those in use come first, unless augmentation left some out: then a copy of contiguous bytes will do.
         is_prefix = numbers[starts + last - first] == last
-        if isinstance(images, StoredImages) and is_prefix.all():
+        if isinstance(images, StoredImages):
             stack = _empty_stack(numbers[-1] + 1, images.shape)
             stack[0] = 0
-            images.read_first((last - first).tolist(), stack[1:])
+            images.read_first(np.where(is_prefix, last - first, 0).tolist(), (first + 1).tolist(), stack)
+            for b in np.flatnonzero(~is_prefix).tolist():
+                used = is_used[starts[b] + 1 : ends[b] + 1]
+                stack[first[b] + 1 : last[b] + 1] = images.read(b)[used]
             return self._renumbered(numbers, stack)
         columns = (starts, ends, first, last, is_prefix)
         stack = np.zeros((0, 0, 0, 0), np.uint8)

@@ -101,7 +101,7 @@ class BehaviourCloning:
                 continue
             for group in by_length(examples):
                 loss, metrics = self._call(collate(group, None), self._validated)
-                weight = sum(e.episode.num_steps for e in group) / total
+                weight = sum(e.num_steps for e in group) / total
                 _add(sums, {"loss": loss, **metrics}, weight * mine * ranks)
         sums = self._parallel.mean(sums)
         score = sums[self._learner.score]

@@ -12,7 +12,7 @@ from openvima.errors import ConfigError, DatasetError
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
 from openvima.training.augmentation.distractor_insertion import allows_distractors
-from openvima.training.dataset import Example
+from openvima.training.dataset import Example, StoredEpisode
 from openvima.training.hash_split import split_hashes
 from openvima.training.learner import Collate
 
@@ -37,7 +37,9 @@ class ExampleSource(Sequence[Example]):
         return len(self.rows)
 
     def __getitem__(self, index: int) -> Example:  # type: ignore[override]  # nobody slices
-        return self.example(int(self.rows[index]))
+        row = int(self.rows[index])
+        content = StoredEpisode(self.cache, row, int(self.lengths[index, 0]))
+        return Example(content, int(self.bases[row]), row)
 
     def example(self, row: int) -> Example:
         """Return a demonstration by its index in the cache."""
@@ -78,7 +80,7 @@ class Parts:
         for part in self._divided(examples):
             rngs = [np.random.default_rng([self.seed, number, example.row]) for example in part]
             drawn = [self._drawn(example, rng) for example, rng in zip(part, rngs, strict=True)]
-            parts.append((self.collate(drawn, rngs), sum(e.episode.num_steps for e in part)))
+            parts.append((self.collate(drawn, rngs), sum(e.num_steps for e in part)))
         return parts
 
     def _drawn(self, example: Example, rng: np.random.Generator) -> Example:
@@ -96,7 +98,7 @@ class Parts:
 
     def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
         if self.count is not None:
-            ordered = sorted(examples, key=lambda example: example.episode.num_steps)
+            ordered = sorted(examples, key=lambda example: example.num_steps)
             ends = [len(ordered) * part // self.count for part in range(self.count + 1)]
             return [ordered[start:end] for start, end in pairwise(ends)]
         size = self.largest
@@ -192,5 +194,5 @@ def by_length(examples: Sequence[Example]) -> list[list[Example]]:
     """Group examples of 1, of 2 or 3, and of more steps, to reduce padding."""
     groups: dict[int, list[Example]] = {}
     for example in examples:
-        groups.setdefault(min(2, example.episode.num_steps // 2), []).append(example)
+        groups.setdefault(min(2, example.num_steps // 2), []).append(example)
     return [groups[key] for key in sorted(groups)]

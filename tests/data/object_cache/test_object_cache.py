@@ -170,10 +170,10 @@ def test_the_first_images_are_read_straight_into_a_stack(demos: Path, counts) ->
     tables = [(cache[row].prompt.objects, cache[row].objects) for row in rows]
     inputs = [max(int(table.crop_index.max()) for table in both) for both in tables]
     asked = [count + {"inputs": 0, "fewer": -1, "more": 1}[counts] for count in inputs]
-    stack = np.zeros((sum(asked), *episodes.images.shape), np.uint8)
-    episodes.images.read_first(asked, stack)
+    stack = np.zeros((2 + sum(asked), *episodes.images.shape), np.uint8)
+    episodes.images.read_first(asked, (2 + np.cumsum(asked) - asked).tolist(), stack)
     expected = [cache[row].images[:count] for row, count in zip(rows, asked, strict=True)]
-    assert np.array_equal(stack, np.concatenate(expected))
+    assert np.array_equal(stack, np.concatenate([np.zeros_like(stack[:2]), *expected]))
 
 
 @pytest.mark.parametrize("part", ["tables", "images"])
@@ -189,7 +189,8 @@ def test_a_batch_with_a_damaged_record_is_refused(copy: Path, part) -> None:
     with pytest.raises(ShardError, match=r"00000\.cache .* record 1 of 2 is wrong"):
         episodes = damaged.batch([0, 1])
         counts = episodes.images.entries["num_inputs"].tolist()
-        episodes.images.read_first(counts, np.zeros((sum(counts), 3, 32, 32), np.uint8))
+        stack = np.zeros((sum(counts), 3, 32, 32), np.uint8)
+        episodes.images.read_first(counts, (np.cumsum(counts) - counts).tolist(), stack)
 
 
 def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path) -> None:

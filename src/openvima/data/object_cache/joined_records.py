@@ -74,21 +74,25 @@ class _Images(Iterable[np.ndarray]):
     def __iter__(self) -> Iterator[np.ndarray]:
         return (file.images(row) for file, row in self.places)
 
-    def read_first(self, counts: Sequence[int], stack: np.ndarray) -> None:
-        """Copy the first images of each episode, one episode after the other; see `StoredImages`."""
-        target, end = stack.reshape(-1).data, 0
+    def read(self, number: int) -> np.ndarray:
+        """Return all images of one episode."""
+        file, row = self.places[number]
+        return file.images(row)
+
+    def read_first(self, counts: Sequence[int], starts: Sequence[int], stack: np.ndarray) -> None:
+        """Copy the first images of each episode to its place; see `StoredImages`."""
+        target, size = stack.reshape(-1).data, self.places[0][0].image_bytes
         columns = (self.entries[name].tolist() for name in ("images_start", "num_inputs", "inputs_checksum"))
-        for (file, row), count, source, num_inputs, checksum in zip(
-            self.places, counts, *columns, strict=True
+        for (file, row), count, start, source, num_inputs, checksum in zip(
+            self.places, counts, starts, *columns, strict=True
         ):
-            num_bytes = count * file.image_bytes
-            start, end = end, end + num_bytes
+            copy = target[start * size : (start + count) * size]
             if count == num_inputs:
                 # What is checked is the copy, which is in the CPU cache by then.
-                target[start:end] = file.content[source : source + num_bytes]
-                file.check(row, target[start:end], checksum)
-            else:
-                target[start:end] = file.images(row)[:count].reshape(-1).data
+                copy[:] = file.content[source : source + count * size]
+                file.check(row, copy, checksum)
+            elif count:
+                copy[:] = file.images(row)[:count].reshape(-1).data
 
 
 def _read_tables(places: Sequence[tuple[CacheFile, int]], entries: np.ndarray) -> list[np.ndarray]:

@@ -34,7 +34,7 @@ class Randomly:
         """Augment a demonstration, or leave it as it is."""
         if not self.prob or rng.random() >= self.prob:
             return example
-        return replace(example, episode=self.augment(example.episode, rng))
+        return replace(example, content=self.augment(example.episode, rng))
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +51,20 @@ class DemonstrationAugmentation:
     of_inverse_dynamics: tuple[Transform, ...] = ()
     of_tasks: tuple[Transform, ...] = (with_distractors,)
 
+    @property
+    def is_certain_to_change_nothing(self) -> bool:
+        """Whether demonstrations stay as they are, those without a source of distractors."""
+        transforms = [each for each in self.of_tasks if each is not with_distractors]
+        return not self.inverse_dynamics_prob and all(
+            isinstance(each, Randomly) and not each.prob for each in transforms
+        )
+
     def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
         """Augment a demonstration; without a generator, as in validation, only what is certain happens."""
         prob = self.inverse_dynamics_prob
         is_inverse = prob == 1 or (rng is not None and prob > 0 and rng.random() < prob)
         if is_inverse:
-            example = replace(example, episode=with_motion_prompt(example.episode))
+            example = replace(example, content=with_motion_prompt(example.episode))
         if rng is not None:
             for transform in self.of_inverse_dynamics if is_inverse else self.of_tasks:
                 example = transform(example, rng)

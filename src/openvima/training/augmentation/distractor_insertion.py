@@ -52,7 +52,7 @@ def with_distractors(example: Example, rng: np.random.Generator) -> Example:
     objects = ObjectTable.concatenate([table for step in steps for table in (step, there)])
     objects_per_step = episode.objects_per_step + len(there)
     return replace(
-        example, episode=replace(episode, objects=objects, objects_per_step=objects_per_step), base=0
+        example, content=replace(episode, objects=objects, objects_per_step=objects_per_step), base=0
     )
 
 

@@ -22,7 +22,7 @@ class DropUnusedObjects:
         """Augment a demonstration."""
         if not self.prob:
             return example
-        return replace(example, episode=without_unused_objects(example.episode, self.prob, rng))
+        return replace(example, content=without_unused_objects(example.episode, self.prob, rng))
 
 
 def without_unused_objects(
