@@ -15,6 +15,7 @@ from openvima.scene.explanation import Explanation, bin_positions  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
 NAMES = ("nano", "small", "nano-bins", "vima-nano")
+FAST = ("nano", "small")
 
 
 def policy_of(name: str, **options) -> NetworkPolicy:
@@ -28,7 +29,10 @@ def policy_of(name: str, **options) -> NetworkPolicy:
     return NetworkPolicy(network, **options)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(
+    scope="module",
+    params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in NAMES],
+)
 def policy(request) -> NetworkPolicy:
     return policy_of(request.param)
 

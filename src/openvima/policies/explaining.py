@@ -61,6 +61,7 @@ def explain_row(
         if follow_coreference:
             refers_LL = coreference(batch)[0].to(torch.float64)
             weights_L = weights_L * (refers_LL.sum(dim=1) == 0) + weights_L @ refers_LL
+        weights_L = weights_L / weights_L.sum()  # exactly, whatever the network computes in
         attention[kind] = np.bincount(piece_L, weights_L.numpy(), minlength=len(words))
     if trace.positions_BC2 is None or trace.masks_BC is None or trace.kinds_C is None:
         bins = dict(zip(COMPONENTS, probabilities, strict=True))
