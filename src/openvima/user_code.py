@@ -17,7 +17,6 @@ from types import ModuleType
 from typing import Any
 
 from openvima.errors import ConfigError, OpenVimaError
-from openvima.input_files import open_regular
 
 FORM = "MODULE:FUNCTION or FILE.py:FUNCTION"
 _NAME = re.compile(r"(.+\.py|[^\W\d]\w*(\.[^\W\d]\w*)*):[^\W\d]\w*")
@@ -87,6 +86,8 @@ def load_file(path: Path, *, what: str) -> ModuleType:
     Raises:
         ConfigError: There is no such Python file, or its code raises.
     """
+    from openvima.input_files import open_regular  # imports a YAML parser
+
     try:
         with open_regular(path) as stream:
             code = stream.read()

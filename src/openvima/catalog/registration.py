@@ -23,7 +23,6 @@ from openvima.errors import (
     echo,
     unknown_name,
 )
-from openvima.input_files import open_regular
 
 MAX_NAME = 40  # characters
 MAX_ALIASES = 10
@@ -270,6 +269,8 @@ def _identifier(name: str) -> str:
 def _read_png(file: Path, what: str) -> np.ndarray:
     """Decode a PNG file of limited size, shape (H, W, 3), uint8."""
     from PIL import Image
+
+    from openvima.input_files import open_regular  # imports a YAML parser
 
     try:
         with open_regular(file) as stream:

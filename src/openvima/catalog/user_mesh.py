@@ -10,7 +10,6 @@ from openvima.catalog.geometry import CollisionHull, Geometry, TriangleMesh, Vec
 from openvima.catalog.meshes import TEXTURE_PER_M, scaled
 from openvima.catalog.obj_file import ObjMesh, face_normals, parse_obj
 from openvima.errors import AssetError, InputFileError, ShapeError
-from openvima.input_files import read_text
 
 MAX_TRIANGLES = 20_000
 MAX_VERTICES = 60_000
@@ -137,6 +136,8 @@ def _read(mesh: Mesh, what: str) -> ObjMesh:
 
 
 def _read_file(file: Path, what: str) -> ObjMesh:
+    from openvima.input_files import read_text  # imports a YAML parser
+
     try:
         return parse_obj(read_text(file, max_bytes=MAX_OBJ_BYTES), str(file))
     except OSError as error:
