@@ -3,6 +3,7 @@
 import json
 import os
 import stat
+from collections import Counter
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,15 @@ class _PlainLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
+
+    def construct_mapping(
+        self, node: yaml.MappingNode, deep: bool = False
+    ) -> dict[Any, Any]:  # Any: as in yaml
+        """Construct a mapping, unless a key is there twice, of which only the last would count."""
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if twice := [key for key, count in keys.items() if count > 1]:
+            raise yaml.YAMLError(f"it has the key {twice[0][:80]!r} twice")
+        return super().construct_mapping(node, deep)
 
 
 def _checked(values: Any, file: Path) -> Any:  # Any: whatever the file holds

@@ -88,6 +88,12 @@ def test_photos_outside_the_folder_are_refused(tmp_path: Path) -> None:
             openvima.load_episode(file)
 
 
+def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(HAND_WRITTEN.replace("  bowl:", "  block:"), encoding="utf-8")
+    with pytest.raises(InputFileError, match="it has the key 'block' twice"):
+        openvima.load_episode(tmp_path / "scene.yaml")
+
+
 def test_the_message_names_the_field(tmp_path: Path) -> None:
     episode = sample_episode("rotate", seed=0)
     path = openvima.save_episode(replace(episode, max_steps=4), tmp_path / "episode.yaml")
