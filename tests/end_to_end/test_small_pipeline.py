@@ -35,8 +35,10 @@ def run(*words: object) -> None:
     assert main([str(word) for word in words]) == 0
 
 
+@pytest.mark.filterwarnings("ignore::openvima.errors.UnknownWordWarning")  # of words beyond these few
 def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, capsys) -> None:
-    demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
+    folder = tmp_path / "my runs"  # a space in all names
+    demos, trained, results = folder / "demos", folder / "trained", folder / "results"
     run("generate", "--tasks", TASKS, "--episodes", 3, "--out", demos)
     train = [
         "train",
@@ -62,6 +64,7 @@ def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, ca
         1,
     ]
     run(*train)
+    assert f"--policy '{trained}' --out" in capsys.readouterr().err
     policies = f"mine={trained},oracle,random"
     evaluate = ["evaluate", "--policy", policies, "--tasks", TASKS, "--levels", "L1", "--episodes", 2]
     run(*evaluate, "--videos", 0, "--out", results)
@@ -78,7 +81,7 @@ def test_demonstrations_training_scores_and_report(tiny: str, tmp_path: Path, ca
     capsys.readouterr()
     run(*train)  # again: nothing is left to do
     assert (trained / "checkpoints" / "2-cloning-000003" / "model.safetensors").read_bytes() == weights
-    assert capsys.readouterr().out.strip().endswith("trained")
+    assert capsys.readouterr().out.strip().endswith("my runs/trained")
 
 
 def test_wrong_input_to_each_verb_ends_in_one_line_that_says_so(tmp_path: Path, capsys) -> None:
@@ -117,8 +120,10 @@ def test_quickstart_refuses_options_that_it_cannot_read(words: tuple[str, str], 
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::openvima.errors.UnknownWordWarning")  # of words beyond these few
 def test_a_killed_training_goes_on_and_is_scored_with_ablations(tmp_path: Path, capsys) -> None:
-    demos, trained, results = tmp_path / "demos", tmp_path / "trained", tmp_path / "results"
+    folder = tmp_path / "my runs"
+    demos, trained, results = folder / "demos", folder / "trained", folder / "results"
     run("generate", "--tasks", TASKS, "--episodes", 4, "--out", demos)
     train = ["train", "--data", demos, "--preset", "vima-nano", "--out", trained, "--loader.batch-size", 2]
     train += ["--schedule.steps", 12, "--schedule.checkpoint-every", 1, "--runtime.threads", 1]

@@ -42,9 +42,13 @@ def git_state(folder: Path) -> dict[str, Any] | None:  # Any: JSON
     def ask(*words: str) -> str | None:
         try:
             result = subprocess.run(
-                ["git", "-C", str(folder), *words], capture_output=True, text=True, check=True, timeout=10
+                ["git", "-C", str(folder), *words],
+                capture_output=True,
+                encoding="utf-8",
+                check=True,
+                timeout=10,
             )
-        except (OSError, subprocess.SubprocessError):
+        except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
             return None
         return result.stdout.strip()
 
