@@ -40,7 +40,7 @@ def test_every_help_and_list_can_be_written_in_ascii(
     assert words != ["tasks"] or max(map(len, text.splitlines())) <= 60
 
 
-def test_letters_become_ascii_that_looks_alike() -> None:
+def test_letters_become_similar_ascii() -> None:
     with ascii_stdout() as written:
         accept_any_text()
         print("3 × 4 – 5 · 45° ≈ é 漢 ┏━┳┓ │ \udcff")

@@ -34,7 +34,7 @@ def accept_any_text() -> None:
 
 
 def _alike(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Replace the first letter of an encoding error by ASCII that looks alike."""
+    """Replace the first letter of an encoding error by similar ASCII letters."""
     if not isinstance(error, UnicodeEncodeError):
         return codecs.backslashreplace_errors(error)
     letter = error.object[error.start]
