@@ -34,7 +34,7 @@ class Pixels(Sequential):
 
 def make():
     """Return the policy, with its weights once it has been trained."""
-    policy = Pixels(Conv2d(3, 64, 8, 4, 2), GELU(), Conv2d(64, 64, 5, 1, 2), GELU(), Conv2d(64, 32, 5, 1, 2))
+    policy = Pixels(Conv2d(3, 32, 8, 4, 2), GELU(), Conv2d(32, 32, 5, 1, 2), GELU(), Conv2d(32, 32, 5, 1, 2))
     if WEIGHTS.exists():
         policy.load_state_dict(torch.load(WEIGHTS, weights_only=True))
     return policy

@@ -18,8 +18,9 @@ class NearestColour:
 
     def reset(self, prompts):
         """Start a batch of episodes, with a prompt for each."""
-        images = [[part for part in prompt.sequence() if not isinstance(part, str)] for prompt in prompts]
-        self.wanted = [[colours(observe_prompt_image(i), i.rgb, i.segm)[0] for i in each] for each in images]
+        shown = [prompt.images.values() for prompt in prompts]
+        found = [[colours(observe_prompt_image(i), i.rgb, i.segm)[0] for i in images] for images in shown]
+        self.wanted = [each or [np.zeros(216)] for each in found]  # a prompt may have no images
 
     def act(self, observations):
         """Return an action for each observation; None stands for an episode that is over."""
@@ -28,8 +29,8 @@ class NearestColour:
 
     def _decide(self, wanted, seen):
         objects = observe(seen)  # crops, boxes and positions of all objects in view
-        first, *_, last = wanted @ colours(objects, seen["rgb"], seen["segm"]).T  # a row for each image
-        pick, place = objects.grasp_points()[first.argmax()], objects.positions()[last.argmax()]
+        alike = wanted @ colours(objects, seen["rgb"], seen["segm"]).T  # images × objects
+        pick, place = objects.grasp_points()[alike[0].argmax()], objects.positions()[alike[-1].argmax()]
         return Action.planar(tuple(pick), tuple(place)).to_arrays()
 
 

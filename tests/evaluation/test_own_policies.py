@@ -131,6 +131,8 @@ def test_code_that_cannot_be_loaded_is_wrong_usage_of_each_verb(file, capsys):
     for words in (["evaluate", "--policy", "none.py:make"], ["demo", "rotate", "--policy", "none.py:make"]):
         assert main(words) == 2
         assert "policy names 'none.py', and there is no such Python file" in capsys.readouterr().err
+    assert main(["evaluate", "--policy", str(file)]) == 2
+    assert "name a function as MODULE:FUNCTION or FILE.py:FUNCTION" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="extracts objects itself"):
         load_policy(f"{file}:make", extractor=object())
 

@@ -9,7 +9,7 @@ import pytest
 
 from openvima.errors import DatasetError
 from openvima.evaluation.comparison import compare
-from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, Results, Row
 from openvima.report import write_report
 from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
@@ -281,6 +281,15 @@ def test_many_tasks_and_causes_of_failure_are_summed_up(results, tmp_path):
     table = Page(section(path.read_text(encoding="utf-8"), "failures")).tables[0]
     assert table[1][4].strip() == "task0 1, task1 1, task2 1, task3 1 and 3 other tasks"
     assert [cell.strip() for cell in table[-1][1:4]] == ["2 rarer causes", "14", "20.0 %"]
+
+
+def test_invalid_actions_are_counted_for_each_policy_that_has_any(tmp_path):
+    bad = EpisodeOutcome(7, False, 0, "pose0_position is <far> away.", BAD_ACTION)
+    rows = [Row("mine", "rotate", "L1", 1, (bad, bad)), Row("oracle", "rotate", "L1", 1, outcomes(1))]
+    path = write_report(Results(tuple(rows)), tmp_path / "a.html")
+    text = section(path.read_text(encoding="utf-8"), "failures")
+    assert "2 of 2 episodes of mine ended by an invalid action; first in rotate, L1, seed 7: pose0" in text
+    assert "is &lt;far&gt; away" in text and "episodes of oracle" not in text
 
 
 def test_videos_are_kept_beside_the_results(clip, tmp_path):

@@ -25,8 +25,8 @@ def is_policy_source(text: str) -> bool:
 
 
 def is_own_code(text: str) -> bool:
-    """Whether a text names a function that makes a policy, and no existing path."""
-    return is_code(text) and not Path(text).exists()
+    """Whether a text names a function that makes a policy, and no existing path; or a file without one."""
+    return text.endswith(".py") or (is_code(text) and not Path(text).exists())
 
 
 def unknown_policy(name: str, others: Sequence[str]) -> str:
