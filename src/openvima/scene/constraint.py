@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, TypeAlias
 
 from openvima.brief import brief_repr
-from openvima.scene.goal import AtPose, Condition, Goal, Zone, block_points, object_of
+from openvima.scene.goal import AtPose, Condition, Goal, Zone, block_points, kind_of, object_of
 from openvima.scene.scene import Scene
 
 
@@ -31,7 +31,7 @@ class StepContext:
         """Name the object of a goal, or the goal if it names no object."""
         goal = self.goals[goal_index]
         object_id = object_of(goal)
-        return f"goal {type(goal).__name__}" if object_id is None else self.scene.describe(object_id)
+        return f"goal {kind_of(goal)}" if object_id is None else self.scene.describe(object_id)
 
 
 class StepConstraint(Protocol):

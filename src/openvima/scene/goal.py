@@ -166,6 +166,11 @@ def is_condition(value: object) -> TypeGuard[Condition]:
     return callable(getattr(value, "is_met", None))
 
 
+def kind_of(condition: object) -> str:
+    """Name of a condition's class, for a reason; of the inner one if it was wrapped for other object ids."""
+    return type(getattr(condition, "condition", condition)).__name__
+
+
 def object_of(goal: Goal) -> int | None:
     """Id of the object that a goal is about; None if it names none."""
     return getattr(goal, "object_id", None)
@@ -185,4 +190,4 @@ def oracle_move(goal: Goal, scene: Scene) -> OracleMove | None:
 def unmet_reason(condition: Condition, scene: Scene) -> str:
     """One sentence on why a condition is not met."""
     reason = getattr(condition, "reason", None)
-    return f"{type(condition).__name__} is violated" if reason is None else str(reason(scene))
+    return f"{kind_of(condition)} is violated" if reason is None else str(reason(scene))

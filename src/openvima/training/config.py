@@ -246,7 +246,7 @@ class TrainingConfig(RunConfig):
         init_from: Initial weights: another run, or whatever else `load_policy` takes.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
-        assets: Asset pack of pretraining: "procedural", or the folder of the original one.
+        assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.
         object_cache: Folder of the object cache; None keeps it beside the demonstrations.
         loader: Batches and held-out demonstrations.
         rollout: Rollouts during training.
