@@ -158,7 +158,7 @@ def _default_name(source: str) -> str:
         check_address(source)
         name = urlsplit(source).netloc
     elif is_own_code(source):
-        name = Path(source.rpartition(":")[0]).name.removesuffix(".py")
+        name = Path(source.rpartition(":")[0] or source).name.removesuffix(".py")
     else:
         name = Path(source).name
     return re.sub(r"[^\w.+-]+", "-", name).strip("-")
