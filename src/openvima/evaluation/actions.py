@@ -9,9 +9,9 @@ import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import ActionError, DatasetError, OracleError
+from openvima.errors import ActionError, DatasetError, OracleError, PolicyError
 from openvima.evaluation.results import Row
-from openvima.evaluation.rollout_policies import Decision, Observation, RolloutPolicy
+from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
 from openvima.input_files import open_regular
 from openvima.scene import ACTION_SHAPES, Action
 
@@ -67,6 +67,10 @@ class ActionReplay:
     def near_ties(self) -> Sequence[bool]:
         """Return nothing: they depend on the policy's scores."""
         return ()
+
+    def explainer(self) -> Explainer:
+        """Raise an error: the policy is not there."""
+        raise PolicyError("recorded actions have no explain(); run their policy.")
 
 
 def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]]) -> str:
