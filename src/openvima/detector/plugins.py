@@ -85,6 +85,7 @@ def plugged_boxes(source: str) -> Boxes:
         weights = hashlib.blake2b((checkpoint_folder(folder) / WEIGHTS_FILE).read_bytes()).hexdigest()
         name, content = DETECTOR, json.dumps([sizes, least, weights], sort_keys=True).encode()
     else:
+        extractor_maker(source)  # says which forms are allowed
         name, content = source.rpartition(":")[2], source_hash(source, what="boxes").encode()
     digest = hashlib.blake2b(content, digest_size=_DIGEST_BYTES).hexdigest()
     return Boxes(f"{name}-{digest}", partial(plugged_extractor, source))
