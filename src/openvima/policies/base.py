@@ -13,7 +13,7 @@ from openvima.memory import require_address_space
 from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, RenderedPrompt
 
 # Least that torch and the libraries loaded after it map, in 2**20 bytes; measured with torch 2.13 on the CPU.
-TORCH_MB = 1300
+TORCH_MB = 800
 POLICIES_THAT_EXPLAIN = "Those that do: nano, nano-bins, small, openvima-small and vima-*, trained or not."
 
 
