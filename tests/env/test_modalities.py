@@ -8,6 +8,7 @@ from box_assets import BoxAssets
 from openvima.env import TabletopEnv
 from openvima.env.tabletop import MODALITIES
 from openvima.errors import ConfigError, ShapeError
+from openvima.evaluation.actions import ActionRecorder
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.render import CAMERAS, VIEWS, Rasteriser, points_from_depth, project
@@ -97,7 +98,9 @@ class Noting:
         return [Action.planar((0.25, -0.5), (0.25, -0.5)).to_arrays() for _ in observations]
 
 
-def test_an_evaluated_policy_sees_what_it_declares() -> None:
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_an_evaluated_policy_sees_what_it_declares(wrapped: bool) -> None:
     noting = Noting()
-    play([TabletopEnv("rotate")], [0], PromptedRolloutPolicy(noting))
+    policy = PromptedRolloutPolicy(noting)
+    play([TabletopEnv("rotate")], [0], ActionRecorder(policy) if wrapped else policy)
     assert noting.seen and all(seen == {"joints", "depth", "ee"} for seen in noting.seen)

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.atomic_io import atomic_write
-from openvima.env.tabletop import TabletopEnv
+from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import ActionError, DatasetError, OracleError, PolicyError
 from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
@@ -46,6 +46,15 @@ class ActionRecorder:
     def near_ties(self) -> Sequence[bool]:
         """Return those of the policy."""
         return self._policy.near_ties()
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """What the policy asks observations to hold."""
+        return getattr(self._policy, "modalities", DEFAULT_MODALITIES)
+
+    def explainer(self) -> Explainer:
+        """Return that of the policy."""
+        return self._policy.explainer()
 
 
 class ActionReplay:

@@ -6,7 +6,7 @@ from typing import Any
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ActionError, OracleError
 from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, failure_kind
-from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
+from openvima.evaluation.rollout_policies import Decision, RolloutPolicy
 from openvima.scene import Episode
 from openvima.scene.goal import object_of
 
@@ -108,9 +108,9 @@ def play(
     Raises:
         PolicyError: The policy left out an episode that is not over, or gave a wrong number of actions.
     """
-    if isinstance(policy, PromptedRolloutPolicy):
+    if (modalities := getattr(policy, "modalities", None)) is not None:
         for env in envs:
-            env.modalities = policy.modalities
+            env.modalities = modalities
     slots = [_EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
     policy.begin(envs)
     while any(slot.outcome is None for slot in slots):
