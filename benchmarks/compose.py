@@ -42,7 +42,7 @@ SLOTS = ("a", "b", "c")
 TASKS = ("rotate", "novel_adj", "follow_motion", "sweep_without_touching", "rearrange_then_restore")
 NAMED = re.compile(r"(object|image|goal) ('\w+'|\d+)")  # how errors name what is wrong
 LIMIT = re.compile(
-    r"must lie|at most|is allowed|give a number|it must be more than|multiple of|only a small block"
+    r"must lie|at most|is allowed|give a number|it must be more than|multiple of|is fixed|only a small block"
 )
 
 

@@ -153,6 +153,7 @@ def test_goals_by_name() -> None:
         (("in", "a", "z"), ["there is no object 'z'", "a, b"]),
         (("in", "a", "a"), ["itself"]),
         (("at", "a", (0.9, 0.0)), ["(at, red swirl heart)", "0.25 … 0.75 m"]),
+        (("in", "b", "a"), ["the green bowl is fixed to the table"]),
         (("rotated", "a", 3), ["degrees is 3", "15"]),
         (("swept_into", "a", "b"), ["spatula"]),
     ],

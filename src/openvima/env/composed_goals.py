@@ -64,10 +64,12 @@ def _goal(given: Any, label: str, handles: Handles, end_effector: EndEffector, a
     for parameter in ("a", "b"):
         if parameter in parameters:
             bound.arguments[parameter] = known_object(bound.arguments[parameter], handles, label)
+    moved = bound.arguments["a"]
+    if moved.fixed:
+        raise SceneError(f"{label} ({name}): the {moved.texture} {moved.object} is fixed to the table.")
     try:
         return make(*bound.args, **bound.kwargs)
     except SceneError as error:
-        moved = bound.arguments["a"]
         raise SceneError(f"{label} ({name}, {moved.texture} {moved.object}): {error}") from None
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from openvima.errors import OracleError
 from openvima.scene import InZone, NeverTouches, Pose, Problem, Scene, Zone
 from openvima.scene.goal import object_of
 from openvima.tasks.footprints import Rectangle
@@ -34,7 +35,13 @@ class View:
 
     @staticmethod
     def of(goals: Sequence[InZone], scene: Scene, problem: Problem) -> "View":
-        """Build the view of a scene with these open goals."""
+        """Build the view of a scene with these open goals.
+
+        Raises:
+            OracleError: A goal's block is fixed to the table.
+        """
+        if fixed := [goal.object_id for goal in goals if scene[goal.object_id].fixed]:
+            raise OracleError(f"{scene.describe(fixed[0])} is fixed to the table, so it cannot be swept.")
 
         def distance(goal: InZone) -> float:
             return scene[goal.object_id].pose.planar_distance(Pose.planar(goal.zone.x, goal.zone.y))
