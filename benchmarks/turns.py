@@ -197,7 +197,8 @@ def main() -> None:
     means = {
         kind: round(math.prod(r.values()) ** (1 / len(r)), 3) for kind, r in found.items() if kind != "data"
     }
-    print(f"{'geometric mean':28}", *(f"{kind} {mean:.2f}" for kind, mean in means.items()))
+    if means:
+        print(f"{'geometric mean':28}", *(f"{kind} {mean:.2f}" for kind, mean in means.items()))
     if given.json:
         base = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], cwd=given.base, capture_output=True, text=True
