@@ -4,37 +4,50 @@ from pathlib import Path
 
 import torch
 from torch.nn import GELU, Conv2d, Sequential
+from torch.nn.functional import normalize, one_hot
 
-from openvima.render import TOP, unproject
+from openvima.perception.objects import observe
 from openvima.scene import Action
 
 WEIGHTS = Path(__file__).with_suffix(".pt")
-# x, y in metres on the table of every fourth pixel of the top view
-POINTS = torch.from_numpy(unproject(4 * torch.ones(32, 64).nonzero().flip(1).numpy() + 1.5, TOP)).float()
 
 
-class Pixels(Sequential):
-    """Picks and places at points of the top view that resemble the first and the last prompt image."""
+class Matcher(Sequential):
+    """Picks and places at the objects that resemble the first and the last prompt image, in the top view."""
 
-    def forward(self, top, prompt):  # uint8 (B, 3, 128, 256), (B, P, 3, 128, 256)
-        """Return a logit for pick and place at each point, (B, 2, 2048)."""
-        seen, shown = (super(Pixels, self).forward(x / 255) for x in (top, prompt[:, [0, -1]].flatten(0, 1)))
-        return torch.einsum("bchw,bic->bihw", seen, shown.amax((2, 3)).unflatten(0, (-1, 2))).flatten(2)
+    def forward(self, rgb, segm, prompt_rgb, prompt_segm):  # top views (N, …), of prompts (N, P, …)
+        """Return a logit for pick and place of each object id below 32, (N, 2, 32)."""
+        shown = self._embed(prompt_rgb[:, [0, -1]].flatten(0, 1), prompt_segm[:, [0, -1]].flatten(0, 1))
+        return 10 * torch.einsum("nic,nkc->nik", shown[:, 0].unflatten(0, (-1, 2)), self._embed(rgb, segm))
+
+    def _embed(self, rgb, segm):  # mean over the pixels of each id
+        masks = one_hot(segm[:, ::4, ::4].long().clamp(max=31), 32).float()
+        return normalize(torch.einsum("nchw,nhwk->nkc", super().forward(rgb / 255), masks), dim=-1)
 
     def reset(self, prompts):
         """Start a batch of episodes."""
-        self.prompts = [torch.stack([torch.tensor(i.rgb["top"]) for i in p.images.values()]) for p in prompts]
+        self.prompts = [list(prompt.images.values()) for prompt in prompts]
 
     def act(self, observations):
         """Return the actions of the episodes that are not over."""
         pairs = zip(observations, self.prompts, strict=True)
-        best = [o and self(torch.tensor(o["rgb"]["top"])[None], p[None])[0].argmax(1) for o, p in pairs]
-        return [None if b is None else Action.planar(*POINTS[b].tolist()).to_arrays() for b in best]
+        return [seen and self._decide(seen, prompt) for seen, prompt in pairs]
+
+    def _decide(self, seen, prompt):
+        views = [torch.tensor(seen[kind]["top"]) for kind in ("rgb", "segm")]
+        shown = [
+            torch.stack([torch.tensor(getattr(i, kind)["top"]) for i in prompt]) for kind in ("rgb", "segm")
+        ]
+        objects = observe(seen)
+        pick, place = self(*(x[None] for x in (*views, *shown)))[0][:, objects.ids.tolist()].argmax(1)
+        return Action.planar(
+            tuple(objects.grasp_points()[pick]), tuple(objects.positions()[place])
+        ).to_arrays()
 
 
 def make():
     """Return the policy, with its weights once it has been trained."""
-    policy = Pixels(Conv2d(3, 32, 8, 4, 2), GELU(), Conv2d(32, 32, 5, 1, 2), GELU(), Conv2d(32, 32, 5, 1, 2))
+    policy = Matcher(Conv2d(3, 32, 8, 4, 2), GELU(), Conv2d(32, 32, 1))
     if WEIGHTS.exists():
         policy.load_state_dict(torch.load(WEIGHTS, weights_only=True))
     return policy
