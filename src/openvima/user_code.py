@@ -100,7 +100,8 @@ def load_file(path: Path, *, what: str) -> ModuleType:
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # last, so that nothing installed is replaced
     spec = importlib.util.spec_from_file_location(_module_name(path, module), path)
-    assert spec is not None  # the name ends in .py
+    if spec is None:
+        raise ConfigError(f"{what} names {str(path)!r}, which is no Python file; its name must end in .py.")
     module = importlib.util.module_from_spec(spec)
     before = sys.modules.get(spec.name)
     sys.modules[spec.name] = module

@@ -61,7 +61,7 @@ def test_policies_by_name_and_what_is_none() -> None:
     assert play(episode, "random").steps == play(episode, RandomPolicy()).steps == 1
     with pytest.raises(UnknownPolicyError):
         play(episode, "no-such-policy")
-    with pytest.raises(PolicyError, match=r"is a int; it needs reset\(prompts\)"):
+    with pytest.raises(PolicyError, match="policy is a int without reset and act"):
         play(episode, 3)  # type: ignore[arg-type]  # wrong on purpose
 
 

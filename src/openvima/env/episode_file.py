@@ -21,6 +21,7 @@ import yaml
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog import LEVELS, Assets, load_assets, object_spec, texture_spec
 from openvima.env.checked_values import MAX_ENTRIES, shown
+from openvima.env.composed_objects import WORKSPACE
 from openvima.env.composing import MAX_STEPS, composed
 from openvima.env.photos import read_photo
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
@@ -340,9 +341,8 @@ def _check_scene(scene: Scene, first_id: int, label: str) -> None:
         _check_placement(placement, what)
         if not in_workspace(placement.pose) or not _HEIGHTS_M[0] <= placement.pose.z <= _HEIGHTS_M[1]:
             raise SceneError(
-                f"{what} ({placement.texture} {placement.object}) is at {shown(placement.pose.position)}; x "
-                "must lie in 0.25 … 0.75 m, y in -0.5 … 0.5 m and z in "
-                f"{_HEIGHTS_M[0]} … {_HEIGHTS_M[1]} m."
+                f"{what} ({placement.texture} {placement.object}) is at {shown(placement.pose.position)}; "
+                f"{WORKSPACE} and z in {_HEIGHTS_M[0]} … {_HEIGHTS_M[1]} m."
             )
 
 

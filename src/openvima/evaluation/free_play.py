@@ -9,7 +9,6 @@ import numpy as np
 from openvima.catalog import Assets
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.env.tabletop import TabletopEnv
-from openvima.errors import PolicyError
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout import play as roll_out
@@ -159,10 +158,6 @@ def _load(
 ) -> RolloutPolicy:
     """Load a policy by name, or take an object."""
     if not isinstance(policy, str):
-        if not callable(getattr(policy, "reset", None)) or not callable(getattr(policy, "act", None)):
-            raise PolicyError(
-                f"the policy is a {type(policy).__name__}; it needs reset(prompts) and act(observations)."
-            )
         return PromptedRolloutPolicy(policy)
     PolicySource(policy, policy, trust_code).check()
     batch = Batch(

@@ -1,21 +1,16 @@
 """Merging several evaluations, for a common report and for comparisons."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 
 from openvima.catalog.partitions import LEVELS
+from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.errors import ConfigError
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 
 # Settings that decide which episode a seed stands for, with what holds for files that do not name them.
-_SAME_EPISODES = {
-    "domain": "eval",
-    "assets": "procedural",
-    "compat": False,
-    "difficulty": "easy",
-    "prompts": "multimodal",
-}
+_SAME_EPISODES = {"domain": "eval", **asdict(DEFAULT_ENV_CONFIG)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from openvima.errors import MissingExtraError, PromptError
 
 if TYPE_CHECKING:
-    import numpy as np
     from jinja2 import Environment
 
 _FOLDER = Path(__file__).parent
@@ -51,7 +52,7 @@ def notebook_html(template: str, **values: object) -> str | None:
         return None
 
 
-def thumbnail_uri(rgb: "np.ndarray", mask: "np.ndarray | None" = None, height: int = 64) -> str:
+def thumbnail_uri(rgb: np.ndarray, mask: np.ndarray | None = None, height: int = 64) -> str:
     """Encode an image as a small data URI.
 
     Args:
@@ -63,7 +64,7 @@ def thumbnail_uri(rgb: "np.ndarray", mask: "np.ndarray | None" = None, height: i
 
     pixels = rgb.transpose(1, 2, 0)
     if mask is not None and mask.any():
-        rows, columns = (mask.any(axis=axis).nonzero()[0] for axis in (1, 0))
+        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
         pixels = pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     width = max(1, round(pixels.shape[1] * height / pixels.shape[0]))
     stream = io.BytesIO()

@@ -120,6 +120,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
             if config.get(name, usual) != usual
         ],
         *(["--compat"] if config.get("compat") else []),
+        *(["--trust-code"] if any("code" in what for what in results.policies.values()) else []),
         *([f"--ablations {','.join(config['ablations'])}"] if config.get("ablations") else []),
         "--out DIR",
     ]
