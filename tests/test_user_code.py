@@ -2,12 +2,20 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from openvima import user_code
 from openvima.errors import ConfigError, SceneError
-from openvima.user_code import call_function, is_code, load_function, source_hash, without_folder
+from openvima.user_code import (
+    call_function,
+    is_code,
+    load_file,
+    load_function,
+    source_hash,
+    without_folder,
+)
 
 CODE = "import beside_it\n\ndef make(size=3):\n    return beside_it.NAME, size\n\nnumber = 4\n"
 
@@ -122,3 +130,9 @@ def test_code_is_told_from_its_form(text):
 @pytest.mark.parametrize("text", ["ws://127.0.0.1:8000", "run:1", "runs/a:b", "a:", ":b", "x.py", "own/er"])
 def test_other_names_are_no_code(text):
     assert not is_code(text)
+
+
+def test_a_file_must_be_a_python_file(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("x = 1\n")
+    with pytest.raises(ConfigError, match=r"FILES names '.*notes.txt', which is no Python file"):
+        load_file(tmp_path / "notes.txt", what="FILES")
