@@ -14,6 +14,7 @@ import pyarrow as pa
 from openvima.data.image_layout import ImageBuffers
 from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
+from openvima.env.config import ENV_SETTINGS, EnvConfig
 from openvima.errors import ShardError, unknown_name
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
@@ -93,6 +94,11 @@ class ShardInfo:
     def file_name(self) -> str:
         """Name of the shard's file."""
         return f"{self.task}-{self.level}-{self.number:05d}.arrow"
+
+    @property
+    def env_config(self) -> EnvConfig:
+        """Settings of the environments; assets by their recorded name."""
+        return EnvConfig(**{name: getattr(self, name) for name in ENV_SETTINGS})
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""

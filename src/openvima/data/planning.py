@@ -6,7 +6,7 @@ data set of more episodes begins with the very shards of a smaller one: asking f
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
@@ -164,15 +164,14 @@ class GenerateConfig:
         Raises:
             ConfigError: The record lacks a setting, or holds one that is not allowed.
         """
+        given = {"prompts": MULTIMODAL, **record}
         try:
             settings: dict[str, Any] = {
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
-                "env_config": EnvConfig(
-                    recorded_assets(record["assets"]),
-                    record["compat"],
-                    record["difficulty"],
-                    record.get("prompts", MULTIMODAL),
+                "env_config": replace(
+                    EnvConfig(**{name: given[name] for name in ENV_SETTINGS}),
+                    assets=recorded_assets(record["assets"]),
                 ),
                 **{name: record[name] for name in ("level", "episodes", "start_seed")},
                 **{name: record[name] for name in ("compression", "images")},
@@ -225,13 +224,10 @@ def plan(config: GenerateConfig) -> list[Block]:
                 number=number,
                 shard_size=config.shard_size or 0,
                 first_seed=config.start_seed,
-                assets=assets,
                 versions=versions,
-                compat=config.env_config.compat,
-                difficulty=config.env_config.difficulty,
-                prompts=config.env_config.prompts,
                 compression=config.compression,
                 images=config.images,
+                **{**asdict(config.env_config), "assets": assets},
             )
             failed = config.out / FAILED_FOLDER / info.file_name if config.keep_failed else None
             blocks.append(

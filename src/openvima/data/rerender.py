@@ -15,7 +15,6 @@ from openvima.catalog.user_assets import recorded_assets
 from openvima.data.encoding import ShardInfo
 from openvima.data.records import Demonstration, package_versions
 from openvima.data.schema import VIEWS
-from openvima.env.config import EnvConfig
 from openvima.errors import (
     AssetError,
     OpenVimaError,
@@ -83,7 +82,6 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         demo: Names the episode; its own prompt is not used.
         info: Of the shard that stores it.
     """
-    options = EnvConfig(info.assets, info.compat, info.difficulty).options()
     rasteriser = _rasteriser(info.assets)
     episode = sample_episode(
         demo.task,
@@ -93,7 +91,7 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         assets=rasteriser.assets,
         compat=info.compat,
         prompts=info.prompts,
-        **options,
+        **info.env_config.options(),
     )
     return rasteriser.prompt(episode.problem.prompt)
 

@@ -16,6 +16,7 @@ from openvima.data.manifest import (
 from openvima.data.planning import COMMAND, Block, GenerateConfig
 from openvima.data.reader import read_manifest
 from openvima.data.shard import Shard
+from openvima.env.config import ENV_SETTINGS
 from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
@@ -135,7 +136,7 @@ def _surplus(found: ShardInfo, config: GenerateConfig) -> str:
 
 
 def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
-    names = ("level", "domain", "shard_size", "first_seed", "assets", "compat", "difficulty", "prompts")
-    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in (*names, "compression", "images")]
+    names = ("level", "domain", "shard_size", "first_seed", *ENV_SETTINGS, "compression", "images")
+    pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
     pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
     return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]

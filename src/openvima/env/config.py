@@ -1,6 +1,6 @@
 """Settings that all environments of a run share: assets, difficulty, fidelity, prompts."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
 from openvima.tasks.options import check_difficulty
@@ -74,5 +74,8 @@ class EnvConfig:
             del record["prompts"]
         return record
 
+
+ENV_SETTINGS = tuple(field.name for field in fields(EnvConfig))
+"""Names of the settings, as data sets and results record them."""
 
 DEFAULT_ENV_CONFIG = EnvConfig()

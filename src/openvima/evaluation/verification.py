@@ -9,7 +9,7 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.user_assets import recorded_assets
-from openvima.env.config import EnvConfig
+from openvima.env.config import ENV_SETTINGS, EnvConfig
 from openvima.errors import DatasetError, OpenVimaError, echo
 from openvima.evaluation.actions import ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
@@ -182,8 +182,7 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
 
 def _env_config(results: Results, assets: str | None) -> EnvConfig:
     """Settings of the environments; assets are recorded without their path, and functions are not run."""
-    known = {field.name for field in fields(EnvConfig)}
-    given = {name: value for name, value in results.config.items() if name in known}
+    given = {name: value for name, value in results.config.items() if name in ENV_SETTINGS}
     if assets is not None:
         given["assets"] = assets
     elif "assets" in given:

@@ -15,8 +15,10 @@ from openvima.data.manifest import finish_folder
 from openvima.data.reader import Dataset
 from openvima.data.subsets.folders import check_out, joined_licence, joined_versions, provenance
 from openvima.data.subsets.shards import CopiedShard, NewShard, ShardNames, write_shards
+from openvima.env.config import EnvConfig
 from openvima.errors import DatasetError, unknown_name
 from openvima.folder_lock import folder_lock
+from openvima.tasks.prompts import MULTIMODAL
 
 Duplicates = Literal["refuse", "skip"]
 Report = Callable[[int, int, str], None]
@@ -159,16 +161,16 @@ def _first_of_each(parts: Sequence[_Part]) -> tuple[np.ndarray, pa.Table]:
 
     Where only the prompts of two setups differ, episodes of equal content count as of one.
     """
-    setups: dict[tuple[object, ...], int] = {}
+    setups: dict[EnvConfig, int] = {}
     tables, numbers, hashes = [], [], []
     for part in parts:
-        info = part.info
-        env_config = (info.assets, info.compat, info.difficulty)
-        setup = setups.setdefault((*env_config, info.prompts), len(setups))
+        env_config = part.info.env_config
+        setup = setups.setdefault(env_config, len(setups))
+        same_content = replace(env_config, prompts=MULTIMODAL)
         rows = part.dataset.index.select((*_NAME, "content_hash")).take(part.episodes)
         tables.append(rows.drop_columns("content_hash"))
         numbers.append(np.full(len(rows), setup))
-        hashes += [f"{env_config} {content}" for content in rows.column("content_hash").to_pylist()]
+        hashes += [f"{same_content} {content}" for content in rows.column("content_hash").to_pylist()]
     _, firsts_of_content, content = np.unique(hashes, return_index=True, return_inverse=True)
     setup_of_content = np.concatenate(numbers)[firsts_of_content]
     names = pa.concat_tables(tables).append_column("setup", pa.array(setup_of_content[content]))

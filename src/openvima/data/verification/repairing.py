@@ -24,6 +24,7 @@ from openvima.data.verification.checks import DEFAULT, verify
 from openvima.data.verification.findings import Report, Verification, VerifyConfig
 from openvima.data.verification.inventory import Inventory, take_inventory
 from openvima.data.verification.salvage import rewrite
+from openvima.env.config import ENV_SETTINGS
 from openvima.errors import DatasetError, OpenVimaError
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import Counts, imap_with_progress
@@ -171,7 +172,7 @@ def _record_of(shards: Sequence[Shard]) -> dict[str, Any]:  # Any: JSON
     info, episodes = shards[0].info, Counter[str]()
     for shard in shards:
         episodes[shard.info.task] += len(shard)
-    names = ("level", "shard_size", "compression", "images", "assets", "compat", "difficulty", "prompts")
+    names = ("level", "shard_size", "compression", "images", *ENV_SETTINGS)
     counts = {"episodes": max(episodes.values()), "start_seed": info.first_seed}
     return {"tasks": sorted(episodes), **counts, **{name: getattr(info, name) for name in names}}
 

@@ -245,7 +245,7 @@ def _when(step: int) -> str:
 
 
 def _setup(task: ReplayTask) -> EnvConfig:
-    return EnvConfig(task.assets, task.info.compat, task.info.difficulty, task.info.prompts)
+    return replace(task.info.env_config, assets=task.assets)
 
 
 @lru_cache(maxsize=4)

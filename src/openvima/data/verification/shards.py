@@ -15,6 +15,7 @@ from openvima.data.manifest import ShardSummary, fingerprint, is_inside, summari
 from openvima.data.shard import Shard, remedy
 from openvima.data.verification.episodes import faults
 from openvima.data.verification.findings import Problem, by_cause
+from openvima.env.config import ENV_SETTINGS
 from openvima.errors import OpenVimaError, ShardError
 from openvima.tasks.prompts import MULTIMODAL
 
@@ -152,7 +153,7 @@ def _record_faults(
 def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
     """Yield contradictions between a generated shard and the manifest."""
     settings = {"prompts": MULTIMODAL, **task.config} if task.config else {}
-    for name in ("level", "domain", "assets", "compat", "difficulty", "prompts", "compression", "images"):
+    for name in ("level", "domain", *ENV_SETTINGS, "compression", "images"):
         if name in settings and getattr(info, name) != settings[name]:
             yield f"{name} is {getattr(info, name)}, in the manifest {settings[name]}"
     if task.versions and info.versions != task.versions:
