@@ -222,19 +222,18 @@ class NetworkPolicy(Policy):
             raise PolicyError(
                 f"episode {', '.join(map(str, ended))} ended with a None before; call reset to start again."
             )
-        episodes = self._episodes.select(list(running))
+        before = episodes = self._episodes.select(list(running))
         actions: list[dict[str, np.ndarray] | None] = [None] * len(observations)
         choices: list[torch.Tensor] = []
-        last_step = _LastStep(episodes, tuple(running.values()), ())
         if running:
-            episodes = self._step(episodes, list(running.values()), choices)
+            episodes = self._step(before, list(running.values()), choices)
             assert episodes.actions_BC is not None
             arrays_BC = episodes.actions_BC.cpu().numpy()
             for index, array_C in zip(running, arrays_BC, strict=True):
                 actions[index] = {key: array_C[part].copy() for key, part in ACTION_PARTS.items()}
         self._episodes = episodes
         if self.network.explains and not self._is_bounded:  # the caches before a step take memory
-            self._last_step = replace(last_step, choices=tuple(choices))
+            self._last_step = _LastStep(before, tuple(running.values()), tuple(choices))
         return actions
 
     @torch.inference_mode()
@@ -289,11 +288,8 @@ class NetworkPolicy(Policy):
         """Return a policy for one client: it shares the network and has its own, bounded batches."""
         other = copy(self)
         other._is_bounded = True
-        other._num_prompts, other._episodes, other._last_step = (
-            0,
-            None,
-            None,
-        )  # never changed in place, so nothing else is shared
+        # Never changed in place, so nothing else is shared.
+        other._num_prompts, other._episodes, other._last_step = 0, None, None
         return other
 
     @property

@@ -394,9 +394,8 @@ class Processor:
         starts, order, count = np.cumsum([0, *counts]), [], 0
         sizes: list[int] = []  # rows of each image
         pieces = split_prompt(text)
-        self.tokenizer.encode(
-            " ".join(piece for piece in pieces if isinstance(piece, str))
-        )  # warns once of all
+        # Warns once of all unknown words.
+        self.tokenizer.encode(" ".join(piece for piece in pieces if isinstance(piece, str)))
         for piece in pieces:
             if isinstance(piece, str):
                 tokens += [(word, WORD, 0) for word in self.tokenizer.encode(piece)]
