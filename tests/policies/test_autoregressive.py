@@ -14,7 +14,7 @@ from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.config import (  # noqa: E402
     PolicyConfig,
-    with_autoregression,
+    with_head,
     with_visual_residual,
 )
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
@@ -38,8 +38,8 @@ from training_examples import collate_examples, examples_of  # noqa: E402
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.
 CONFIGS = {
     "midas": preset("midas-nano"),
-    "vima": with_autoregression(with_visual_residual(preset("vima-nano"))),
-    "query": with_autoregression(preset("nano-bins")),
+    "vima": with_head(with_visual_residual(preset("vima-nano")), "autoregressive"),
+    "query": with_head(preset("nano-bins"), "autoregressive"),
 }
 
 
@@ -268,16 +268,15 @@ def test_the_residual_changes_the_prompt_at_images_alone_by_what_goes_in(demonst
 
 def test_switches_change_nothing_else_and_can_be_undone() -> None:
     plain = preset("vima-nano")
-    both = with_visual_residual(with_autoregression(plain))
+    both = with_visual_residual(with_head(plain, "autoregressive"))
     assert replace(both, head=plain.head, prompt=plain.prompt) == plain
-    assert with_visual_residual(with_autoregression(both, False), False) == plain
+    assert with_visual_residual(with_head(both, "bins"), False) == plain
     midas = preset("midas-nano")
     assert (both.images, both.prompt, both.head) == (midas.images, midas.prompt, midas.head)
 
 
-@pytest.mark.parametrize("name", ["nano", "vima-nano"])
-def test_switching_off_what_is_not_on_changes_nothing(name) -> None:
-    assert with_autoregression(preset(name), False) == preset(name)
+def test_the_head_that_a_network_has_changes_nothing() -> None:
+    assert with_head(preset("vima-nano"), "bins") == preset("vima-nano")
 
 
 def test_vectors_without_spread_are_refused() -> None:
@@ -286,8 +285,8 @@ def test_vectors_without_spread_are_refused() -> None:
 
 
 def test_a_pointer_model_has_no_bins_to_decode_one_by_one() -> None:
-    with pytest.raises(ConfigError, match="use nano-bins"):
-        with_autoregression(preset("nano"))
+    with pytest.raises(ConfigError, match="take nano-bins"):
+        with_head(preset("nano"), "autoregressive")
 
 
 def chance_of_either(config: PolicyConfig, demonstration) -> float:
@@ -318,5 +317,5 @@ def test_two_right_answers_are_not_mixed(demonstrations) -> None:
     """Three components differ: decoded independently, one of the two actions comes out once in four times."""
     single = next(demo for demo in demonstrations if demo.num_steps == 1)
     plain = preset("vima-nano")
-    assert chance_of_either(with_autoregression(plain), single) > 0.9
+    assert chance_of_either(with_head(plain, "autoregressive"), single) > 0.9
     assert chance_of_either(plain, single) < 0.3

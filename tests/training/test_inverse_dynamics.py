@@ -21,6 +21,7 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation  # noqa: E402
 from openvima.training.augmentation.inverse_dynamics import motion_prompt, motion_text, with_motion_prompt  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
+from openvima.training.config import ModelConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
@@ -207,8 +208,8 @@ def test_weights_of_another_size_are_refused(settings, data, tmp_path) -> None:
         ("augmentation.inverse_dynamics_prob", 0.5),
         ("augmentation.drop_unused_objects_prob", 0.5),
         ("augmentation.rename_objects_prob", 0.5),
-        ("autoregressive", True),
-        ("visual_residual", True),
+        ("model.head", "mixture"),
+        ("model.visual_residual", True),
     ],
 )
 def test_a_custom_learner_has_no_such_setting(switch, value, data, tmp_path) -> None:
@@ -220,14 +221,14 @@ def test_a_custom_learner_has_no_such_setting(switch, value, data, tmp_path) -> 
 
 
 def test_parts_of_midas_can_be_switched_on_and_off(data, tmp_path) -> None:
-    def sizes(preset_name: str, **switches: bool):
-        config = TrainingConfig(data=data, out=tmp_path, preset=preset_name, **switches)
+    def sizes(preset_name: str, head: str, visual_residual: bool):
+        model = ModelConfig(head, visual_residual)
+        config = TrainingConfig(data=data, out=tmp_path, preset=preset_name, model=model)
         return build_learner(config).network.config
 
     plain = preset("vima-nano")
     midas = preset("midas-nano")
-    both = {"autoregressive": True, "visual_residual": True}
-    on = sizes("vima-nano", **both)
+    on = sizes("vima-nano", "autoregressive", True)
     assert replace(midas, images=on.images, prompt=on.prompt, head=on.head) == midas
-    off = sizes("midas-nano", autoregressive=False, visual_residual=False)
+    off = sizes("midas-nano", "bins", False)
     assert replace(plain, images=off.images, prompt=off.prompt, head=off.head) == plain

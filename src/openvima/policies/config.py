@@ -12,7 +12,7 @@ from openvima.policies.gato.config import GatoConfig
 from openvima.policies.gpt.config import GptConfig
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.bins import BinsConfig
+from openvima.policies.nn.heads import HEADS
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.vima.config import VimaConfig
 
@@ -46,22 +46,27 @@ def appearance_width(config: PolicyConfig) -> int:
     return config.images.appearance_width if has_objects else 0
 
 
-def with_autoregression(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
-    """Return the same network with autoregressive or with independent bins.
+def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
+    """Return the same network with another action head of the same sizes.
+
+    Args:
+        config: The network.
+        name: One of `openvima.policies.nn.heads.HEADS`.
 
     Raises:
-        ConfigError: A pointer network has no action bins.
+        ConfigError: There is no such head, or the network is a pointer model.
     """
+    if name not in HEADS:
+        raise ConfigError(unknown_name("head", name, HEADS))
     if isinstance(config, PointerConfig):
-        if not wanted:
-            return config
-        raise ConfigError("pointer models have no autoregressive head; use nano-bins or another preset.")
-    head = config.head
-    if wanted:
-        head = AutoregressiveConfig(head.hidden_width, config.decoder.initial_std, head.action_width)
-    elif isinstance(head, AutoregressiveConfig):
-        head = BinsConfig(head.hidden_width, head.action_width)
-    return replace(config, head=head)
+        raise ConfigError(
+            f"head is {name!r}, but pointer models choose among candidates; take nano-bins or another preset."
+        )
+    kind, head = HEADS[name], config.head
+    if isinstance(head, kind):
+        return config
+    std = {"token_std": config.decoder.initial_std} if kind is AutoregressiveConfig else {}
+    return replace(config, head=kind(head.hidden_width, action_width=head.action_width, **std))
 
 
 def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:

@@ -1,7 +1,7 @@
 """Builds the learner of a run: the network of a preset, or a learner of your own."""
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -13,7 +13,7 @@ from openvima.policies.config import (
     PolicyConfig,
     appearance_width,
     config_to_dict,
-    with_autoregression,
+    with_head,
     with_visual_residual,
 )
 from openvima.policies.nn.policy_network import PolicyNetwork
@@ -29,8 +29,6 @@ from openvima.training.schedule import step_seed
 from openvima.training.validation import flattened
 from openvima.user_code import with_absolute_path
 
-# Settings that only networks of this package have.
-_OF_PRESETS = ("t5", "autoregressive", "visual_residual")
 _FOR_OBJECTS = ("drop_unused_objects_prob", "rename_objects_prob", "distractor_prob")
 
 
@@ -88,7 +86,8 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
     augmentation.pop("augmentation.false_positive_prob")  # ignored unless its collator uses it
     given = {
         "pretraining.steps": config.pretraining.steps,
-        **{name: getattr(config, name) for name in _OF_PRESETS},
+        **{f"model.{name}": value for name, value in asdict(config.model).items()},
+        "t5": config.t5,
         **augmentation,
     }
     if unknown := [name for name, value in given.items() if value]:
@@ -100,10 +99,10 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
 def _sizes(config: TrainingConfig) -> PolicyConfig:
     """Return the config of the preset with its overrides."""
     sizes = preset(config.preset)
-    if config.autoregressive is not None:
-        sizes = with_autoregression(sizes, config.autoregressive)
-    if config.visual_residual is not None:
-        sizes = with_visual_residual(sizes, config.visual_residual)
+    if config.model.head is not None:
+        sizes = with_head(sizes, config.model.head)
+    if config.model.visual_residual is not None:
+        sizes = with_visual_residual(sizes, config.model.visual_residual)
     return sizes
 
 
@@ -178,7 +177,7 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
     if differing:
         raise ConfigError(
             f"init_from is {source}, a network of other sizes: {'; '.join(differing)}. Give the preset that "
-            "it was trained with, and the same autoregressive and visual_residual."
+            "it was trained with, and the same settings of the model."
         )
 
 

@@ -48,6 +48,20 @@ class LoaderConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ModelConfig:
+    """Parts of the network that differ from the preset; None is as the preset has it.
+
+    Args:
+        head: Action head: "bins", independent ones; "autoregressive" bins; "mixture", a mixture density over
+            positions and rotation; or "regression". Pointer models (nano, small) have their own.
+        visual_residual: Add object tokens to the encoded prompt (MIDAS).
+    """
+
+    head: Literal["bins", "autoregressive", "mixture", "regression"] | None = None
+    visual_residual: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class OptimizerConfig:
     """AdamW.
 
@@ -241,12 +255,11 @@ class TrainingConfig(RunConfig):
     Args:
         preset: Network and sizes, such as "nano" or "gato-nano" (`openvima policies` lists them); or
             "module:function" for a `Learner` of your own.
-        autoregressive: Autoregressive action decoding; None is as the preset has it.
-        visual_residual: Add object tokens to the encoded prompt; None is as the preset has it.
         init_from: Initial weights: another run, or whatever else `load_policy` takes.
         t5: Source of the T5 weights and tokenizer, for presets that use them: a folder, or an id on the
             Hugging Face Hub such as "t5-base".
         assets: Asset pack of pretraining: "procedural", the folder of the original one, or FILE.py:FUNCTION.
+        model: Parts of the network that differ from the preset.
         object_cache: Folder of the object cache; None keeps it beside the demonstrations.
         loader: Batches and held-out demonstrations.
         rollout: Rollouts during training.
@@ -255,8 +268,7 @@ class TrainingConfig(RunConfig):
     """
 
     preset: str = "nano"
-    autoregressive: bool | None = None
-    visual_residual: bool | None = None
+    model: ModelConfig = ModelConfig()
     init_from: str | None = None
     t5: str | None = None
     assets: str = "procedural"

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
-from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.resampler import ResamplerConfig
 from openvima.policies.nn.vit import VitConfig, check_frame_encoder
@@ -22,7 +22,7 @@ class FlamingoConfig:
         resampler: The resampler of the patches of both views.
         prompt: The prompt encoder.
         decoder: The decoder.
-        head: Independent or autoregressive bins.
+        head: The action head.
     """
 
     architecture: ClassVar[str] = "flamingo"
@@ -30,7 +30,7 @@ class FlamingoConfig:
     resampler: ResamplerConfig
     prompt: PromptEncoderConfig
     decoder: DecoderConfig
-    head: BinsConfig | AutoregressiveConfig
+    head: HeadConfig
 
     def __post_init__(self) -> None:
         check_frame_encoder(self.frame, self.decoder.width, class_token=False)

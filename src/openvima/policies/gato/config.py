@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
-from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.vit import VitConfig, check_frame_encoder
 from openvima.policies.sizes import Size
@@ -20,14 +20,14 @@ class GatoConfig:
         frame: The encoder of whole frames; its features are as wide as the decoder.
         prompt: The prompt encoder.
         decoder: The decoder.
-        head: Independent or autoregressive bins.
+        head: The action head.
     """
 
     architecture: ClassVar[str] = "gato"
     frame: VitConfig
     prompt: PromptEncoderConfig
     decoder: PrefixDecoderConfig
-    head: BinsConfig | AutoregressiveConfig
+    head: HeadConfig
 
     def __post_init__(self) -> None:
         check_frame_encoder(self.frame, self.decoder.width, class_token=False)

@@ -9,13 +9,12 @@ from torch import nn
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.gato.config import GatoConfig
 from openvima.policies.nn.decoder import PrefixDecoder
+from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
-    build_action_tokens,
-    build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.vit import VisionTransformer, encode_frames
@@ -41,7 +40,7 @@ class Gato(PolicyNetwork):
         self.observation_out = nn.Linear(width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
         self.decoder = PrefixDecoder(config.decoder)
-        self.head = build_bins_head(config.head, width, actions)
+        self.head = build_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode frames (..., 3, 64, 128), uint8, to features of patches (..., P, F)."""

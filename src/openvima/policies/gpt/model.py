@@ -9,14 +9,13 @@ from torch import nn
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.gpt.config import GptConfig
 from openvima.policies.nn.decoder import PrefixDecoder
+from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import NUM_VIEWS
 from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
-    build_action_tokens,
-    build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.vit import VisionTransformer, encode_frames
@@ -42,7 +41,7 @@ class Gpt(PolicyNetwork):
         self.observation_out = nn.Linear(NUM_VIEWS * width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
         self.decoder = PrefixDecoder(config.decoder)
-        self.head = build_bins_head(config.head, width, actions)
+        self.head = build_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode frames (..., 3, 64, 128), uint8, to class vectors (..., F)."""

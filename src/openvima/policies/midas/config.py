@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.sizes import Size
@@ -20,14 +20,14 @@ class MidasConfig:
         images: The object encoder, with a token for each view.
         prompt: The prompt encoder.
         decoder: The decoder.
-        head: Autoregressive or independent bins.
+        head: The action head.
     """
 
     architecture: ClassVar[str] = "midas"
     images: ObjectEncoderConfig
     prompt: PromptEncoderConfig
     decoder: PrefixDecoderConfig
-    head: BinsConfig | AutoregressiveConfig
+    head: HeadConfig
 
     def __post_init__(self) -> None:
         check_widths(self.images.width, self.decoder.width)

@@ -9,14 +9,13 @@ from torch import nn
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.decoder import PrefixDecoder
+from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
-    build_action_tokens,
-    build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 
@@ -43,7 +42,7 @@ class Midas(PolicyNetwork):
         self.observation_out = nn.Linear(config.images.width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
         self.decoder = PrefixDecoder(config.decoder)
-        self.head = build_bins_head(config.head, width, actions)
+        self.head = build_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""

@@ -14,7 +14,14 @@ from torch import nn
 
 from openvima.errors import ConfigError
 from openvima.policies.nn.actions import ACTION_WIDTH, ActionTargets, DecodingStrategy, greedy, to_unit_range
-from openvima.policies.nn.bins import NUM_BINS, actions_from_bins, bin_classifiers, bins_loss, encode_bins
+from openvima.policies.nn.bins import (
+    NUM_BINS,
+    SCORE,
+    actions_from_bins,
+    bin_classifiers,
+    bins_loss,
+    encode_bins,
+)
 from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
 from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations
 
@@ -45,6 +52,8 @@ class AutoregressiveHead(nn.Module):
             |     |    |   |   |   |   |    |    |   |   |   |
             x0    y0   a0  b0  c0  d0  x1   y1   a1  b1  c1  d1
     """
+
+    score = SCORE
 
     def __init__(self, hidden_width: int, width: int, actions: "ComponentTokens") -> None:
         super().__init__()

@@ -13,18 +13,16 @@ import torch
 from torch import nn
 
 from openvima.policies.nn.action_encoder import ActionEncoder
+from openvima.policies.nn.action_head import ActionHead
 from openvima.policies.nn.actions import (
     ACTION_PARTS,
     ActionTargets,
     DecodingStrategy,
     from_unit_range,
-    greedy,
     masked_mean,
     nll,
     to_unit_range,
 )
-from openvima.policies.nn.decoder import CausalDecoder, KVCache, TokenSegment
-from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations, shift_actions
 from openvima.policies.nn.mlp import mlp, scale_last
 
 NUM_BINS = (50, 100, 50, 50, 50, 50) * 2  # x, y, quaternion of pose0, then of pose1
@@ -44,48 +42,33 @@ class BinsConfig:
     action_width: int = 256
 
 
-class BinsHead(nn.Module):
-    """Twelve classifiers on the action query; a past action is one token of the history."""
+class BinsHead(ActionHead):
+    """Twelve classifiers on the action query, each component independent of the others."""
+
+    score = SCORE
 
     def __init__(self, hidden_width: int, width: int, actions: ActionEncoder) -> None:
-        super().__init__()
-        self.actions = actions
+        super().__init__(actions)
         self.classifiers = bin_classifiers(hidden_width, width)
 
-    def loss(
-        self, decoder: CausalDecoder, cache: KVCache, observations: ObservationTokens, targets: ActionTargets
+    def action_loss(
+        self, query_BTD: torch.Tensor, targets: ActionTargets
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Return the loss of whole histories and its metrics; see `bins_loss`."""
-        previous = self._segment(*shift_actions(targets), observations.tokens_BTQD.dtype)
-        outputs_BTQD, _ = decode_observations(decoder, cache, observations, previous)
-        return bins_loss(self.logits(observations.query(outputs_BTQD)), targets)
+        """Return the loss and its metrics; see `bins_loss`."""
+        return bins_loss(self.logits(query_BTD), targets)
 
-    def decode_step(
-        self,
-        decoder: CausalDecoder,
-        cache: KVCache,
-        observations: ObservationTokens,
-        previous_BTC: torch.Tensor,
-        has_previous_BT: torch.Tensor,
-        strategy: DecodingStrategy = greedy,
-    ) -> tuple[torch.Tensor, KVCache]:
-        """Decode the next action, each component independently of the others."""
-        previous = self._segment(previous_BTC, has_previous_BT, observations.tokens_BTQD.dtype)
-        outputs_BTQD, cache = decode_observations(decoder, cache, observations, previous)
-        bins = [strategy(logits) for logits in self.logits(observations.query(outputs_BTQD))]
-        return actions_from_bins(torch.stack(bins, dim=-1), outputs_BTQD.dtype), cache
+    def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
+        """Decode the bin of each component."""
+        bins = [strategy(logits) for logits in self.logits(query_BTD)]
+        return actions_from_bins(torch.stack(bins, dim=-1), query_BTD.dtype)
+
+    def past_actions(self, actions_BTC: torch.Tensor) -> torch.Tensor:
+        """Map past actions to the bins that the head would have given, in unit range; float64."""
+        return decode_bins(encode_bins(super().past_actions(actions_BTC)), torch.float64)
 
     def logits(self, query_BTD: torch.Tensor) -> list[torch.Tensor]:
         """Return one tensor (B, T, K) for each of the twelve components."""
         return [classifier(query_BTD) for classifier in self.classifiers]
-
-    def _segment(
-        self, actions_BTC: torch.Tensor, exists_BT: torch.Tensor, dtype: torch.dtype
-    ) -> TokenSegment:
-        # Bins need all digits, whatever the network computes in.
-        bins_BTC = encode_bins(to_unit_range(actions_BTC.to(torch.float64)))
-        unit_BTC = decode_bins(bins_BTC, torch.float64).to(dtype)  # past actions as the head expresses them
-        return action_segment(self.actions(unit_BTC)[:, :, None], exists_BT)
 
 
 def bin_classifiers(hidden_width: int, width: int) -> nn.ModuleList:

@@ -12,10 +12,7 @@ import torch
 from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy
-from openvima.policies.nn.autoregressive import AutoregressiveConfig, AutoregressiveHead, ComponentTokens
-from openvima.policies.nn.bins import SCORE, BinsConfig, BinsHead
 from openvima.policies.nn.decoder import CausalDecoder, CrossBlock, Decoder
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
@@ -44,22 +41,28 @@ class PolicyNetwork(nn.Module):
     """Multimodal prompt and history to actions.
 
     A model defines its parts, `encode_images`, `encode_prompt` and `observe`. Decoding, the loss and acting
-    are those of an action head over bins; the pointer models replace them.
+    are those of its action head; the pointer models replace them.
 
     Attributes:
         config: All sizes.
-        score: The metric that selects the best checkpoint, a fraction of 1.
-        explains: Whether `explain_step` is of use.
     """
 
     config: Any  # the config of the model
     prompt: PromptEncoder
     decoder: CausalDecoder
-    head: Any  # over bins; the pointer models have their own
+    head: Any  # one of `nn/heads.py`; the pointer models have their own
     end_effectors: nn.Embedding
     observation_out: nn.Linear
-    score = SCORE
-    explains = False  # whether there is `explain_step`
+
+    @property
+    def explains(self) -> bool:
+        """Whether `explain_step` is of use."""
+        return False
+
+    @property
+    def score(self) -> str:
+        """The metric that selects the best checkpoint, a fraction of 1."""
+        return self.head.score
 
     @property
     def object_encoder(self) -> ObjectEncoder | None:
@@ -182,21 +185,3 @@ class PolicyNetwork(nn.Module):
         mask_BTQ = history.steps_BT[..., None].expand(tokens_BTQD.shape[:3])
         query_BT = torch.full_like(history.num_slots_BT, tokens_BTQD.shape[2] - 1)
         return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, history.steps_BT)
-
-
-def build_action_tokens(
-    config: BinsConfig | AutoregressiveConfig, width: int
-) -> ActionEncoder | ComponentTokens:
-    """Build the tokens of past actions; before the decoder, so that a seed gives the same weights."""
-    if isinstance(config, AutoregressiveConfig):
-        return ComponentTokens(width, config.token_std)
-    return ActionEncoder(config.action_width, width)
-
-
-def build_bins_head(
-    config: BinsConfig | AutoregressiveConfig, width: int, actions: ActionEncoder | ComponentTokens
-) -> BinsHead | AutoregressiveHead:
-    """Build the head that goes with the tokens of past actions."""
-    if isinstance(actions, ComponentTokens):
-        return AutoregressiveHead(config.hidden_width, width, actions)
-    return BinsHead(config.hidden_width, width, actions)

@@ -71,7 +71,7 @@ class Pointer(PolicyNetwork):
     """
 
     score = "accuracy"
-    explains = True
+    explains = True  # type: ignore[assignment]
 
     def __init__(self, config: PointerConfig) -> None:
         super().__init__()

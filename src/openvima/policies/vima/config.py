@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
-from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
 from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.sizes import Size, size
@@ -21,7 +21,7 @@ class VimaConfig:
         images: The object encoder.
         prompt: The prompt encoder.
         decoder: The decoder.
-        head: Independent or autoregressive bins.
+        head: The action head.
         query_token: Append a learned token to each step's objects and decode the action from there, instead
             of from the last object token.
     """
@@ -30,7 +30,7 @@ class VimaConfig:
     images: ObjectEncoderConfig
     prompt: PromptEncoderConfig
     decoder: DecoderConfig
-    head: BinsConfig | AutoregressiveConfig
+    head: HeadConfig
     query_token: bool = False
 
     def __post_init__(self) -> None:

@@ -7,15 +7,16 @@ import torch
 from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
+from openvima.policies.nn.autoregressive import AutoregressiveHead
+from openvima.policies.nn.bins import BinsHead
 from openvima.policies.nn.decoder import Decoder
+from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import (
     NUM_END_EFFECTORS,
     EncodedPrompt,
     PolicyNetwork,
-    build_action_tokens,
-    build_bins_head,
 )
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.vima.config import VimaConfig
@@ -37,8 +38,6 @@ class Vima(PolicyNetwork):
     Source: VIMA (Jiang et al. 2023), section 4.
     """
 
-    explains = True
-
     def __init__(self, config: VimaConfig) -> None:
         super().__init__()
         width = config.decoder.width
@@ -50,7 +49,12 @@ class Vima(PolicyNetwork):
         actions = build_action_tokens(config.head, width)
         self.decoder = Decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
-        self.head = build_bins_head(config.head, width, actions)
+        self.head = build_head(config.head, width, actions)
+
+    @property
+    def explains(self) -> bool:
+        """Whether `explain_step` is of use: only bins have probabilities to show."""
+        return isinstance(self.head, BinsHead | AutoregressiveHead)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""

@@ -1,0 +1,240 @@
+"""Continuous action heads: a mixture density, and plain regression.
+
+Both express an action by six numbers: the planar positions of pick and place in unit range, and the
+rotation between them as cosine and sine. Only the difference of the two yaws turns an object, so the rotation
+at the pick is none.
+
+Shape suffixes: B batch, T steps, D width, C components of an action, K components of the mixture.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.errors import ConfigError
+from openvima.policies.nn.action_encoder import ActionEncoder
+from openvima.policies.nn.action_head import ActionHead
+from openvima.policies.nn.actions import (
+    ACTION_PARTS,
+    ActionTargets,
+    DecodingStrategy,
+    from_unit_range,
+    greedy,
+    masked_mean,
+    to_unit_range,
+)
+from openvima.policies.nn.mlp import mlp, scale_last
+
+SCORE = "accuracy"
+NEAR_M = 0.02  # position error, and
+NEAR_RAD = math.radians(5)  # rotation error of an action that counts as accurate
+_POSITIONS = 4  # x, y of pick and of place
+
+
+@dataclass(frozen=True, slots=True)
+class MixtureConfig:
+    """Sizes of the mixture-density head.
+
+    Args:
+        hidden_width: Width of the two hidden layers.
+        action_width: Width of the features of each part of a past action.
+        num_components: Components of the mixture.
+        min_std: Smallest standard deviation of a position, in unit range (0.05 is 25 mm in x, 50 mm in y),
+            and of the rotation, in radians. It bounds the density, which has no maximum otherwise; with
+            0.005 a short training did not learn which component is right. Modes can be more precise.
+    """
+
+    hidden_width: int = 512
+    action_width: int = 256
+    num_components: int = 5
+    min_std: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.num_components < 1 or not 0 < self.min_std < 1:
+            raise ConfigError(
+                f"mixture head: num_components is {self.num_components} and min_std {self.min_std}; they "
+                "must be at least 1, and between 0 and 1."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class RegressionConfig:
+    """Sizes of the regression head.
+
+    Args:
+        hidden_width: Width of the two hidden layers.
+        action_width: Width of the features of each part of a past action.
+        huber_delta: Error above which the loss grows linearly, in unit range.
+    """
+
+    hidden_width: int = 512
+    action_width: int = 256
+    huber_delta: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0 < self.huber_delta <= 1:
+            raise ConfigError(
+                f"regression head: huber_delta is {self.huber_delta}; it must be above 0 and at most 1."
+            )
+
+
+class MixtureHead(ActionHead):
+    """A mixture of Gaussians over the positions and von Mises distributions over the rotation.
+
+    The action is the mode of the likeliest component. Where two actions would be right, their mean is not.
+
+    Source: mixture density networks, Bishop 1994. The von Mises distribution is the Gaussian of a circle.
+    """
+
+    score = SCORE
+
+    def __init__(self, config: MixtureConfig, width: int, actions: ActionEncoder) -> None:
+        super().__init__(actions)
+        self.num_components, self.min_std = config.num_components, config.min_std
+        hidden = (width, config.hidden_width, config.hidden_width)
+        # Weights have layers of their own: gradients of narrow components would drown theirs.
+        self.gate = scale_last(mlp((*hidden, config.num_components)), gain=0.01)
+        # Of each component: means, cosine and sine, logarithms of the five standard deviations.
+        count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
+        self.out = scale_last(mlp((*hidden, count)), gain=0.01)
+        with torch.no_grad():
+            bias = self.out[-1].bias.view(config.num_components, -1)
+            nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
+            bias[:, _POSITIONS] = 1.0
+            bias[:, _POSITIONS + 2 :] = math.log(0.25)
+
+    def action_loss(
+        self, query_BTD: torch.Tensor, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the negative log-likelihood of the demonstrated actions, and the metrics of `_metrics`."""
+        loss = masked_mean(-self.log_density(query_BTD, targets.actions_BTC), targets.steps_BT)
+        with torch.no_grad():
+            actions_BTC = self.action(query_BTD, greedy)
+        return loss, {"loss/action": loss.detach(), **_metrics(actions_BTC, targets)}
+
+    def log_density(self, query_BTD: torch.Tensor, actions_BTC: torch.Tensor) -> torch.Tensor:
+        """Return the logarithm of the density, (B, T), per unit range of each position and radian."""
+        logits_BTK, means_BTKP, yaws_BTK2, log_stds_BTKS = self._components(query_BTD)
+        positions_BTP, yaw_BT2 = _planar(actions_BTC, query_BTD.dtype)
+        stds_BTKS = log_stds_BTKS.exp()
+        errors_BTKP = (positions_BTP[:, :, None] - means_BTKP) / stds_BTKS[..., :_POSITIONS]
+        normal_BTK = -(0.5 * errors_BTKP.square() + log_stds_BTKS[..., :_POSITIONS]).sum(-1)
+        kappa_BTK = stds_BTKS[..., _POSITIONS] ** -2
+        cosine_BTK = (yaw_BT2[:, :, None] * yaws_BTK2).sum(-1)
+        # I0(κ) e^-κ does not overflow.
+        von_mises_BTK = kappa_BTK * (cosine_BTK - 1) - torch.special.i0e(kappa_BTK).log()
+        weights_BTK = torch.log_softmax(logits_BTK, dim=-1)
+        scale = (0.5 * _POSITIONS + 1) * math.log(2 * math.pi)
+        return torch.logsumexp(weights_BTK + normal_BTK + von_mises_BTK, dim=-1) - scale
+
+    def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
+        """Return the mode of the component that the strategy chooses."""
+        logits_BTK, means_BTKP, yaws_BTK2, _ = self._components(query_BTD)
+        chosen_BT = strategy(logits_BTK)
+        return _actions(_of(means_BTKP, chosen_BT), _of(yaws_BTK2, chosen_BT))
+
+    def _components(self, query_BTD: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Logits, means, unit vectors of the rotation, and logarithms of standard deviations."""
+        values = self.out(query_BTD).unflatten(-1, (self.num_components, -1))
+        means, yaws, log_stds = values.split((_POSITIONS, 2, _POSITIONS + 1), dim=-1)
+        log_stds = log_stds.clamp(math.log(self.min_std), 0.0)
+        return self.gate(query_BTD), means, F.normalize(yaws, dim=-1), log_stds
+
+
+class RegressionHead(ActionHead):
+    """Regresses positions, cosine and sine with the Huber loss."""
+
+    score = SCORE
+
+    def __init__(self, config: RegressionConfig, width: int, actions: ActionEncoder) -> None:
+        super().__init__(actions)
+        self.huber_delta = config.huber_delta
+        hidden = config.hidden_width
+        self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
+        with torch.no_grad():
+            self.out[-1].bias[:_POSITIONS] = 0.5
+            self.out[-1].bias[_POSITIONS] = 1.0
+
+    def action_loss(
+        self, query_BTD: torch.Tensor, targets: ActionTargets
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Return the Huber loss of positions and rotation, in units of its delta, and `_metrics`."""
+        positions_BTP, yaw_BT2 = self.out(query_BTD).split((_POSITIONS, 2), dim=-1)
+        target_BTP, target_BT2 = _planar(targets.actions_BTC, query_BTD.dtype)
+        losses = {
+            "position": self._huber(positions_BTP, target_BTP),
+            "rotation": self._huber(yaw_BT2, target_BT2),
+        }
+        parts = {f"loss/{name}": masked_mean(loss_BT, targets.steps_BT) for name, loss_BT in losses.items()}
+        actions_BTC = _actions(positions_BTP.detach(), yaw_BT2.detach())
+        detached = {name: value.detach() for name, value in parts.items()}
+        return torch.stack(list(parts.values())).sum(), {**detached, **_metrics(actions_BTC, targets)}
+
+    def action(self, query_BTD: torch.Tensor, strategy: DecodingStrategy) -> torch.Tensor:
+        """Return the regressed actions; there is nothing to choose from."""
+        positions_BTP, yaw_BT2 = self.out(query_BTD).split((_POSITIONS, 2), dim=-1)
+        return _actions(positions_BTP, yaw_BT2)
+
+    def _huber(self, values: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        loss = F.huber_loss(values, targets, reduction="none", delta=self.huber_delta)
+        return loss.sum(-1) / self.huber_delta
+
+
+def _of(values_BTKX: torch.Tensor, chosen_BT: torch.Tensor) -> torch.Tensor:
+    """Values of the chosen component, (B, T, X)."""
+    index = chosen_BT[..., None, None].expand(-1, -1, 1, values_BTKX.shape[-1])
+    return values_BTKX.gather(2, index).squeeze(2)
+
+
+def _yaw(quaternions: torch.Tensor) -> torch.Tensor:
+    """Yaw of quaternions xyzw, shape (..., 4), radians."""
+    x, y, z, w = quaternions.unbind(-1)
+    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _planar(actions_BTC: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions in unit range, (B, T, 4), and cosine and sine of the rotation, (B, T, 2)."""
+    unit_BTC, poses = to_unit_range(actions_BTC), ("pose0", "pose1")
+    positions = torch.cat([unit_BTC[..., ACTION_PARTS[f"{pose}_position"]] for pose in poses], dim=-1)
+    yaw0, yaw1 = (_yaw(actions_BTC[..., ACTION_PARTS[f"{pose}_rotation"]]) for pose in poses)
+    rotation = yaw1 - yaw0
+    return positions.to(dtype), torch.stack([rotation.cos(), rotation.sin()], dim=-1).to(dtype)
+
+
+def _actions(positions_BTP: torch.Tensor, yaw_BT2: torch.Tensor) -> torch.Tensor:
+    """Actions in metres and quaternions, in float32 at least; the rotation need not have unit length."""
+    dtype = torch.promote_types(positions_BTP.dtype, torch.float32)
+    cosine, sine = yaw_BT2.to(dtype).unbind(-1)
+    half = torch.atan2(sine, cosine) / 2
+    zero, one = torch.zeros_like(half), torch.ones_like(half)
+    quaternions = torch.stack([zero, zero, zero, one, zero, zero, half.sin(), half.cos()], dim=-1)
+    pick, place = positions_BTP.to(dtype).split(2, dim=-1)
+    rotation0, rotation1 = ((quaternions + 1) / 2).split(4, dim=-1)  # to unit range
+    return from_unit_range(torch.cat([pick, rotation0, place, rotation1], dim=-1))
+
+
+def _metrics(actions_BTC: torch.Tensor, targets: ActionTargets) -> dict[str, torch.Tensor]:
+    """Accuracy, and mean errors of positions in metres and of the rotation in radians.
+
+    An action is accurate if both positions are within 2 cm and the rotation within 5° of the demonstrated.
+    """
+    errors = {
+        name: (actions_BTC[..., ACTION_PARTS[name]] - targets.actions_BTC[..., ACTION_PARTS[name]]).norm(
+            dim=-1
+        )
+        for name in ("pose0_position", "pose1_position")
+    }
+    _, wanted_BT2 = _planar(targets.actions_BTC, actions_BTC.dtype)
+    _, given_BT2 = _planar(actions_BTC, actions_BTC.dtype)
+    errors["rotation"] = (wanted_BT2 * given_BT2).sum(-1).clamp(-1, 1).acos()
+    is_near = [error <= (NEAR_RAD if name == "rotation" else NEAR_M) for name, error in errors.items()]
+    values = {
+        "accuracy": torch.stack(is_near).all(0),
+        **{f"{name}_error": error for name, error in errors.items()},
+    }
+    return {
+        name: masked_mean(value.to(actions_BTC.dtype), targets.steps_BT) for name, value in values.items()
+    }
