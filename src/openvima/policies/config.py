@@ -65,8 +65,11 @@ def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
     kind, head = HEADS[name], config.head
     if isinstance(head, kind):
         return config
-    std = {"token_std": config.decoder.initial_std} if kind is AutoregressiveConfig else {}
-    return replace(config, head=kind(head.hidden_width, action_width=head.action_width, **std))
+    if kind is AutoregressiveConfig:
+        new = AutoregressiveConfig(head.hidden_width, config.decoder.initial_std, head.action_width)
+    else:
+        new = kind(head.hidden_width, action_width=head.action_width)
+    return replace(config, head=new)
 
 
 def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:

@@ -120,9 +120,11 @@ def _plain(hint: Any) -> tuple[Any, Range | None]:  # Any: types
 def _problem(name: str, value: Any, hint: Any) -> str | None:  # Any: a value may be anything; types
     options = _options(hint)
     plain, limits = _plain(options[0])
+    if value is None and NoneType in options:
+        return None
     if get_origin(plain) is Literal:
         return None if value in get_args(plain) else unknown_name(name, value, get_args(plain))
-    if plain not in _TYPES or (value is None and NoneType in options):
+    if plain not in _TYPES:
         return None
     kind, called = _TYPES[plain]
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):

@@ -100,8 +100,8 @@ class MixtureHead(ActionHead):
         # Of each component: means, cosine and sine, logarithms of the five standard deviations.
         count = config.num_components * (_POSITIONS + 2 + _POSITIONS + 1)
         self.out = scale_last(mlp((*hidden, count)), gain=0.01)
+        bias = _last_bias(self.out).view(config.num_components, -1)
         with torch.no_grad():
-            bias = self.out[-1].bias.view(config.num_components, -1)
             nn.init.uniform_(bias[:, :_POSITIONS])  # equal components would stay equal
             bias[:, _POSITIONS] = 1.0
             bias[:, _POSITIONS + 2 :] = math.log(0.25)
@@ -154,9 +154,10 @@ class RegressionHead(ActionHead):
         self.huber_delta = config.huber_delta
         hidden = config.hidden_width
         self.out = scale_last(mlp((width, hidden, hidden, _POSITIONS + 2)), gain=0.01)
+        bias = _last_bias(self.out)
         with torch.no_grad():
-            self.out[-1].bias[:_POSITIONS] = 0.5
-            self.out[-1].bias[_POSITIONS] = 1.0
+            bias[:_POSITIONS] = 0.5
+            bias[_POSITIONS] = 1.0
 
     def action_loss(
         self, query_BTD: torch.Tensor, targets: ActionTargets
@@ -181,6 +182,12 @@ class RegressionHead(ActionHead):
     def _huber(self, values: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
         loss = F.huber_loss(values, targets, reduction="none", delta=self.huber_delta)
         return loss.sum(-1) / self.huber_delta
+
+
+def _last_bias(layers: nn.Sequential) -> torch.Tensor:
+    last = layers[-1]
+    assert isinstance(last, nn.Linear)
+    return last.bias
 
 
 def _of(values_BTKX: torch.Tensor, chosen_BT: torch.Tensor) -> torch.Tensor:

@@ -53,11 +53,7 @@ class PolicyNetwork(nn.Module):
     head: Any  # one of `nn/heads.py`; the pointer models have their own
     end_effectors: nn.Embedding
     observation_out: nn.Linear
-
-    @property
-    def explains(self) -> bool:
-        """Whether `explain_step` is of use."""
-        return False
+    explains: bool = False  # whether `explain_step` is of use
 
     @property
     def score(self) -> str:

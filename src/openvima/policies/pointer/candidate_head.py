@@ -61,6 +61,8 @@ class CandidatePointerHead(nn.Module):
     head has.
     """
 
+    score = "accuracy"
+
     def __init__(self, config: CandidateHeadConfig, width: int, rotation_bins: int = 0) -> None:
         super().__init__()
         self.config = config

@@ -70,8 +70,7 @@ class Pointer(PolicyNetwork):
     embeddings, pretrained by contrast, then match prompt objects with objects in view.
     """
 
-    score = "accuracy"
-    explains = True  # type: ignore[assignment]
+    explains = True
 
     def __init__(self, config: PointerConfig) -> None:
         super().__init__()

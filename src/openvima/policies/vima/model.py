@@ -50,11 +50,7 @@ class Vima(PolicyNetwork):
         self.decoder = Decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
-
-    @property
-    def explains(self) -> bool:
-        """Whether `explain_step` is of use: only bins have probabilities to show."""
-        return isinstance(self.head, BinsHead | AutoregressiveHead)
+        self.explains = isinstance(self.head, BinsHead | AutoregressiveHead)  # others have no bins to show
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
