@@ -36,7 +36,8 @@ from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.comparison import Comparison
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
-from openvima.policies import preset
+from openvima.policies.bundled import BUNDLED
+from openvima.policies.checkpoint import read_info
 from openvima.policies.parameter_counts import policy_size
 from openvima.report.paper import Estimate, Line, Table, markdown, paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
@@ -182,12 +183,12 @@ def _beside() -> list[PublishedModel]:
 
 
 def _level_table(findings: Findings, models: Sequence[PublishedModel]) -> Table:
-    means, size = findings.means(), policy_size(preset("small")).parameters.total
+    means, size = findings.means(), policy_size(read_info(BUNDLED["openvima-small"].folder).config).parameters.total
     own = (f"{size / 1e6:.1f}M", f"{findings.demonstrations:,}", *(_estimate(means.get(x)) for x in LEVELS))
     lines = [Line(findings.policy, own)]
     for model in models:
         cells = (f"{model.size} and T5", f"{PUBLISHED_DEMONSTRATIONS:,}")
-        rates = (model.written(level).replace("*", "") for level in LEVELS)
+        rates = (model.written(level, model.levels[level], keep_marks=False) for level in LEVELS)
         lines.append(Line(f"{model.model}, published", (*cells, *rates)))
     return Table("levels", "", ("", "parameters", "demonstrations", *LEVELS), tuple(lines))
 

@@ -141,7 +141,10 @@ def test_an_empty_folder_holds_no_data_set(tmp_path: Path) -> None:
         summarise_folder(tmp_path)
 
 
-def test_the_terminal_shows_the_whole(demos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_terminal_shows_the_whole(
+    demos: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "150")
     assert main(["data", "info", str(demos), "--details"]) == 0
     shown = capsys.readouterr().out
     assert f"{demos}: 9 episodes" in shown
