@@ -183,7 +183,10 @@ def _beside() -> list[PublishedModel]:
 
 
 def _level_table(findings: Findings, models: Sequence[PublishedModel]) -> Table:
-    means, size = findings.means(), policy_size(read_info(BUNDLED["openvima-small"].folder).config).parameters.total
+    means, size = (
+        findings.means(),
+        policy_size(read_info(BUNDLED["openvima-small"].folder).config).parameters.total,
+    )
     own = (f"{size / 1e6:.1f}M", f"{findings.demonstrations:,}", *(_estimate(means.get(x)) for x in LEVELS))
     lines = [Line(findings.policy, own)]
     for model in models:
