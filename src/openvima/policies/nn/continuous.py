@@ -84,7 +84,7 @@ class RegressionConfig:
 class MixtureHead(ActionHead):
     """A mixture of Gaussians over the positions and von Mises distributions over the rotation.
 
-    The action is the mode of the most probable component. Where two actions would be right, their mean is not.
+    The action is the mode of the most probable component: where two actions are right, their mean is not.
 
     Source: mixture density networks, Bishop 1994. The von Mises distribution is the Gaussian of a circle.
     """
