@@ -1,16 +1,21 @@
 """Bounded reading of files that others wrote: regular files only, limited size, plain values only."""
 
+import io
 import json
 import os
 import stat
+import warnings
 from collections import Counter
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from openvima.errors import InputFileError
+
+if TYPE_CHECKING:
+    import PIL.Image
 
 MAX_TEXT_BYTES = 64 * 1024  # of a config; the longest of the package has 10 kB
 _MAX_DEPTH = 32
@@ -74,6 +79,48 @@ def read_json(file: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:  # Any: pl
     except (ValueError, RecursionError) as error:
         raise InputFileError(f"{file} is no valid JSON: {_reason(error)}.") from None
     return _checked(values, file)
+
+
+def read_png(file: Path, *, max_bytes: int, max_side: int) -> "PIL.Image.Image":
+    """Decode a PNG file of limited size.
+
+    Args:
+        file: The file.
+        max_bytes: Largest size of the file.
+        max_side: Largest width and height, pixels; they are checked before anything is decoded.
+
+    Returns:
+        The image, in mode RGBA.
+
+    Raises:
+        InputFileError: There is no such file, it is no regular file, too large, or no PNG file.
+    """
+    from PIL import Image
+
+    try:
+        with open_regular(file) as stream:
+            content = stream.read(max_bytes + 1)
+    except InputFileError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputFileError(f"{str(file)!r} cannot be read: {reason}.") from None
+    if len(content) > max_bytes:
+        raise InputFileError(f"{str(file)!r} has more than {max_bytes:,} bytes, the most allowed.")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of bombs, and of damaged chunks
+            with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+                width, height = image.size
+                if max(width, height) > max_side:
+                    raise InputFileError(
+                        f"{str(file)!r} has {width} × {height} pixels; sides must lie within 1 … {max_side}."
+                    )
+                return image.convert("RGBA")
+    except InputFileError:
+        raise
+    except Exception as error:  # Pillow raises many kinds for damaged files
+        raise InputFileError(f"{str(file)!r} is no readable PNG file ({type(error).__name__}).") from None
 
 
 class _PlainLoader(yaml.SafeLoader):

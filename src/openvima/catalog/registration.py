@@ -268,29 +268,12 @@ def _identifier(name: str) -> str:
 
 def _read_png(file: Path, what: str) -> np.ndarray:
     """Decode a PNG file of limited size, shape (H, W, 3), uint8."""
-    from PIL import Image
-
-    from openvima.input_files import open_regular  # imports a YAML parser
+    from openvima.input_files import read_png  # imports a YAML parser
 
     try:
-        with open_regular(file) as stream:
-            if file.stat().st_size > MAX_PNG_BYTES:
-                raise AssetError(f"{what}: {file} has more than {MAX_PNG_BYTES >> 20} MiB.")
-            with Image.open(stream, formats=["PNG"]) as image:
-                if max(image.size) > MAX_TEXTURE_SIDE:
-                    width, height = image.size
-                    raise AssetError(
-                        f"{what}: {file} has {width} × {height} pixels; sides must lie within 1 … "
-                        f"{MAX_TEXTURE_SIDE}."
-                    )
-                pixels = np.array(image.convert("RGBA"))
+        pixels = np.asarray(read_png(file, max_bytes=MAX_PNG_BYTES, max_side=MAX_TEXTURE_SIDE))
     except InputFileError as error:
         raise AssetError(f"{what}: {error}") from None
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        if isinstance(error, AssetError):
-            raise
-        reason = " ".join(str(error).split())[:120]
-        raise AssetError(f"{what}: {file} is no readable PNG file ({reason}).") from None
     if (pixels[..., 3] != 255).any():
         raise AssetError(f"{what}: {file} is partly transparent; save it without an alpha channel.")
     return pixels[..., :3]

@@ -1,14 +1,12 @@
 """Photos of objects as prompt images: bounded reading of PNG files."""
 
-import io
-import warnings
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from openvima.errors import InputFileError
-from openvima.input_files import open_regular
+from openvima.input_files import read_png
 from openvima.render.rasteriser import PHOTO_WHITE
 from openvima.scene import PhotoImage
 from openvima.scene.prompt import PHOTO_SIDE
@@ -26,42 +24,16 @@ def read_photo(file: Path) -> PhotoImage:
         InputFileError: There is no such file, it is no regular file, no PNG, too large, or empty.
     """
     try:
-        with open_regular(file) as stream:
-            content = stream.read(MAX_PNG_BYTES + 1)
-    except InputFileError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputFileError(f"photo {str(file)!r} cannot be read: {reason}.") from None
-    if len(content) > MAX_PNG_BYTES:
-        raise InputFileError(f"photo {str(file)!r} has more than {MAX_PNG_BYTES:,} bytes, the most allowed.")
-    pixels = _on_white(content, file)
+        picture = read_png(file, max_bytes=MAX_PNG_BYTES, max_side=MAX_PNG_SIDE)
+    except InputFileError as error:
+        raise InputFileError(f"photo {error}") from None
+    paper = Image.new("RGBA", picture.size, "white")
+    pixels = np.asarray(Image.alpha_composite(paper, picture).convert("RGB"))
     is_object = (pixels < PHOTO_WHITE).any(axis=-1)
     if not is_object.any():
         raise InputFileError(f"photo {str(file)!r} is all white; it must show an object on white.")
     rows, columns = np.flatnonzero(is_object.any(axis=-1)), np.flatnonzero(is_object.any(axis=0))
     return _fitted(Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]))
-
-
-def _on_white(content: bytes, file: Path) -> np.ndarray:
-    """Decode a PNG of limited size onto white, shape (H, W, 3), uint8."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # of bombs, and of damaged chunks
-            with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-                width, height = image.size
-                if max(width, height) > MAX_PNG_SIDE:
-                    raise InputFileError(
-                        f"photo {str(file)!r} has {width} × {height} pixels; "
-                        f"at most {MAX_PNG_SIDE} × {MAX_PNG_SIDE} are allowed."
-                    )
-                picture = image.convert("RGBA")
-    except InputFileError:
-        raise
-    except Exception as error:  # Pillow raises many kinds for damaged files
-        raise InputFileError(f"photo {str(file)!r} is no valid PNG ({type(error).__name__}).") from None
-    paper = Image.new("RGBA", picture.size, "white")
-    return np.asarray(Image.alpha_composite(paper, picture).convert("RGB"))
 
 
 def _fitted(picture: Image.Image) -> PhotoImage:
