@@ -141,9 +141,7 @@ def render_pairs(
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
         episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
-        scene = _retextured(
-            episode.problem.scene, task_spec(task).pool("train"), np.random.default_rng(episode_seed)
-        )
+        scene = _retextured(episode.problem.scene, pools[task], np.random.default_rng(episode_seed))
         # A generator of its own, so that the scenes below are the same with any augmentation.
         rng = np.random.default_rng([episode_seed, 1])
         scene = augmentation(scene, shades, rasteriser.assets, rng)
