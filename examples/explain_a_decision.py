@@ -20,12 +20,12 @@ while True:
     print(f"Step {info['num_steps'] + 1}")
     for each in sorted(explanation.objects, key=lambda each: -each.probability):
         names = info["objects"][each.object_id]
-        print(f"  pick  {each.probability:6.1%}  {names['texture']} {names['object']}")
+        print(f"  pick   {each.probability:6.1%}  {names['texture']} {names['object']}")
     for place in sorted(explanation.places, key=lambda place: -place.probability)[:2]:
-        print(f"  place {place.probability:6.1%}  {place.kind}, {np.round(place.position, 2)} m")
+        print(f"  place  {place.probability:6.1%}  {place.kind}, {np.round(place.position, 2)} m")
     best = explanation.yaw_probabilities.argmax()
     angle = np.rad2deg(explanation.yaw_rad[best])
-    print(f"  turn  {explanation.yaw_probabilities[best]:6.1%}  {angle:.0f}°, counter-clockwise above 0")
+    print(f"  rotate {explanation.yaw_probabilities[best]:6.1%}  {angle:.0f}°, counter-clockwise above 0")
     for kind, weights in explanation.attention.items():
         print(f"  the {kind} attends to {explanation.prompt[weights.argmax()]} most: {weights.max():.0%}")
     observation, _, terminated, truncated, info = env.step(action)
