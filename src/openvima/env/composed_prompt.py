@@ -1,7 +1,6 @@
 """Prompts of composed episodes: images of objects, scenes and photos from what users give."""
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from openvima.env.composed_objects import (
 )
 from openvima.errors import InputFileError, SceneError, unknown_name
 from openvima.perception.objects import MAX_OBJECTS
+from openvima.perception.preprocessing import image_names
 from openvima.scene import ObjectImage, PhotoImage, Placement, Pose, Prompt, PromptFill, SceneImage
 from openvima.tasks.sweep_table import MAGNIFICATION
 from openvima.tasks.table import TableSampler
@@ -26,7 +26,6 @@ from openvima.tasks.table import TableSampler
 MAX_PROMPT_CHARS = 1000
 MAX_IMAGES = 64
 SMALL_BLOCK = "small block"
-_PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +121,7 @@ def composed_prompt(text: object, images: object, fills: ImageMaker) -> Prompt:
         )
     if not isinstance(images, Mapping | None):
         raise SceneError(f"images is {shown(images)}; give a mapping of placeholders to images.")
-    slots = dict.fromkeys(_PLACEHOLDER.findall(text))
+    slots = image_names(text)
     if len(slots) > MAX_IMAGES:
         raise SceneError(f"the prompt has {len(slots)} placeholders; at most {MAX_IMAGES} are allowed.")
     given = dict(images or {})

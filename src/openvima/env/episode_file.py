@@ -27,6 +27,7 @@ from openvima.env.photos import read_photo
 from openvima.errors import InputFileError, OpenVimaError, SceneError, echo, unknown_name
 from openvima.input_files import read_json, read_yaml
 from openvima.perception.objects import MAX_OBJECTS
+from openvima.perception.preprocessing import image_names
 from openvima.scene import (
     FIRST_OBJECT_ID,
     AtPose,
@@ -314,8 +315,7 @@ def _ids_of(record: Any) -> set[int]:  # Any: a goal or constraint
 
 def _check_prompt(episode: Episode) -> None:
     prompt = episode.problem.prompt
-    slots = list(dict.fromkeys(re.findall(r"\{(\w+)\}", prompt.text)))
-    names = [name for name, _ in prompt.images]
+    slots, names = list(image_names(prompt.text)), [name for name, _ in prompt.images]
     if names != slots:
         raise InputFileError(f"the prompt has placeholders {shown(slots)} but images {shown(names)}.")
     for name, fill in prompt.images:

@@ -4,7 +4,6 @@ Images (crops of objects, or whole frames at half the size) are named by their i
 blank image and stands for a hidden object, everywhere.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -24,12 +23,11 @@ from openvima.perception.objects import (
 )
 from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
+from openvima.scene.prompt import PLACEHOLDER
 
 InputKind = Literal["objects", "frames"]
 KINDS: tuple[InputKind, ...] = get_args(InputKind)
 IMAGE_SIZES: dict[InputKind, tuple[int, int]] = {"objects": (CROP_SIZE, CROP_SIZE), "frames": (64, 128)}
-
-_PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,7 +208,7 @@ def offset_index(crop_index: np.ndarray, offset: int | np.ndarray) -> np.ndarray
 
 def image_names(text: str) -> tuple[str, ...]:
     """Return the placeholders of a prompt in the order in which the text first names them."""
-    return tuple(dict.fromkeys(_PLACEHOLDER.findall(text)))
+    return tuple(dict.fromkeys(PLACEHOLDER.findall(text)))
 
 
 @lru_cache(maxsize=2**16)
@@ -221,7 +219,7 @@ def split_prompt(text: str) -> tuple[str | int, ...]:
         Texts, and for each placeholder the number of its image in the order of `image_names`.
     """
     numbers = {name: number for number, name in enumerate(image_names(text))}
-    parts = _PLACEHOLDER.split(text)  # texts at even indices, names at odd ones
+    parts = PLACEHOLDER.split(text)  # texts at even indices, names at odd ones
     pieces = [numbers[part] if k % 2 else part.strip() for k, part in enumerate(parts)]
     return tuple(piece for piece in pieces if piece != "")
 

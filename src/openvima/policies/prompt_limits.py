@@ -1,12 +1,10 @@
 """What a prompt may hold, checked before any of it is encoded."""
 
-import re
 from dataclasses import dataclass
 
 from openvima.errors import PromptError
 from openvima.scene import RenderedPrompt
-
-_PLACEHOLDER = re.compile(r"\{\w+\}")
+from openvima.scene.prompt import PLACEHOLDER
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +31,7 @@ class PromptLimits:
         """
         found = {"chars": len(prompt.text), "images": 0, "objects": 0}
         if found["chars"] <= self.chars:
-            found["images"] = max(len(prompt.images), len(_PLACEHOLDER.findall(prompt.text)))
+            found["images"] = max(len(prompt.images), len(PLACEHOLDER.findall(prompt.text)))
             found["objects"] = sum(len(image.objects) for image in prompt.images.values())
         for name, number in found.items():
             if number > (allowed := getattr(self, name)):

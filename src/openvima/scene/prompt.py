@@ -14,7 +14,7 @@ from openvima.scene.scene import Placement, Scene
 
 FIRST_IMAGE_ID = 2  # after floor and sheet; prompt images show no arm
 PHOTO_SIDE = 48  # pixels; rendered prompt objects have 22 to 60
-_PLACEHOLDER = re.compile(r"\{(\w+)\}")
+PLACEHOLDER = re.compile(r"\{(\w+)\}")  # of an image, with its name
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class Prompt:
         shown = {name: str(fill) for name, fill in self.images}
         return [
             (piece, shown.get(piece, piece)) if place % 2 else piece.strip()
-            for place, piece in enumerate(_PLACEHOLDER.split(self.text))
+            for place, piece in enumerate(PLACEHOLDER.split(self.text))
             if piece.strip()
         ]
 
@@ -139,7 +139,7 @@ class Prompt:
             >>> Prompt.parse("Turn by {angle} degrees.", angle=30).text
             'Turn by 30 degrees.'
         """
-        slots = set(_PLACEHOLDER.findall(template))
+        slots = set(PLACEHOLDER.findall(template))
         if slots != set(fills):
             raise PromptError(f"template {template!r} has slots {sorted(slots)}, but got {sorted(fills)}.")
         text = template
@@ -149,7 +149,7 @@ class Prompt:
                 text = text.replace("{" + name + "}", str(fill))
             else:
                 fills_by_name[name] = fill
-        order = dict.fromkeys(_PLACEHOLDER.findall(text))
+        order = dict.fromkeys(PLACEHOLDER.findall(text))
         images = tuple((name, fills_by_name[name]) for name in order)
         return Prompt(text, images)
 
@@ -207,12 +207,12 @@ class RenderedPrompt:
         Raises:
             PromptError: A placeholder has no image or an image no placeholder.
         """
-        names = _PLACEHOLDER.findall(self.text)
+        names = PLACEHOLDER.findall(self.text)
         if set(names) != set(self.images):
             raise PromptError(
                 f"prompt {echo(repr(self.text), 100)} names images {echo(str(sorted(set(names))), 100)}, "
                 f"but got {echo(str(sorted(self.images)), 100)}."
             )
-        pieces = _PLACEHOLDER.split(self.text)  # text at even places, names at odd ones
+        pieces = PLACEHOLDER.split(self.text)  # text at even places, names at odd ones
         parts = [self.images[piece] if i % 2 else piece.strip() for i, piece in enumerate(pieces)]
         return [part for part in parts if not isinstance(part, str) or part]

@@ -11,6 +11,7 @@ from openvima.catalog import NEUTRAL_TEXTURE, OBJECTS
 from openvima.catalog.objects import REGISTERED_OBJECTS
 from openvima.errors import ConfigError, PromptError, echo, unknown_name
 from openvima.scene import ObjectImage, ObjectRecord, Placement, Prompt, RenderedPrompt, Scene
+from openvima.scene.prompt import PLACEHOLDER
 
 MULTIMODAL = "multimodal"
 PROMPTS = (MULTIMODAL, "text", "mixed", "text,paraphrased", "mixed,paraphrased")
@@ -18,7 +19,6 @@ PROMPTS = (MULTIMODAL, "text", "mixed", "text,paraphrased", "mixed,paraphrased")
 
 _REPLACED_PROB = 0.5  # of an object image in mixed prompts
 _MAX_NAMES = 200  # characters of object and texture that others send
-_PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _INTRODUCED = re.compile(r"\bis an? [\w-]+ $")  # "This is a wug {image}."
 _ARTICLE = re.compile(r"\b([Aa])n? $")
 _PLURAL = re.compile(r"\b(two|three|four|five|six|all|both|some|\d+) $", re.IGNORECASE)
@@ -135,7 +135,7 @@ def _is_ambiguous(image: Placement, noun: str, shown: Iterable[Placement], scene
 def _with_phrases(text: str, phrases: Mapping[str, str]) -> str:
     """Put phrases in place of placeholders, each with the article that its sentence needs."""
     result = ""
-    for number, piece in enumerate(_PLACEHOLDER.split(text)):
+    for number, piece in enumerate(PLACEHOLDER.split(text)):
         if number % 2 == 0:
             result += piece
         elif piece in phrases:
