@@ -1,7 +1,7 @@
 """Recorded actions of an evaluation: `actions.arrow`, one record a step, from which outcomes are replayed."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +69,7 @@ class ActionReplay:
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Give the next recorded action of each episode that is not over."""
         return [
-            None if observation is None else _action(next(steps, None))
+            None if observation is None else _next(steps)
             for steps, observation in zip(self._left, observations, strict=True)
         ]
 
@@ -151,10 +151,14 @@ def _numbers(decision: Decision) -> list[float]:
     return np.concatenate(list(action.to_arrays().values())).tolist()
 
 
-def _action(numbers: np.ndarray | None) -> Decision:
-    if numbers is None:
-        return OracleError("no action is recorded")
-    parts = np.split(numbers, np.cumsum(list(ACTION_SHAPES.values()))[:-1])
+def _next(steps: Iterator[np.ndarray]) -> Decision:
+    step = next(steps, None)
+    return OracleError("no action is recorded") if step is None else action_arrays(step)
+
+
+def action_arrays(numbers: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
+    """Return a recorded step as the arrays of an action."""
+    parts = np.split(np.asarray(numbers, np.float32), np.cumsum(list(ACTION_SHAPES.values()))[:-1])
     return dict(zip(ACTION_SHAPES, parts, strict=True))
 
 

@@ -1,6 +1,6 @@
 """Playing a single episode with any policy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,12 +9,12 @@ import numpy as np
 from openvima.catalog import Assets
 from openvima.env.config import DEFAULT_ENV_CONFIG
 from openvima.env.tabletop import TabletopEnv
+from openvima.evaluation.actions import ActionRecorder, action_arrays
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.recording import record_episode
 from openvima.evaluation.rollout import play as roll_out
 from openvima.evaluation.rollout_policies import (
     Decision,
-    Explainer,
     Observation,
     PromptedRolloutPolicy,
     RolloutPolicy,
@@ -99,58 +99,41 @@ def play(
     env = TabletopEnv(
         _HOST_TASK, assets=assets, compat=compat, realtime=video is not None, render_mode=render_mode
     )
-    if isinstance(rollout_policy, PromptedRolloutPolicy):
-        env.modalities = rollout_policy.modalities
-    watcher = _Watcher(rollout_policy, frames)
+    recorder = _FrameRecorder(rollout_policy, frames)
     if video is None:
-        (ended,) = roll_out([env], [episode], watcher)
+        (ended,) = roll_out([env], [episode], recorder)
     else:
         name = policy if isinstance(policy, str) else type(policy).__name__
         caption = f"{episode.task} · {Path(name).name}" if title is None else title
-        ended = record_episode(env, watcher, episode, Path(video), title=caption, explain=explain)
+        ended = record_episode(env, recorder, episode, Path(video), title=caption, explain=explain)
     return PlayResult(
         episode,
-        watcher.actions(ended.steps),
+        tuple(Action.from_arrays(action_arrays(step)) for step in recorder.steps[0]),
         Outcome(ended.success, env.outcome.failure, ended.reason),
         env.scene,
-        (*watcher.frames, _rendered(env)) if frames else (),
+        (*recorder.frames, _rendered(env)) if frames else (),
     )
 
 
-class _Watcher:
-    """A rollout policy of one episode that keeps the actions and images of another."""
+class _FrameRecorder(ActionRecorder):
+    """Keeps an image before each action too."""
 
     def __init__(self, policy: RolloutPolicy, with_frames: bool) -> None:
-        self._policy, self._with_frames = policy, with_frames
+        super().__init__(policy)
+        self._with_frames = with_frames
         self._envs: Sequence[TabletopEnv] = ()
-        self._decisions: list[Decision] = []
         self.frames: list[np.ndarray] = []
-
-    def actions(self, steps: int) -> tuple[Action, ...]:
-        """Return the actions of the steps taken; a last decision may have been none."""
-        taken = [decision for decision in self._decisions[:steps] if isinstance(decision, Action | Mapping)]
-        return tuple(each if isinstance(each, Action) else Action.from_arrays(each) for each in taken)
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start the episode."""
         self._envs = envs
-        self._policy.begin(envs)
+        super().begin(envs)
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Pass on the decision."""
         if self._with_frames:
             self.frames.append(_rendered(self._envs[0]))
-        decisions = self._policy.decide(observations)
-        self._decisions += decisions
-        return decisions
-
-    def near_ties(self) -> Sequence[bool]:
-        """Return those of the policy."""
-        return self._policy.near_ties()
-
-    def explainer(self) -> Explainer:
-        """Return that of the policy."""
-        return self._policy.explainer()
+        return super().decide(observations)
 
 
 def _load(
