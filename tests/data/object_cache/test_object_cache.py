@@ -193,12 +193,13 @@ def test_a_batch_with_a_damaged_record_is_refused(copy: Path, part) -> None:
         episodes.images.read_first(counts, (np.cumsum(counts) - counts).tolist(), stack)
 
 
-def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path) -> None:
+@pytest.mark.parametrize(("field", "value"), [("num_steps", 10_000), ("start", -64)])
+def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path, field: str, value: int) -> None:
     path = next(iter(sorted(open_object_cache(Dataset(copy)).folder.iterdir())))
     content = bytearray(path.read_bytes())
     preamble = np.frombuffer(content, PREAMBLE, count=1)
     start = PREAMBLE.itemsize + int(preamble["json_bytes"][0])
-    np.frombuffer(content, INDEX, count=1, offset=start)["num_steps"] = 10_000
+    np.frombuffer(content, INDEX, count=1, offset=start)[field] = value
     preamble["checksum"] = xxh3_64_intdigest(content[16 : int(preamble["head_bytes"][0])])
     path.write_bytes(content)
     with pytest.raises(ShardError, match="counts more than its records hold"):

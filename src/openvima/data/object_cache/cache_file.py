@@ -201,7 +201,7 @@ class CacheFile:
         num_bytes = _aligned(int(ends.max(initial=len(self.content) if not len(self) else 0)))
         if len(self.content) != num_bytes:
             raise ShardError(_unfit(path, f"it has {len(self.content):,} of {num_bytes:,} bytes"))
-        if not _fits(self.index):
+        if not _fits(self.index, len(self.content)):
             raise ShardError(_unfit(path, "its index counts more than its records hold"))
 
     def __len__(self) -> int:
@@ -303,7 +303,7 @@ def object_table(rows: np.ndarray) -> ObjectTable:
     return ObjectTable(rows["ids"], rows["crop_index"], rows["boxes"], rows["grasps"])
 
 
-def _fits(index: np.ndarray) -> bool:
+def _fits(index: np.ndarray, file_bytes: int) -> bool:
     """Tell whether the tables of each record lie within it; compiled loops read them unchecked."""
     counts = index["num_prompt_objects"], index["num_objects"], index["num_final_objects"]
     counts = *counts, index["num_steps"], index["num_prompt_images"]
@@ -311,7 +311,8 @@ def _fits(index: np.ndarray) -> bool:
     num_bytes = sum(
         dtype.itemsize * count.astype(np.int64) for dtype, count in zip(dtypes, counts, strict=True)
     )
-    has_room = index["start"] + num_bytes <= index["images_start"]
+    start, end = index["start"], index["images_start"]
+    has_room = (start >= 0) & (start <= end) & (end <= file_bytes) & (num_bytes <= end - start)
     return bool(all((count >= 0).all() for count in counts) and np.all(has_room))
 
 
