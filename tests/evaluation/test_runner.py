@@ -68,6 +68,21 @@ def test_an_interrupted_evaluation_goes_on_where_it_stopped(first, tmp_path, mon
     assert not (tmp_path / "parts").exists()
 
 
+def test_parts_of_other_assets_are_not_kept(tmp_path, monkeypatch):
+    def stop(done, total, note):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setenv("OPENVIMA_LOADED_ASSETS", "")  # restores it afterwards
+    file = tmp_path / "assets_of_a_test.py"
+    config = replace(ORACLE, out=tmp_path / "out", env_config=EnvConfig(f"{file}:make"))
+    for content in ("def make(): ...\n", "def make(): pass\n"):
+        file.write_text(content)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(config, stop)
+    assert len(list((tmp_path / "out/parts").iterdir())) == 4
+
+
 @pytest.mark.parametrize("damaged", [lambda text: text[:-20], lambda text: "[]", lambda text: "{}"])
 def test_a_damaged_part_is_played_again(damaged, first, tmp_path):
     def stop(done, total, note):

@@ -21,6 +21,7 @@ from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.base import require_torch
 from openvima.policies.loading import load_policy
+from openvima.user_code import is_code, source_hash
 from openvima.video.clips import FOLDER
 
 Report = Callable[[int, int, str], None]
@@ -174,7 +175,11 @@ def _play_all(
     """Run the batches that are not finished yet."""
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
-    prints = {name: json.dumps([what, dict(found)], sort_keys=True) for name, what in policies.items()}
+    assets = config.env_config.assets
+    source = source_hash(assets, what="assets") if is_code(assets) else ""
+    prints = {
+        name: json.dumps([what, dict(found), source], sort_keys=True) for name, what in policies.items()
+    }
     jobs = [Job(batch, prints[batch.policy]) for batch in batches]
     kept = {job.batch: _kept(job, config.out) for job in jobs}
     finished = {batch: played for batch, played in kept.items() if played is not None}
