@@ -262,6 +262,17 @@ def test_published_means_are_those_of_the_same_tasks(text, results, tmp_path):
     assert "VIMA 200M" not in text and "published" not in section(text, "results")
 
 
+def test_code_is_hashed_as_source_and_weights_as_weights(results, tmp_path):
+    kinds = {name: {"kind": "random"} for name in results.policies}
+    first, second = list(kinds)[:2]
+    kinds[first] = {"kind": "code", "source": "p.py:make", "sha256": "a" * 64, "weights_sha256": "b" * 64}
+    kinds[second] = {"kind": "run", "sha256": "c" * 64}
+    text = write_report(replace(results, policies=kinds), tmp_path / "a.html").read_text("utf-8")
+    assert f"{first} source <b>{'a' * 12}</b>" in text
+    assert f"{first} weights <b>{'b' * 12}</b>" in text
+    assert f"{second} weights <b>{'c' * 12}</b>" in text
+
+
 def test_levels_of_ones_own_have_no_published_section(results, tmp_path):
     rows = tuple(replace(row, level="train") for row in results.rows if row.level == "L3")
     path = write_report(replace(results, rows=rows), tmp_path / "a.html")

@@ -36,7 +36,7 @@ class Action:
 
     @staticmethod
     def planar(pick: tuple[float, float], place: tuple[float, float], yaw_rad: float = 0.0) -> "Action":
-        """Build an action from two points and the relative rotation of the object.
+        """Build an action from two points and a relative rotation, counter-clockwise from above.
 
         Positions are clipped to the workspace and rounded to float32.
         """
