@@ -1,6 +1,7 @@
 """Atomic writes of files and folders."""
 
 import contextlib
+import errno
 import glob
 import os
 import shutil
@@ -8,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # how systems say that a disk is full
 FREE_SPACE = "Free space, or give another folder; the same command then continues."
 
 

@@ -22,7 +22,8 @@ def published(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys) -> None:
+def test_the_list_holds_every_preset_with_its_numbers_within_100_columns(capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
     assert main(["policies"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line) for line in lines if "model card" not in line) <= 100

@@ -80,7 +80,7 @@ def run_in_processes(count: int, settings: dict) -> Path:
         for rank in range(count)
     ]
     try:
-        errors = [process.communicate(timeout=60)[1] for process in processes]
+        errors = [process.communicate(timeout=300)[1] for process in processes]
     finally:
         for process in processes:
             process.kill()

@@ -1,7 +1,6 @@
 """The `openvima` program: dispatches to the module of the verb and reports errors in one line."""
 
 import argparse
-import errno
 import importlib
 import sys
 import warnings
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from openvima import __version__
-from openvima.atomic_io import FREE_SPACE
+from openvima.atomic_io import FREE_SPACE, NO_SPACE
 from openvima.cli.streams import accept_any_text
 from openvima.errors import OpenVimaError, UnknownWordWarning, echo, unknown_name
 from openvima.memory import address_space_remedy, lacks_memory, require_address_space
@@ -35,7 +34,6 @@ VERBS = {
 
 _HELP = ("-h", "--help")
 _MAX_MESSAGE = 4000  # characters
-_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MEMORY_REMEDIES = {
     "train": "lower --loader.batch-size or raise --optimizer.grad-accum-steps",
     "detector": "lower --loader.batch-size",
@@ -128,7 +126,7 @@ def _explained(error: Exception, verb: str, rest: Sequence[str]) -> tuple[str, i
     if not isinstance(error, OSError):
         raise error
     reason = error.strerror or name
-    if error.errno in _NO_SPACE:
+    if error.errno in NO_SPACE:
         return f"cannot write {error.filename or out}: {reason}. {FREE_SPACE}", 1
     if error.filename is None:
         return f"{name}: {error}", 1

@@ -1,9 +1,9 @@
 """What a folder already holds of the data set that is asked for, and what does not belong to it."""
 
-import errno
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from openvima.atomic_io import NO_SPACE
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import (
     BROKEN_NAME,
@@ -21,7 +21,6 @@ from openvima.errors import DatasetError, StorageError
 
 FAILED_KINDS = ("failed", "unsolved")  # what the oracle tried and did not solve
 _NAMES = (MANIFEST_NAME, INDEX_NAME, BROKEN_NAME, PREVIOUS_NAME)
-FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def is_done(block: Block) -> bool:
@@ -105,7 +104,7 @@ def storage_error(folder: Path, shards: Sequence[Path], error: OSError) -> Stora
         error: What the system said.
     """
     num_there = sum(path.is_file() for path in shards)
-    remedy = "Make room" if error.errno in FULL_DISK else "Make sure that it can be written to"
+    remedy = "Make room" if error.errno in NO_SPACE else "Make sure that it can be written to"
     return StorageError(
         f"cannot write to {folder}: {error.strerror or error}. {num_there} of {len(shards)} shards are "
         f"whole and were kept. {remedy}; the same command then goes on from there."

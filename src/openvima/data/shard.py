@@ -7,6 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from openvima.atomic_io import NO_SPACE
 from openvima.data.checksums import Envelope, Span, mapped
 from openvima.data.decoding import actions_in, decode, decode_columns
 from openvima.data.encoding import ShardInfo
@@ -221,6 +222,8 @@ class Shard:
             raise ShardError(f"{self.path}: {error}") from None
 
     def _row_error(self, row: int, error: Exception | str) -> ShardError:
+        if isinstance(error, OSError) and error.errno in NO_SPACE:
+            raise error  # nothing is damaged: Numba keeps what it compiled on a full disk
         return ShardError(_damaged(self.path, f"record {row} of {len(self)}", error))
 
 

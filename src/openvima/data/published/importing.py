@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from openvima.atomic_io import atomic_write_file
+from openvima.atomic_io import NO_SPACE, atomic_write_file
 from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import BROKEN_NAME, MANIFEST_NAME, finish_folder
 from openvima.data.published.episode import ASSETS, DOMAIN, LEVEL, package_versions
@@ -19,7 +19,7 @@ from openvima.data.published.reader import (
     open_source,
     read_place,
 )
-from openvima.data.resuming import FULL_DISK, clear, is_finished, remove_leftovers, storage_error
+from openvima.data.resuming import clear, is_finished, remove_leftovers, storage_error
 from openvima.data.shard import Shard
 from openvima.data.writer import ShardWriter
 from openvima.errors import ConfigError, DatasetError
@@ -138,7 +138,7 @@ def _import(
         ):
             broken[block.path] = found
     except OSError as error:
-        if error.errno not in FULL_DISK:
+        if error.errno not in NO_SPACE:
             raise
         raise storage_error(config.out, [block.path for block in blocks], error) from error
     finally:
