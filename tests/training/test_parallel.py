@@ -108,7 +108,7 @@ def assert_alike(ours: Path, theirs: Path) -> None:
         assert a.get("gradient_norm", 0) == pytest.approx(b.get("gradient_norm", 0), rel=1e-3)
 
 
-@pytest.mark.parametrize("sharding", ["ddp", "fsdp"])
+@pytest.mark.parametrize("sharding", ["ddp"])  # fsdp: the next test compares its steps, too
 def test_two_processes_train_as_one(bins, tmp_path, sharding) -> None:
     bins |= {"loader.boxes": HOOK}
     one = train(TrainingConfig.of({**bins, "out": tmp_path / "one"}))
