@@ -60,9 +60,7 @@ class VerifiedResults:
 class _Replay:
     """Some episodes of a row, with their recorded actions."""
 
-    row: Row
-    first: int
-    outcomes: tuple[EpisodeOutcome, ...]
+    row: Row  # with the outcomes of these episodes only
     actions: list[np.ndarray]
     env_config: EnvConfig
 
@@ -134,9 +132,10 @@ def _digest_in(text: str) -> str:
 
 def _text_problems(text: str, results: Results) -> Iterator[str]:
     """Compare the file with what its outcomes give: every count, mean, interval, and the digest."""
-    if text == results.to_json():
+    own_text = results.to_json()
+    if text == own_text:
         return
-    given, own = json.loads(text), json.loads(results.to_json())
+    given, own = json.loads(text), json.loads(own_text)
     differing = [key for key in own if given.get(key) != own[key] and key != "sha256"]
     if differing:
         yield f"{', '.join(differing)} do not follow from the outcomes"
@@ -199,9 +198,7 @@ def _replay_all(
 ) -> list[str]:
     jobs = [
         _Replay(
-            row,
-            first,
-            row.outcomes[first : first + _BATCH],
+            replace(row, outcomes=row.outcomes[first : first + _BATCH]),
             list(actions[index][first : first + _BATCH]),
             env_config,
         )
@@ -210,26 +207,23 @@ def _replay_all(
     ]
     total = sum(row.episodes for row in results.rows)
     watch = None if report is None else (lambda done: report(done, total, "replaying"))
-    problems: dict[tuple[int, int], list[str]] = {}
-    places = {id(job): place for place, job in enumerate(jobs)}
-    for job, found in imap_unordered(replay_episodes, jobs, workers, report=watch):
-        problems[places[id(job)], job.first] = found
-    return [problem for place in sorted(problems) for problem in problems[place]]
+    problems = {id(job): found for job, found in imap_unordered(replay_episodes, jobs, workers, report=watch)}
+    return [problem for job in jobs for problem in problems[id(job)]]
 
 
 def replay_episodes(job: _Replay, count: Callable[[int], None]) -> list[str]:
     """Execute the actions of some episodes in a worker process; return what differs."""
     row = job.row
-    envs = [job.env_config.make(row.task, row.level, domain="eval") for _ in job.outcomes]
+    envs = [job.env_config.make(row.task, row.level, domain="eval") for _ in row.outcomes]
     for env in envs:
         env.modalities = ("joints",)  # nothing is rendered
-    seeds = [outcome.seed for outcome in job.outcomes]
+    seeds = [outcome.seed for outcome in row.outcomes]
     again = play(envs, seeds, ActionReplay(job.actions))
     count(len(again))
     return [
-        f"{_named(row)}, seed {given.seed}: {_difference(given, own)}"
-        for given, own in zip(job.outcomes, again, strict=True)
-        if _difference(given, own)
+        f"{_named(row)}, seed {given.seed}: {difference}"
+        for given, own in zip(row.outcomes, again, strict=True)
+        if (difference := _difference(given, own))
     ]
 
 
