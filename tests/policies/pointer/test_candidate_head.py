@@ -220,6 +220,26 @@ def test_without_a_candidate_there_the_named_object_is_right_and_else_the_neares
         assert (is_known == (slot >= 0)).all()
 
 
+def test_beside_an_off_centre_container_no_other_object_is_right(head, inputs):
+    """The middle of the container's box is 6 cm from the goal, another object 2 cm, now and at first."""
+    goal = torch.tensor([0.29, -0.43], dtype=torch.float64).expand(B, T, 2)
+    positions, first = inputs.positions_BTN2.clone(), inputs.first_step.positions_BK2.clone()
+    positions[:, :, 2] = goal + torch.tensor([0.0, 0.06], dtype=torch.float64)
+    positions[:, :, 1] = goal + torch.tensor([0.02, 0.0], dtype=torch.float64)
+    first[:, 1] = positions[:, 0, 1]
+    crowded = with_objects(replace(inputs, positions_BTN2=positions), "first_step", "positions_BK2", first)
+    right, is_known = head.candidates(crowded).right(targets_at(crowded, goal, place_slot=2), goal)
+    assert (right.nonzero()[:, 2].view(B, T) == 2).all()
+    assert is_known.all()
+    unnamed, _ = head.candidates(crowded).right(targets_at(crowded, goal), goal)
+    assert unnamed[..., [1, FIRST_STEP + 1]].all()
+    # The container's place at the first step is right, too, where it is near the goal.
+    first[:, 0] = positions[:, 0, 2] = goal[:, 0] + 0.02
+    near = with_objects(replace(crowded, positions_BTN2=positions), "first_step", "positions_BK2", first)
+    right, _ = head.candidates(near).right(targets_at(near, goal, place_slot=2), goal)
+    assert right[:, 0].nonzero()[:, 1].view(B, 2).tolist() == [[2, FIRST_STEP]] * B
+
+
 def test_steps_that_only_clear_the_way_count_in_the_loss_but_not_in_the_metrics(head, inputs):
     away = torch.tensor([0.29, -0.43], dtype=torch.float64).expand(B, T, 2)
     loss, metrics = head.loss(inputs, targets_at(inputs, away))

@@ -148,6 +148,10 @@ class PlaceCandidates:
     def right(self, targets: ActionTargets, goal_BT2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Determine which candidates are right.
 
+        Where the demonstration names an object, that one is, and so are candidates at the demonstrated place,
+        except other objects in view and places where those are: the middle of a container's box may be
+        farther from what was put into it than another object is.
+
         Args:
             targets: Demonstrated actions.
             goal_BT2: Where the centre of the picked object goes, metres.
@@ -157,16 +161,25 @@ class PlaceCandidates:
             (B, T): a grid point is one of many that would do.
         """
         masks_BTC, num_grid = self.masks_BTC, self.grid.masks_BK.shape[1]
+        is_named_BT = targets.place_BT >= 0
         distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
         count = masks_BTC.shape[-1]
         is_grid_C = torch.arange(count, device=masks_BTC.device) >= count - num_grid
         near_BTC = (distance_BTC < COPIED_WITHIN_M) & masks_BTC & ~is_grid_C
+        near_BTC &= ~is_named_BT[..., None] | self._nearest_to(targets.place_BT)
         nearest_BT = distance_BTC.masked_fill(~is_grid_C, torch.inf).argmin(-1)
-        named_BT = torch.where(targets.place_BT >= 0, targets.place_BT, nearest_BT)
-        named_BTC = F.one_hot(named_BT, count).bool()
+        instead_BT = torch.where(is_named_BT, targets.place_BT, nearest_BT)
         is_copied_BT = near_BTC.any(-1)
-        right_BTC = torch.where(is_copied_BT[..., None], near_BTC, named_BTC)
-        return right_BTC, is_copied_BT | (targets.place_BT >= 0)
+        needs_instead_BT = is_named_BT | ~is_copied_BT
+        right_BTC = near_BTC | (F.one_hot(instead_BT, count).bool() & needs_instead_BT[..., None])
+        return right_BTC, is_copied_BT | is_named_BT
+
+    def _nearest_to(self, slot_BT: torch.Tensor) -> torch.Tensor:
+        """Whether each candidate is nearer to an object in view than to all others in view, (B, T, C)."""
+        inputs = self.inputs
+        distance_BTCN = (self.positions_BTC2[:, :, :, None] - inputs.positions_BTN2[:, :, None]).norm(dim=-1)
+        distance_BTCN = distance_BTCN.masked_fill(~inputs.masks_BTN[:, :, None], torch.inf)
+        return distance_BTCN.argmin(-1) == slot_BT[..., None]
 
 
 def products(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Tensor) -> torch.Tensor:
