@@ -1,88 +1,87 @@
-"""Prompted with a demonstration: it is that of the very episode, and the episode is left as it was."""
+"""In-context evaluation: prompts of three tasks contain an example from their own images."""
 
 import numpy as np
 import pytest
 
 from openvima.cli.main import main
-from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
-from openvima.errors import OracleError
+from openvima.errors import ConfigError, PromptError
 from openvima.evaluation import EvaluationConfig, Results
-from openvima.evaluation.ablations import ABLATIONS, IN_CONTEXT, ablate
-from openvima.evaluation.in_context import HELD_OUT_TASKS, held_out_tasks
-from openvima.evaluation.rollout import play
-from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
+from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ablate
+from openvima.evaluation.config import cells
+from openvima.evaluation.in_context import HELD_OUT_TASKS, in_context_prompt
 from openvima.evaluation.sources import policy_sources
-from openvima.policies import RandomPolicy
-from openvima.policies.tokenizer import WordTokenizer
+from openvima.evaluation.verification import verify_results
 from openvima.tasks import task_spec
 
 
-@pytest.mark.parametrize("task", HELD_OUT_TASKS)
-def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
+@pytest.mark.parametrize(
+    ("task", "words", "names"),
+    [
+        ("twist", ["Follow this motion:", "for all {texture} objects."], ["before_twist_1", "after_twist_1"]),
+        (
+            "follow_motion",
+            ["Follow this motion for", ":", "."],
+            ["dragged_obj", "frame_0", "frame_1", "frame_2"],
+        ),
+        ("follow_order", ["Follow this motion:", "."], ["frame_0", "frame_1", "frame_2"]),
+    ],
+)
+def test_the_edited_prompt_shows_images_of_the_tasks_own(task, words, names) -> None:
     env = TabletopEnv(task, level=task_spec(task).levels[-1], domain="eval")
-    observation, _ = env.reset(seed=3)
-    before = env.scene
-    prompt = ablate(env, IN_CONTEXT).prompt
-    assert env.scene == before
-    demo = rollout_oracle(TabletopEnv(task, level=env.level, domain="eval"), 3)
-    assert demo.outcome.success
-    assert list(prompt.images) == [f"frame_{t}" for t in range(demo.num_steps + 1)]
-    for t, image in enumerate(prompt.images.values()):
-        for view in ("front", "top"):
-            np.testing.assert_array_equal(image.rgb[view], demo.rgb[view][t])
-            np.testing.assert_array_equal(image.segm[view], demo.segm[view][t])
-        assert image.objects == tuple(sorted(demo.objects, key=lambda record: record.object_id))
-    np.testing.assert_array_equal(prompt.images["frame_0"].rgb["top"], observation["rgb"]["top"])
-    words = [piece for piece in prompt.sequence() if isinstance(piece, str)]
-    assert words[0] == "Follow this motion:"
-    WordTokenizer().encode(" ".join(words))
-
-
-def test_an_oracle_that_finds_no_action_shows_what_it_did_until_then(monkeypatch) -> None:
-    env = TabletopEnv("follow_order", level="L1", domain="eval")
     env.reset(seed=3)
-    whole = ablate(env, IN_CONTEXT).prompt
-    decide, asked = TabletopEnv.oracle_decision, []
-
-    def once(own):
-        asked.append(own)
-        if len(asked) > 1:
-            raise OracleError("nothing can be seen from above")
-        return decide(own)
-
-    monkeypatch.setattr(TabletopEnv, "oracle_decision", once)
+    own, scene = env.prompt, env.scene
     prompt = ablate(env, IN_CONTEXT).prompt
-    assert list(prompt.images) == ["frame_0", "frame_1"]
-    np.testing.assert_array_equal(prompt.images["frame_1"].rgb["top"], whole.images["frame_1"].rgb["top"])
+    assert env.prompt is own and env.scene == scene
+    texture = env.episode.problem.scene.placements[0].texture  # of a target of twist
+    pieces = prompt.sequence()
+    assert [piece for piece in pieces if isinstance(piece, str)] == [w.format(texture=texture) for w in words]
+    assert [piece.name for piece in pieces if not isinstance(piece, str)] == names == list(prompt.images)
+    assert all(prompt.images[name] is own.images[name] for name in names)
+    if task == "twist":  # the turn is shown on an object of another texture
+        assert texture not in {record.texture for image in prompt.images.values() for record in image.objects}
 
 
-class Noting(RandomPolicy):
-    """Notes what it is told."""
+def test_twist_takes_its_first_pair_whatever_their_number() -> None:
+    env = TabletopEnv("twist", level="L1", num_examples=1)
+    env.reset(seed=0)
+    one = in_context_prompt(env.prompt, "twist")
+    more = TabletopEnv("twist", level="L1", num_examples=2)
+    more.reset(seed=0)
+    two = in_context_prompt(more.prompt, "twist")
+    assert one.text == two.text and list(two.images) == ["before_twist_1", "after_twist_1"]
+    np.testing.assert_array_equal(
+        one.images["after_twist_1"].rgb["top"], two.images["after_twist_1"].rgb["top"]
+    )
 
-    def reset(self, prompts):
-        super().reset(prompts)
-        self.prompts = prompts
+
+def test_other_tasks_and_prompts_are_refused() -> None:
+    env = TabletopEnv("rotate", level="L1")
+    env.reset(seed=0)
+    with pytest.raises(
+        ConfigError, match=r"no in-context evaluation of task 'rotate'.* Allowed: twist, foll"
+    ):
+        in_context_prompt(env.prompt, "rotate")
+    with pytest.raises(PromptError, match=r"'Rotate the {dragged_obj} .* is no prompt of twist"):
+        in_context_prompt(env.prompt, "twist")
+    with pytest.raises(
+        ConfigError, match=r"no in-context evaluation of task 'twists'. Did you mean 'twist'\?"
+    ):
+        EvaluationConfig(("untrained",), ("twists",), ablations=(IN_CONTEXT,))
 
 
-def test_players_are_told_the_motion() -> None:
-    policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
-    play([env], [0], PromptedRolloutPolicy(policy, IN_CONTEXT))
-    assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")
-
-
-def test_it_is_asked_for_by_name_only() -> None:
+def test_all_leaves_out_prompts_with_an_example() -> None:
     (source,) = policy_sources(("untrained",))
-    asked = EvaluationConfig(("untrained",), ablations=("all", IN_CONTEXT)).ablations_of(source)
-    assert asked == (*(name for name in ABLATIONS if name != "detected_boxes"), IN_CONTEXT)
-    assert IN_CONTEXT not in EvaluationConfig(("untrained",), ablations=("all",)).ablations_of(source)
+    asked = EvaluationConfig(("untrained",), ablations=("all", *EXAMPLE_PROMPTS)).ablations_of(source)
+    assert asked == (*(name for name in ABLATIONS if name != "detected_boxes"), *EXAMPLE_PROMPTS)
+    assert not {*EXAMPLE_PROMPTS} & {
+        *EvaluationConfig(("untrained",), ablations=("all",)).ablations_of(source)
+    }
 
 
-def test_by_default_the_tasks_are_those_that_the_levels_hold() -> None:
-    assert held_out_tasks(("L1", "L2", "L3", "L4")) == HELD_OUT_TASKS
-    assert held_out_tasks(("L1",)) == ("twist", "follow_order")
-    assert held_out_tasks(("L4",)) == ("follow_motion",)
-    assert held_out_tasks(("L9",)) == HELD_OUT_TASKS  # and the evaluation says what is wrong
+def test_by_default_the_tasks_are_those_with_an_edited_prompt() -> None:
+    config = EvaluationConfig(("untrained",), ablations=(IN_CONTEXT,))
+    assert {task for task, _ in cells(config)} == {*HELD_OUT_TASKS}
 
 
 def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> None:
@@ -93,3 +92,4 @@ def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> No
     assert {(row.task, row.ablation) for row in rows} == {
         (task, ablation) for task in ("twist", "follow_order") for ablation in ("", IN_CONTEXT)
     }
+    assert verify_results(tmp_path).is_verified

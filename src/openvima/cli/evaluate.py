@@ -73,12 +73,13 @@ def main(
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
             object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
-            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all.
+            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all. Also in_context and
+            oracle_demonstration, which prompts with the oracle's solution of the same episode.
         boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which makes an ObjectExtractor.
-        in_context: Also prompt with a demonstration of each episode, "Follow this motion: …";
-            by default of twist, follow_motion and follow_order, for policies trained without these tasks.
+        in_context: In-context evaluation: also prompt with an example, "Follow this motion: …". For twist,
+            follow_motion and follow_order, of policies trained without these tasks.
         batch: Episodes that are run together, with batched inference.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
@@ -101,14 +102,13 @@ def main(
     from openvima.errors import ConfigError
     from openvima.evaluation import EvaluationConfig, Results, evaluate
     from openvima.evaluation.ablations import IN_CONTEXT
-    from openvima.evaluation.in_context import held_out_tasks
     from openvima.report import VideoSelection, evaluate_and_report
 
     if in_context:
         ablations = f"{ablations},{IN_CONTEXT}"
     config = EvaluationConfig(
         policies=parse_list(policy),
-        tasks=held_out_tasks(parse_list(levels)) if in_context and tasks == "all" else parse_list(tasks),
+        tasks=parse_list(tasks),
         levels=parse_list(levels),
         episodes=episodes,
         seed=seed,

@@ -7,7 +7,8 @@
 | `scrambled_words` | its own images; each word, number and mark replaced by a random word of the benchmark |
 | `shuffled_objects` | permuted object ids, in segmentations and in the records of the prompt |
 | `detected_boxes` | boxes from a detector |
-| `in_context` | a demonstration of the oracle in the same episode as the prompt |
+| `in_context` | its prompt, edited as for in-context evaluation (`in_context.py`) |
+| `oracle_demonstration` | the oracle's solution of the same episode as the prompt |
 
 Random choices follow from the episode's task, level and seed, not from the batch or the number of workers.
 Starts, goals and step limits stay the same.
@@ -26,7 +27,8 @@ import numpy as np
 
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import SamplingError
-from openvima.evaluation.in_context import demonstrated
+from openvima.evaluation.in_context import in_context_prompt
+from openvima.evaluation.oracle_demonstration import demonstrated
 from openvima.policies.tokenizer import benchmark_vocabulary
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, ObjectRecord, Prompt, PromptImage, RenderedPrompt
@@ -39,8 +41,11 @@ OTHER_PROMPT_IMAGES = "other_prompt_images"
 SCRAMBLED_WORDS = "scrambled_words"
 SHUFFLED_OBJECTS = "shuffled_objects"
 DETECTED_BOXES = "detected_boxes"
-IN_CONTEXT = "in_context"  # takes the task away and gives its solution; not among "all"
+IN_CONTEXT = "in_context"
+ORACLE_DEMONSTRATION = "oracle_demonstration"
 ABLATIONS = (NO_PROMPT, OTHER_PROMPT_IMAGES, SCRAMBLED_WORDS, SHUFFLED_OBJECTS, DETECTED_BOXES)
+EXAMPLE_PROMPTS = (IN_CONTEXT, ORACLE_DEMONSTRATION)
+"""Replace the task's description by an example; not part of "all", as they add information."""
 
 NEUTRAL_PROMPT = RenderedPrompt(".", {})  # not empty, as policies may refuse a prompt without any token
 _MAX_TRIES = 100  # for tasks whose placeholders vary; those of the benchmark's own tasks never do
@@ -72,13 +77,16 @@ def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
 
     Args:
         env: The environment, which stays unchanged.
-        ablation: One of `ABLATIONS`, `IN_CONTEXT`, or empty for none. Detected boxes are handled
-            by the policy, see `openvima.detector.plugins`.
+        ablation: One of `ABLATIONS` or `EXAMPLE_PROMPTS`, or empty for none. Detected boxes are handled by
+            the policy, see `openvima.detector.plugins`.
 
     Raises:
+        ConfigError: The task has no in-context evaluation.
         SamplingError: No other episode has images for the same placeholders.
     """
     if ablation == IN_CONTEXT:
+        return AblatedInput(in_context_prompt(env.prompt, env.task))
+    if ablation == ORACLE_DEMONSTRATION:
         return AblatedInput(demonstrated(env))
     if ablation == NO_PROMPT:
         return AblatedInput(NEUTRAL_PROMPT)

@@ -16,7 +16,8 @@ from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
-from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, IN_CONTEXT
+from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, EXAMPLE_PROMPTS, IN_CONTEXT
+from openvima.evaluation.in_context import HELD_OUT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
@@ -59,7 +60,8 @@ class EvaluationConfig:
             elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
         ablations: Input ablations to evaluate besides, for each policy that reads prompts: names of
             `openvima.evaluation.ablations.ABLATIONS`; "random" and "oracle", which are added as policies; or
-            ("all",). "in_context", which prompts with a demonstration of the episode, is not part of "all".
+            ("all",), which leaves out "in_context" and "oracle_demonstration": these prompt with an example.
+            With "in_context" all tasks are those that have an edited prompt.
         boxes: For the ablation "detected_boxes": "detector" for the bundled one,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
@@ -113,7 +115,7 @@ class EvaluationConfig:
             raise ConfigError(" ".join(problems))
 
     def _unknown_names(self) -> Iterator[str]:
-        allowed = ("all", *ABLATIONS, IN_CONTEXT, *REFERENCE_POLICIES)
+        allowed = ("all", *ABLATIONS, *EXAMPLE_PROMPTS, *REFERENCE_POLICIES)
         yield from (unknown_name("ablation", name, allowed) for name in self.ablations if name not in allowed)
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
@@ -125,6 +127,8 @@ class EvaluationConfig:
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
         if DETECTED_BOXES in self.ablations and self.boxes is None:
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
+        if IN_CONTEXT in self.ablations:
+            yield from filter(None, (no_edited_prompt(task) for task in self.tasks if task != "all"))
         if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.ablations):
             yield f"boxes is {self.boxes!r}, which only the ablation {DETECTED_BOXES} plugs in; ask for it."
 
@@ -150,7 +154,7 @@ class EvaluationConfig:
             return ()
         asked = {*self.ablations, *(ABLATIONS if "all" in self.ablations else ())}
         usable = self.boxes is not None and source.kind not in ("code", "remote") and not source.learner
-        names = (name for name in (*ABLATIONS, IN_CONTEXT) if name in asked)
+        names = (name for name in (*ABLATIONS, *EXAMPLE_PROMPTS) if name in asked)
         return tuple(name for name in names if name != DETECTED_BOXES or usable)
 
     def record(self) -> dict[str, object]:
@@ -251,7 +255,8 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
             raise LevelError(unknown_name("level", level, LEVELS))
     prompts = config.env_config.prompts
     if "all" in config.tasks:
-        tasks = [task for task in list_tasks() if takes_prompts(task, prompts)]
+        known = HELD_OUT_TASKS if IN_CONTEXT in config.ablations else list_tasks()
+        tasks = [task for task in known if takes_prompts(task, prompts)]
     else:
         tasks = list(dict.fromkeys(config.tasks))
         for task in tasks:
@@ -281,7 +286,7 @@ def plan(config: EvaluationConfig) -> list[Batch]:
     played = [
         (source, ablation) for source in config.sources for ablation in ("", *config.ablations_of(source))
     ]
-    asked = [name for name in config.ablations if name in (*ABLATIONS, IN_CONTEXT)]
+    asked = [name for name in config.ablations if name in (*ABLATIONS, *EXAMPLE_PROMPTS)]
     if useless := [name for name in asked if name not in {ablation for _, ablation in played}]:
         raise ConfigError(
             f"ablation {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "

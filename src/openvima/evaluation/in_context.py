@@ -1,51 +1,77 @@
-"""In-context evaluation: the prompt is a demonstration of the same episode.
+"""In-context evaluation: prompts of three tasks, edited to contain an example, as inverse dynamics does.
 
-The oracle's observations become the prompt "Follow this motion: frame … frame". The policy starts from the
-same initial state.
+| task | edited prompt |
+|---|---|
+| `twist` | "Follow this motion: {before} {after} for all red swirl objects." |
+| `follow_motion` | "Follow this motion for {object}: {frames}.", its own prompt |
+| `follow_order` | "Follow this motion: {frames}." |
 
-Source: MIDAS (Li et al. 2023), which holds out the three tasks below.
+All images are those of the task's own prompt, of `twist` the first pair. Episodes stay the same. Policies
+are trained without these tasks.
+
+Source: MIDAS (Li et al. 2023); which pair of `twist` it shows is not published.
 """
 
-from collections.abc import Collection
+import re
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
-from openvima.env.tabletop import TabletopEnv
-from openvima.errors import OracleError
-from openvima.scene import ObjectRecord, RenderedPrompt
-from openvima.tasks.registry import task_spec
-from openvima.training.augmentation.inverse_dynamics import motion_prompt
+from openvima.errors import ConfigError, PromptError, echo, unknown_name
+from openvima.scene import RenderedPrompt
+from openvima.tasks import twist
+from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 
-HELD_OUT_TASKS = ("twist", "follow_motion", "follow_order")
-
-
-def held_out_tasks(levels: Collection[str]) -> tuple[str, ...]:
-    """Return those of the held-out tasks that some levels hold, or all if none of them does."""
-    held = (task for task in HELD_OUT_TASKS if not set(levels).isdisjoint(task_spec(task).levels))
-    return tuple(held) or HELD_OUT_TASKS
+_MAX_SHOWN = 100  # characters of a prompt in an error
+_TEXTURE = re.compile(
+    re.escape(twist.TEMPLATE.partition("{examples} ")[2]).replace(r"\{twist_obj_texture\}", "(.+)")
+)
 
 
-def demonstrated(env: TabletopEnv) -> RenderedPrompt:
-    """Return the motion of the oracle in the episode that an environment has begun, as a prompt.
-
-    If the oracle fails or has no action, the demonstration ends there.
+def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
+    """Edit a prompt for in-context evaluation.
 
     Args:
-        env: The environment; it is left as it is.
+        prompt: The task's own prompt.
+        task: Name of the task.
+
+    Raises:
+        ConfigError: The task has no edited prompt.
+        PromptError: The prompt is not one of that task.
     """
-    own = TabletopEnv(
-        env.task,
-        level=env.level,
-        domain=env.domain,
-        assets=env.assets,
-        compat=env.compat,
-        hide_arm=env.hide_arm,
-        **env.task_options,
-    )
-    seen = [own.reset(seed=env.episode.seed)[0]]
-    while not own.outcome.is_over and len(seen) <= own.episode.oracle_max_steps:
-        try:
-            action = own.oracle_decision().action
-        except OracleError:
-            break
-        seen.append(own.step(action)[0])
-    objects = [ObjectRecord(p.id, p.object, p.texture) for p in own.scene.placements]
-    return motion_prompt(seen, objects)
+    if problem := no_edited_prompt(task):
+        raise ConfigError(problem)
+    names = tuple(prompt.images)
+    text, shown = _EDITS[task](prompt.text, names)
+    return RenderedPrompt(text, {name: prompt.images[name] for name in shown})
+
+
+def no_edited_prompt(task: str) -> str:
+    """Return why a task has no in-context evaluation; empty if it has one."""
+    if task in HELD_OUT_TASKS:
+        return ""
+    return unknown_name("in-context evaluation of task", task, HELD_OUT_TASKS)
+
+
+_Edited = tuple[str, tuple[str, ...]]  # text, and names of the images in it
+
+
+def _twist(text: str, names: tuple[str, ...]) -> _Edited:
+    found = _TEXTURE.search(text)
+    if found is None or len(names) < 2:
+        raise PromptError(f"{echo(repr(text), _MAX_SHOWN)} is no prompt of twist; it has no pair of images.")
+    before, after = names[:2]
+    return f"Follow this motion: {{{before}}} {{{after}}} for all {found[1]} objects.", (before, after)
+
+
+def _follow_motion(text: str, names: tuple[str, ...]) -> _Edited:
+    return text, names
+
+
+def _follow_order(text: str, names: tuple[str, ...]) -> _Edited:
+    return MOTION_TEXT.format(frames=" ".join(f"{{{name}}}" for name in names)), names
+
+
+_EDITS: Mapping[str, Callable[[str, tuple[str, ...]], _Edited]] = MappingProxyType(
+    {"twist": _twist, "follow_motion": _follow_motion, "follow_order": _follow_order}
+)
+HELD_OUT_TASKS = tuple(_EDITS)

@@ -11,6 +11,7 @@ from openvima.atomic_io import atomic_write_file
 from openvima.catalog.user_assets import recorded_assets
 from openvima.env.config import ENV_SETTINGS, EnvConfig
 from openvima.errors import DatasetError, OpenVimaError, echo
+from openvima.evaluation.ablations import IN_CONTEXT
 from openvima.evaluation.actions import ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
 from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, Row
@@ -153,6 +154,7 @@ def _row_problems(results: Results) -> Iterator[str]:
         int(config["episodes"]),
         int(config["seed"]),
         env_config=EnvConfig(prompts=config.get("prompts", MULTIMODAL)),
+        ablations=(IN_CONTEXT,) if IN_CONTEXT in config.get("ablations", ()) else (),  # decides the tasks
     )
     expected = {(task, level) for task, level in cells(whole)}
     seeds = list(range(whole.seed, whole.seed + whole.episodes))

@@ -33,7 +33,8 @@ _ABLATION_DESCRIPTIONS = {
     "scrambled_words": "The prompt keeps its images; each word is replaced by a random word.",
     "shuffled_objects": "Object ids are permuted; only with compat do they reveal the order of spawning.",
     "detected_boxes": "Boxes come from a detector instead of the simulator.",
-    "in_context": "The prompt is a demonstration of the oracle in the same episode.",
+    "in_context": "The prompt is edited to contain an example from the task's own prompt, as in MIDAS.",
+    "oracle_demonstration": "The prompt is the oracle's solution of the same episode.",
 }
 
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
