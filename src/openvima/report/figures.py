@@ -2,15 +2,19 @@
 
 import html
 import io
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from openvima.evaluation.results import Results
+from openvima.evaluation.statistics import Interval
+from openvima.report.rate_curves import RateFigure
 
 # Stand-ins that matplotlib draws with; the page's colours replace them, see `_themed`.
 _INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
 _PANEL_WIDTH_IN = 3.9
+_LEAST_GAP = 0.12  # between named values of an axis, as a fraction of its length
 _STYLE: Any = {  # Any: the type of matplotlib's settings is not public
     "svg.hashsalt": "openvima",  # element names in the file are the same in every run
     "svg.fonttype": "none",
@@ -42,28 +46,106 @@ def level_chart(results: Results, level: str, colours: Mapping[str, str]) -> str
     Returns:
         An `<svg>` element.
     """
-    tasks, policies = results.tasks(level), results.policy_names()
-    lines_a_task = len(policies) + 1.6  # the task's name stands above its dots
-    num_lines = lines_a_task * len(tasks)
+    rows = {
+        task: {
+            policy: (row.rate, row.interval)
+            for policy in results.policy_names()
+            if (row := results.row(policy, task, level))
+        }
+        for task in results.tasks(level)
+    }
+    return dot_chart(rows, colours, title=f"Success rates at level {level}", name=f"level-{level}")
+
+
+def dot_chart(
+    rows: Mapping[str, Mapping[str, tuple[float, Interval]]],
+    colours: Mapping[str, str],
+    *,
+    title: str,
+    name: str,
+) -> str:
+    """Draw success rates by category: a heading a category, below it a dot with its interval a series.
+
+    Args:
+        rows: Rate and interval, as fractions, of each series in each category.
+        colours: Name of each series to the CSS variable of its colour; each has a line in every category.
+        title: What screen readers say.
+        name: Put before the names of its elements; no other chart of the page may have it.
+
+    Returns:
+        An `<svg>` element.
+    """
+    lines_a_row = len(colours) + 1.6  # the heading stands above its dots
+    num_lines = lines_a_row * len(rows)
     figure, axes = _panel(0.45 + 0.155 * num_lines, margins_in=(0.12, 0.3, 0.22, 0.05))
-    for task_index, task in enumerate(tasks):
-        top = task_index * lines_a_task
-        axes.text(0, top + 0.55, task, fontsize=9.5, color=_INK, va="center")
-        for index, policy in enumerate(policies):
-            row = results.row(policy, task, level)
-            if row is None:
+    for row_index, (heading, dots) in enumerate(rows.items()):
+        top = row_index * lines_a_row
+        axes.text(0, top + 0.55, heading, fontsize=9.5, color=_INK, va="center")
+        for index, (series, variable) in enumerate(colours.items()):
+            if series not in dots:
                 continue
             y = top + 1.55 + index
-            low, high = (100 * end for end in row.interval)
-            colour = _series(colours[policy])
-            axes.plot([low, high], [y, y], color=colour, linewidth=2.4, alpha=0.45, solid_capstyle="round")
-            axes.plot([100 * row.rate], [y], "o", color=colour, markersize=5)
+            rate, (low, high) = dots[series]
+            colour = _series(variable)
+            ends = [100 * low, 100 * high]
+            axes.plot(ends, [y, y], color=colour, linewidth=2.4, alpha=0.45, solid_capstyle="round")
+            axes.plot([100 * rate], [y], "o", color=colour, markersize=5)
     axes.set_xlim(-2, 102)
     axes.set_ylim(num_lines, -0.2)
     axes.set_xticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
     axes.set_yticks([])
     axes.tick_params(length=0)
-    return _themed(figure, f"level-{level}", f"Success rates at level {level}", colours.values())
+    return _themed(figure, name, title, colours.values())
+
+
+def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str:
+    """Draw one panel of success rates over a quantity; published ones are dashed, with hollow dots.
+
+    Args:
+        rates: The figure.
+        index: Which of its panels.
+        colours: Name of each curve to the CSS variable of its colour.
+
+    Returns:
+        An `<svg>` element.
+    """
+    panel = rates.panels[index]
+    figure, axes = _panel(2.6, margins_in=(0.5, 0.45, 0.16, 0.08))
+    for curve in panel.curves:
+        colour = _series(colours[curve.name])
+        at = [point.x for point in curve.points]
+        style: dict[str, Any] = {"color": colour, "marker": "o", "linewidth": 1.8, "markersize": 4.5}
+        if curve.published:
+            style |= {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
+        axes.plot(at, [100 * point.rate for point in curve.points], **style)
+        for point in curve.points:
+            if point.interval:
+                ends = [100 * end for end in point.interval]
+                axes.plot([point.x] * 2, ends, color=colour, linewidth=2.4, alpha=0.4, solid_capstyle="round")
+    if rates.logarithmic:
+        axes.set_xscale("log")
+    ticks = _spaced(
+        {p.x for panel in rates.panels for c in panel.curves for p in c.points}, rates.logarithmic
+    )
+    axes.set_xticks(ticks, [rates.tick(x) for x in ticks])
+    axes.set_xticks([], minor=True)
+    axes.set_ylim(-3, 103)
+    axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
+    axes.set_xlabel(rates.quantity)
+    axes.tick_params(length=0)
+    title = f"{rates.caption} {panel.title}"
+    return _themed(figure, f"{rates.label}-{index}", title, [colours[c.name] for c in panel.curves])
+
+
+def _spaced(values: Iterable[float], logarithmic: bool) -> list[float]:
+    """Leave out values whose names would overlap on an axis; the largest one stays."""
+    at = {x: math.log(x) if logarithmic else x for x in sorted(values, reverse=True)}
+    gap = _LEAST_GAP * (max(at.values()) - min(at.values())) if at else 0.0
+    kept: list[float] = []
+    for x, position in at.items():
+        if not kept or at[kept[-1]] - position >= gap:
+            kept.append(x)
+    return kept
 
 
 def curve_chart(

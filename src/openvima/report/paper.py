@@ -47,6 +47,19 @@ class Estimate:
     signed: bool = False
     mark: str = ""
 
+    @property
+    def written(self) -> str:
+        """The number, without a unit."""
+        return self._percentage(self.value)
+
+    @property
+    def written_interval(self) -> str:
+        """Its interval in words: "59.6 to 98.2"."""
+        return " to ".join(map(self._percentage, self.interval))
+
+    def _percentage(self, fraction: float) -> str:
+        return f"{100 * fraction:{'+' if self.signed else ''}.1f}".replace("-", "−")
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -239,8 +252,7 @@ def _markdown_table(table: Table) -> str:
 def _markdown_cell(cell: Estimate | str) -> str:
     if isinstance(cell, str):
         return _markdown_text(cell)
-    low, high = (_number(end, cell.signed) for end in cell.interval)
-    return f"{_number(cell.value, cell.signed)} ({low} to {high}){f' {cell.mark}' if cell.mark else ''}"
+    return f"{cell.written} ({cell.written_interval}){f' {cell.mark}' if cell.mark else ''}"
 
 
 def _markdown_text(text: str) -> str:
@@ -267,15 +279,10 @@ def _latex_table(table: Table) -> str:
 def _latex_cell(cell: Estimate | str) -> str:
     if isinstance(cell, str):
         return latex_text(cell)
-    value, low, high = (latex_text(_number(x, cell.signed)) for x in (cell.value, *cell.interval))
     mark = f" {latex_text(cell.mark)}" if cell.mark else ""
-    return f"{value} {{\\footnotesize({low} to {high})}}{mark}"
+    return f"{latex_text(cell.written)} {{\\footnotesize({latex_text(cell.written_interval)})}}{mark}"
 
 
 def _label(text: str) -> str:
     """A name that LaTeX takes as a label: other letters become hyphens."""
     return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in text)
-
-
-def _number(fraction: float, signed: bool) -> str:
-    return f"{100 * fraction:{'+' if signed else ''}.1f}".replace("-", "−")

@@ -47,6 +47,15 @@ class PublishedModel:
         fraction = "" if self.data_fraction == 1 else f", {100 * self.data_fraction:g} % of the data"
         return f"{self.model} {self.size}{fraction}"
 
+    @property
+    def num_parameters(self) -> float:
+        """Its size as a number."""
+        return float(self.size.removesuffix("M")) * 1e6
+
+    def mark(self, level: str) -> str:
+        """Mark of a level's number, as `RELIABILITY` explains it."""
+        return "*" if self.printed else "~" if level in self.rough else ""
+
     def written(self, level: str, rate: float, keep_marks: bool = True) -> str:
         """Write a rate (%), with the marks that `RELIABILITY` explains if it is that of the level."""
         if rate != self.levels.get(level):
