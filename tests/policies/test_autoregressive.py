@@ -12,11 +12,7 @@ from openvima.errors import ConfigError  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import (  # noqa: E402
-    PolicyConfig,
-    with_head,
-    with_visual_residual,
-)
+from openvima.policies.config import PolicyConfig  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.actions import (  # noqa: E402
     ACTION_PARTS,
@@ -33,6 +29,7 @@ from openvima.policies.nn.autoregressive import (  # noqa: E402
 from openvima.policies.nn.bins import NUM_BINS, decode_bins, encode_bins  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
+from openvima.policies.variants import with_head, with_visual_residual  # noqa: E402
 from training_examples import collate_examples, examples_of  # noqa: E402
 
 # One decoder; and cross-attention, with the last slot or with a query token as the action query.

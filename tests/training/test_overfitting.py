@@ -14,13 +14,13 @@ from openvima.env import TabletopEnv  # noqa: E402
 from openvima.policies import preset  # noqa: E402
 from openvima.policies.batch import Batch  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
-from openvima.policies.config import with_head  # noqa: E402
 from openvima.policies.inference import NetworkPolicy  # noqa: E402
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range  # noqa: E402
 from openvima.policies.nn.bins import encode_bins  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
+from openvima.policies.variants import with_head  # noqa: E402
 from openvima.scene import Action  # noqa: E402
 from openvima.scene.pose import angle_difference  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402

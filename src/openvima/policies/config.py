@@ -1,7 +1,7 @@
 """Configs of all architectures, as validated frozen dataclasses."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from reprlib import repr as short
 from typing import Any, get_args
 
@@ -11,8 +11,6 @@ from openvima.policies.flamingo.config import FlamingoConfig
 from openvima.policies.gato.config import GatoConfig
 from openvima.policies.gpt.config import GptConfig
 from openvima.policies.midas.config import MidasConfig
-from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.heads import HEADS
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.vima.config import VimaConfig
 
@@ -44,34 +42,3 @@ def appearance_width(config: PolicyConfig) -> int:
     """Length of the appearance embedding; 0 for networks without one."""
     has_objects = isinstance(config, VimaConfig | MidasConfig | PointerConfig)
     return config.images.appearance_width if has_objects else 0
-
-
-def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
-    """Return the same network with another action head of the same sizes.
-
-    Args:
-        config: The network.
-        name: One of `openvima.policies.nn.heads.HEADS`.
-
-    Raises:
-        ConfigError: There is no such head, or the network is a pointer model.
-    """
-    if name not in HEADS:
-        raise ConfigError(unknown_name("head", name, HEADS))
-    if isinstance(config, PointerConfig):
-        raise ConfigError(
-            f"head is {name!r}, but pointer models choose among candidates; take nano-bins or another preset."
-        )
-    kind, head = HEADS[name], config.head
-    if isinstance(head, kind):
-        return config
-    if kind is AutoregressiveConfig:
-        new = AutoregressiveConfig(head.hidden_width, config.decoder.initial_std, head.action_width)
-    else:
-        new = kind(head.hidden_width, action_width=head.action_width)
-    return replace(config, head=new)
-
-
-def with_visual_residual(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
-    """Return the same network with or without the visual residual in its prompt encoder."""
-    return replace(config, prompt=replace(config.prompt, visual_residual=wanted))

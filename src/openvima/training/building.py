@@ -9,19 +9,14 @@ import torch
 from openvima.errors import ConfigError
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import load_network
-from openvima.policies.config import (
-    PolicyConfig,
-    appearance_width,
-    config_to_dict,
-    with_head,
-    with_visual_residual,
-)
+from openvima.policies.config import PolicyConfig, appearance_width, config_to_dict
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
+from openvima.policies.variants import with_variant
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
@@ -98,12 +93,7 @@ def _for_own_learner(config: TrainingConfig) -> TrainingConfig:
 
 def _sizes(config: TrainingConfig) -> PolicyConfig:
     """Return the config of the preset with its overrides."""
-    sizes = preset(config.preset)
-    if config.model.head is not None:
-        sizes = with_head(sizes, config.model.head)
-    if config.model.visual_residual is not None:
-        sizes = with_visual_residual(sizes, config.model.visual_residual)
-    return sizes
+    return with_variant(preset(config.preset), asdict(config.model))
 
 
 def build_learner(config: TrainingConfig, texts: Iterable[str] = ()) -> Learner:

@@ -55,10 +55,13 @@ class ModelConfig:
         head: Action head: "bins", independent ones; "autoregressive" bins; "mixture", a mixture density over
             positions and rotation; or "regression". Pointer models (nano, small) have their own.
         visual_residual: Add object tokens to the encoded prompt (MIDAS).
+        conditioning: The decoder attends to the prompt by "cross-attention"; or the prompt is the "prefix" of
+            the history, with twice as many layers of half the size.
     """
 
     head: Literal["bins", "autoregressive", "mixture", "regression"] | None = None
     visual_residual: bool | None = None
+    conditioning: Literal["cross-attention", "prefix"] | None = None
 
 
 @dataclass(frozen=True, slots=True)

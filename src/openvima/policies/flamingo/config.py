@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.bins import BinsConfig
-from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.decoder import AnyDecoderConfig
 from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.resampler import ResamplerConfig
@@ -29,7 +29,7 @@ class FlamingoConfig:
     frame: VitConfig
     resampler: ResamplerConfig
     prompt: PromptEncoderConfig
-    decoder: DecoderConfig
+    decoder: AnyDecoderConfig
     head: HeadConfig
 
     def __post_init__(self) -> None:

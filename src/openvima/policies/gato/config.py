@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.bins import BinsConfig
-from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.nn.decoder import AnyDecoderConfig
 from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.vit import VitConfig, check_frame_encoder
@@ -26,7 +26,7 @@ class GatoConfig:
     architecture: ClassVar[str] = "gato"
     frame: VitConfig
     prompt: PromptEncoderConfig
-    decoder: PrefixDecoderConfig
+    decoder: AnyDecoderConfig
     head: HeadConfig
 
     def __post_init__(self) -> None:

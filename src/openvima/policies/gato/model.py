@@ -8,7 +8,7 @@ from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.gato.config import GatoConfig
-from openvima.policies.nn.decoder import PrefixDecoder
+from openvima.policies.nn.decoder import build_decoder
 from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.policy_network import (
@@ -39,7 +39,7 @@ class Gato(PolicyNetwork):
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
-        self.decoder = PrefixDecoder(config.decoder)
+        self.decoder = build_decoder(config.decoder)
         self.head = build_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:

@@ -8,7 +8,7 @@ from torch import nn
 
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.gpt.config import GptConfig
-from openvima.policies.nn.decoder import PrefixDecoder
+from openvima.policies.nn.decoder import build_decoder
 from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import NUM_VIEWS
@@ -40,7 +40,7 @@ class Gpt(PolicyNetwork):
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(NUM_VIEWS * width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
-        self.decoder = PrefixDecoder(config.decoder)
+        self.decoder = build_decoder(config.decoder)
         self.head = build_head(config.head, width, actions)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:

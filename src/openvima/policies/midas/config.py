@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.decoder import PrefixDecoderConfig
+from openvima.policies.nn.decoder import AnyDecoderConfig
 from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
@@ -26,7 +26,7 @@ class MidasConfig:
     architecture: ClassVar[str] = "midas"
     images: ObjectEncoderConfig
     prompt: PromptEncoderConfig
-    decoder: PrefixDecoderConfig
+    decoder: AnyDecoderConfig
     head: HeadConfig
 
     def __post_init__(self) -> None:

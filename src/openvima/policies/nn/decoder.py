@@ -1,8 +1,9 @@
 """The two decoders of a history, given a prompt, with key-value caches.
 
-`Decoder` attends to the prompt through cross-attention (VIMA, VIMA-Flamingo, nano, small). `PrefixDecoder`
-puts the prompt before the history in one causal sequence (VIMA-Gato, VIMA-GPT, MIDAS). Training decodes a
-whole history in one call, acting one step per call: both run the same code on the same cache.
+`Decoder` attends to the prompt through cross-attention (by default VIMA, VIMA-Flamingo, nano, small).
+`PrefixDecoder` puts the prompt before the history in one causal sequence (VIMA-Gato, VIMA-GPT, MIDAS).
+Training decodes a whole history in one call, acting one step per call: both run the same code on the same
+cache.
 
 Shape suffixes: B batch, T steps, Q tokens of a step, L new positions, N valid positions of all rows, S cached
 positions, P positions of the prompt, D width, H heads, K width of a head.
@@ -78,6 +79,9 @@ class PrefixDecoderConfig:
 
     def __post_init__(self) -> None:
         _check_sizes("prefix decoder", self.width, self.num_heads, self.dropout)
+
+
+AnyDecoderConfig = DecoderConfig | PrefixDecoderConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,6 +266,11 @@ class PrefixDecoder(CausalDecoder):
         tokens_BPD = torch.cat([prompt_BPD, separator_B1D], dim=1)
         mask_BP = F.pad(mask_BP, (0, 1), value=True)
         return self(self._empty_cache(tokens_BPD, mask_BP), tokens_BPD, mask_BP)[1]
+
+
+def build_decoder(config: AnyDecoderConfig) -> Decoder | PrefixDecoder:
+    """Build the decoder of a config."""
+    return Decoder(config) if isinstance(config, DecoderConfig) else PrefixDecoder(config)
 
 
 class CrossBlock(nn.Module):

@@ -6,7 +6,7 @@ from typing import ClassVar
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
-from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
 from openvima.policies.nn.heads import HeadConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
@@ -29,7 +29,7 @@ class VimaConfig:
     architecture: ClassVar[str] = "vima"
     images: ObjectEncoderConfig
     prompt: PromptEncoderConfig
-    decoder: DecoderConfig
+    decoder: AnyDecoderConfig
     head: HeadConfig
     query_token: bool = False
 

@@ -9,7 +9,7 @@ from torch import nn
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.autoregressive import AutoregressiveHead
 from openvima.policies.nn.bins import BinsHead
-from openvima.policies.nn.decoder import Decoder
+from openvima.policies.nn.decoder import Decoder, build_decoder
 from openvima.policies.nn.heads import build_action_tokens, build_head
 from openvima.policies.nn.history import ObservationTokens
 from openvima.policies.nn.object_encoder import ObjectEncoder
@@ -47,10 +47,13 @@ class Vima(PolicyNetwork):
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(config.images.width + NUM_END_EFFECTORS, width)
         actions = build_action_tokens(config.head, width)
-        self.decoder = Decoder(config.decoder)
+        self.decoder = build_decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
         self.head = build_head(config.head, width, actions)
-        self.explains = isinstance(self.head, BinsHead | AutoregressiveHead)  # others have no bins to show
+        # Other heads have no bins, and other decoders no attention to the prompt alone.
+        self.explains = isinstance(self.head, BinsHead | AutoregressiveHead) and isinstance(
+            self.decoder, Decoder
+        )
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
