@@ -11,10 +11,13 @@ torch = pytest.importorskip("torch")
 from openvima.data import Dataset  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
+from openvima.evaluation.sources import policy_sources  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.false_positives import augmented  # noqa: E402
+from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import StoredEpisode  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
 from openvima.training.source import (  # noqa: E402
@@ -22,9 +25,11 @@ from openvima.training.source import (  # noqa: E402
     Parts,
     by_length,
     check_words,
+    open_demonstrations,
     order_of,
     split_examples,
 )
+from openvima.training.vocabulary import training_texts  # noqa: E402
 from training_examples import collate_examples, examples_of, rngs_of  # noqa: E402
 
 OBJECTS, VIEWS = Processor("objects"), Processor("views")
@@ -48,6 +53,41 @@ def test_slots_point_at_the_objects_that_were_picked(data, examples):
 
 def names_of(source: ExampleSource) -> set[tuple[str, int]]:
     return {(example.episode.task, example.episode.seed) for example in source}
+
+
+def test_demonstrations_of_some_tasks_are_left_out(data):
+    kept = open_demonstrations(data, ("follow_motion", "rotate"))
+    assert set(kept.index.column("task").to_pylist()) == {"sweep_without_exceeding", "visual_manipulation"}
+    assert not any("degrees" in text for text in training_texts(kept, AugmentationConfig()))
+    assert any(
+        "degrees" in text for text in training_texts(open_demonstrations(data, ()), AugmentationConfig())
+    )
+    with pytest.raises(
+        ConfigError, match=r"exclude_tasks: there is no task 'rotat'. Did you mean 'rotate'\?"
+    ):
+        open_demonstrations(data, ("rotat",))
+    with pytest.raises(
+        ConfigError, match="has no other task, only rotate, sweep_without_exceeding, visual_m"
+    ):
+        open_demonstrations(data, ("rotate", "sweep_without_exceeding", "visual_manipulation"))
+
+
+def test_a_run_declares_the_tasks_that_it_did_not_see(settings):
+    config = TrainingConfig.of(
+        {
+            **settings,
+            "pretraining.steps": 0,
+            "schedule.steps": 1,
+            "loader.exclude_tasks": "rotate, follow_motion",
+        }
+    )
+    run = train(config)
+    same = replace(config, loader=replace(config.loader, exclude_tasks="follow_motion,rotate"))
+    assert train(same) == run  # of a finished run nothing is left to do
+    (source,) = policy_sources([str(run)])
+    assert source.record()["excluded_tasks"] == ["follow_motion", "rotate"]
+    with pytest.raises(ConfigError, match="exclude_tasks is 'follow_motion,rotate' there and '' here"):
+        train(replace(config, loader=replace(config.loader, exclude_tasks="")))
 
 
 def test_the_split_follows_from_the_episode_and_keeps_everything(data):

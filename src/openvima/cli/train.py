@@ -95,6 +95,7 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     from openvima.tasks.registry import task_spec
 
     manifest = read_manifest(config.data)
-    playable = tuple(t for t in sorted(manifest["tasks"]) if ONLINE_EVAL_LEVEL in task_spec(t).levels)
+    trained = sorted(set(manifest["tasks"]) - {*config.loader.excluded_tasks})
+    playable = tuple(task for task in trained if ONLINE_EVAL_LEVEL in task_spec(task).levels)
     prompts = manifest["config"].get("prompts", MULTIMODAL)
     return OnlineEval(playable, config.rollout.episodes, EnvConfig(config.assets, prompts=prompts))

@@ -11,7 +11,13 @@ from urllib.parse import urlsplit
 from openvima.errors import CheckpointError, ConfigError, UnknownPolicyError, echo
 from openvima.input_files import open_regular
 from openvima.policies.bundled import BUNDLED
-from openvima.policies.own_code import LearnerCode, learner_code, parameters_hash, policy_of_code
+from openvima.policies.own_code import (
+    LearnerCode,
+    learner_code,
+    parameters_hash,
+    policy_of_code,
+    tasks_left_out,
+)
 from openvima.policies.presets import PRESETS
 from openvima.policies.sources import find_checkpoint, is_own_code, is_policy_source, unknown_policy
 from openvima.serving.client import describe
@@ -80,7 +86,8 @@ class PolicySource:
         """What the policy is.
 
         Returns:
-            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights;
+            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights
+            and, if its training excluded tasks, "excluded_tasks", as its settings declare;
             for a function its name without folders, "sha256" of its source file and, if the policy offers
             weights, "weights_sha256". Files that the source file imports are not hashed.
 
@@ -102,8 +109,10 @@ class PolicySource:
             weights = weights_hash(self.source)
             return {"kind": "run", "sha256": weights, "code": _code_record(code.source)}
         if self.kind == "run":
-            where = {"bundled": self.source} if self.source in BUNDLED else {}
-            return {"kind": "run", **where, "sha256": weights_hash(self.source)}
+            if self.source in BUNDLED:
+                return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
+            left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
+            return {"kind": "run", "sha256": weights_hash(self.source), **left_out}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
 

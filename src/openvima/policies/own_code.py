@@ -48,17 +48,28 @@ def learner_code(folder: str | Path) -> LearnerCode | None:
 
     Nothing is executed.
     """
+    file, preset = _run_setting(folder, "preset")
+    return LearnerCode(preset, file) if isinstance(preset, str) and is_code(preset) else None
+
+
+def tasks_left_out(folder: str | Path) -> list[str]:
+    """Return the tasks that the training of a run folder, or of one of its checkpoints, excluded."""
+    _, loader = _run_setting(folder, "loader")
+    tasks = loader.get("exclude_tasks") if isinstance(loader, dict) else None
+    return tasks.split(",") if isinstance(tasks, str) and tasks else []
+
+
+def _run_setting(folder: str | Path, name: str) -> tuple[Path, Any]:  # Any: YAML
+    """Return a setting of the run that a folder belongs to, None without any, and the file that holds it."""
     path = Path(folder)
     run = path.absolute().parent
     for place in (path, run.parent) if run.name == CHECKPOINTS_FOLDER else (path,):
         file = place / CONFIG_FILE
         try:
-            training = read_yaml(file)["training"]
-            preset = training["preset"]
+            return file, read_yaml(file)["training"][name]
         except (OSError, OpenVimaError, KeyError, TypeError):
             continue
-        return LearnerCode(preset, file) if isinstance(preset, str) and is_code(preset) else None
-    return None
+    return path, None
 
 
 def policy_of_code(source: str) -> Policy:

@@ -33,7 +33,8 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     Raises:
         ConfigError: Settings contradict the preset.
     """
-    loader, augmentation = config.loader, config.augmentation
+    loader = replace(config.loader, exclude_tasks=",".join(config.loader.excluded_tasks))
+    config, augmentation = replace(config, loader=loader), config.augmentation
     if loader.detected_prob and loader.boxes is None:
         raise ConfigError(
             f"loader.detected_prob is {loader.detected_prob:g}, but no detector is given; name one with "

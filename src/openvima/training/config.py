@@ -36,6 +36,8 @@ class LoaderConfig:
             makes an `ObjectExtractor`.
         detected_prob: Probability of using these boxes, drawn per demonstration and batch; None is 0.5 where
             `boxes` are given. Held-out demonstrations keep true boxes, unless it is 1.
+        exclude_tasks: Tasks that the run must not see, comma-separated: in no stage, vocabulary or
+            validation.
     """
 
     batch_size: Count = 64
@@ -45,6 +47,12 @@ class LoaderConfig:
     validation_episodes: Count = 4096
     boxes: str | None = None
     detected_prob: Probability | None = None
+    exclude_tasks: str = ""
+
+    @property
+    def excluded_tasks(self) -> tuple[str, ...]:
+        """The excluded tasks, sorted."""
+        return tuple(sorted({name.strip() for name in self.exclude_tasks.split(",")} - {""}))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,13 @@ from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
 from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
-from openvima.training.source import ExampleSource, check_words, split_examples, with_boxes_of
+from openvima.training.source import (
+    ExampleSource,
+    check_words,
+    open_demonstrations,
+    split_examples,
+    with_boxes_of,
+)
 from openvima.training.vocabulary import training_texts
 
 
@@ -41,7 +47,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
 
     Raises:
         ConfigError: The folder holds a run with other settings, preset and settings contradict each other,
-            there is no such detector, or the loss diverged.
+            there is no such detector or excluded task, or the loss diverged.
         DatasetError: There are no demonstrations, or one is too long for the network.
         CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
@@ -51,7 +57,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     """
     config = resolved(config)
     load_assets(config.assets)  # fails before there is a run folder
-    dataset = Dataset(config.data)
+    dataset = open_demonstrations(config.data, config.loader.excluded_tasks)
     boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
     runtime = config.runtime
     with (

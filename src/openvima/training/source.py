@@ -3,14 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from openvima.data.batching import BatchOrder
 from openvima.data.object_cache.cache import ObjectCache
-from openvima.errors import ConfigError, DatasetError
+from openvima.data.reader import Dataset, read_manifest
+from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
+from openvima.tasks.registry import list_tasks
 from openvima.training.augmentation.distractor_insertion import allows_distractors
 from openvima.training.dataset import Example, StoredEpisode
 from openvima.training.hash_split import split_hashes
@@ -107,6 +110,36 @@ class Parts:
             for group in by_length(examples)
             for start in range(0, len(group), size)
         ]
+
+
+def open_demonstrations(folder: Path, excluded: Sequence[str]) -> Dataset:
+    """Open a folder of demonstrations without those of some tasks.
+
+    Args:
+        folder: The folder.
+        excluded: Names of tasks; the folder need not have any of them.
+
+    Raises:
+        ConfigError: There is no such task, or no other one is left.
+        DatasetError: The folder is no finished data set.
+    """
+    if not excluded:
+        return Dataset(folder)
+    present = sorted(read_manifest(folder)["tasks"])
+    known = {*present, *list_tasks()}
+    if problems := [
+        unknown_name("task", name, known, f"{folder} has {', '.join(present)}.")
+        for name in excluded
+        if name not in known
+    ]:
+        raise ConfigError(f"loader.exclude_tasks: {' '.join(problems)}")
+    kept = [task for task in present if task not in excluded]
+    if not kept:
+        raise ConfigError(
+            f"loader.exclude_tasks is {', '.join(excluded)}; {folder} has no other task, only "
+            f"{', '.join(present)}."
+        )
+    return Dataset(folder, tasks=kept)
 
 
 def split_examples(

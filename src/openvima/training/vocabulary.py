@@ -2,6 +2,9 @@
 
 from collections.abc import Iterator
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from openvima.data.reader import Dataset
 from openvima.perception.preprocessing import split_prompt
 from openvima.tasks.novel_words import NOUNS
@@ -22,7 +25,10 @@ def training_texts(dataset: Dataset, augmentation: AugmentationConfig) -> Iterat
     """
     prompts: set[str] = set()
     for name in dataset.shard_names():  # 0.1 ms per demonstration
-        prompts.update(dataset.shard(name).table(["prompt"]).column("prompt").unique().to_pylist())
+        table = dataset.shard(name).table(["task", "prompt"])
+        if dataset.tasks is not None:  # a shard may hold others
+            table = table.filter(pc.is_in(table.column("task"), pa.array(dataset.tasks)))
+        prompts.update(table.column("prompt").unique().to_pylist())
     if augmentation.inverse_dynamics_prob:
         prompts.add(motion_text(1))
     if augmentation.rename_objects_prob:
