@@ -69,7 +69,7 @@ def test_settings_survive_their_record(tmp_path: Path) -> None:
         tmp_path,
         level="L1",
         start_seed=5,
-        env_config=EnvConfig(compat=True, difficulty="hard"),
+        env_config=EnvConfig(compat=True, task_options="difficulty=hard"),
         compression="zstd",
         images=False,
     )

@@ -25,7 +25,7 @@ def info_of(demo: Demonstration, env_config: EnvConfig) -> ShardInfo:
         assets=demo.assets,
         versions=demo.versions,
         compat=env_config.compat,
-        difficulty=env_config.difficulty,
+        task_options=env_config.task_options,
         prompts=env_config.prompts,
         images=False,
     )
@@ -47,7 +47,7 @@ def recorded() -> Demonstration:
     [
         ("visual_manipulation", "L2", EnvConfig()),
         ("visual_manipulation", "train", EnvConfig(compat=True)),
-        ("visual_manipulation", "train", EnvConfig(difficulty="medium")),
+        ("visual_manipulation", "train", EnvConfig(task_options="difficulty=medium")),
         ("visual_manipulation", "train", EnvConfig(prompts="mixed,paraphrased")),
         ("rearrange", "train", EnvConfig()),  # a scene in the prompt
         ("twist", "train", EnvConfig()),  # scenes before and after

@@ -243,7 +243,7 @@ def test_episodes_that_repeat_others_are_refused_or_skipped(
 
 
 def test_equal_seeds_of_another_setup_are_no_duplicates(tmp_path: Path, write_folder: WriteFolder) -> None:
-    first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", difficulty="hard")
+    first, second = write_folder(tmp_path / "1"), write_folder(tmp_path / "2", compat=True)
     assert len(Dataset(merge(MergeConfig((first, second), tmp_path / "all")))) == 24
 
 

@@ -184,7 +184,9 @@ def _out_of_order(rows: str) -> str:
 def test_a_shard_of_other_settings_is_found(folder: Path) -> None:
     shard = Shard(folder / FIRST)
     demos = [shard[row] for row in range(len(shard))]
-    info = dataclasses.replace(shard.info, difficulty="hard", versions={"openvima": "0"}, number=5)
+    info = dataclasses.replace(
+        shard.info, task_options="difficulty=hard", versions={"openvima": "0"}, number=5
+    )
     manifest = Dataset(folder).manifest
     with ShardWriter(folder / FIRST, info) as writer:
         for demo in demos:
@@ -192,7 +194,7 @@ def test_a_shard_of_other_settings_is_found(folder: Path) -> None:
     origin = {key: manifest[key] for key in ("command", "config", "versions", "licence")}
     finish_folder(folder, sorted(folder.glob("*.arrow")), **origin)
     found = causes(verify(folder, NONE))[FIRST]
-    assert "difficulty is hard, in the manifest easy" in found
+    assert "task_options is difficulty=hard, in the manifest none" in found
     assert any(cause.startswith("it was written by {'openvima': '0'}") for cause in found)
     assert "it says that it is rotate-train-00005.arrow" in found
 

@@ -79,6 +79,6 @@ def test_other_versions_are_noted(results):
 
 
 def test_files_that_do_not_name_a_setting_had_the_default(results):
-    config = {key: value for key, value in results.config.items() if key != "difficulty"}
+    config = {key: value for key, value in results.config.items() if key != "compat"}
     merged = merge({"old": replace(results, config=config), "new": results})
     assert merged.results.policy_names() == results.policy_names()

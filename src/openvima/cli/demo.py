@@ -16,8 +16,8 @@ def main(
     policy: str = "oracle",
     assets: str = "procedural",
     compat: bool = False,
-    difficulty: str = "easy",
     prompts: str = "multimodal",
+    task_options: str = "",
     device: str = "cpu",
     boxes: str | None = None,
     trust_code: bool = False,
@@ -39,9 +39,11 @@ def main(
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd.
-        difficulty: easy, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
             object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
+            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
+            all that have the option.
         device: Where a network computes: cpu, in float64, or cuda, in float32.
         boxes: Use the boxes of a detector instead of the true ones: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION.
@@ -57,9 +59,9 @@ def main(
 
     if (task is None) == (episode is None):
         raise ConfigError("demo takes either a TASK or --episode FILE; `openvima tasks` lists the tasks.")
-    if episode is not None and (seed, level, difficulty, prompts) != (0, None, "easy", "multimodal"):
+    if episode is not None and (seed, level, prompts, task_options) != (0, None, "multimodal", ""):
         raise ConfigError(
-            "an episode file says all of --seed, --level, --difficulty and --prompts; leave them out."
+            "an episode file says all of --seed, --level, --prompts and --task-options; leave them out."
         )
     level = "" if task is None else task_spec(task).checked_level(level)  # before what takes a second to load
     if out.suffix.lower() != ".mp4":
@@ -86,7 +88,7 @@ def main(
             explain=explain,
         )
     assert task is not None  # as checked
-    env_config = EnvConfig(assets, compat, difficulty, prompts)
+    env_config = EnvConfig(assets, compat, prompts, task_options)
     batch = Batch(
         policy,
         policy,

@@ -30,8 +30,8 @@ def main(
     out: Path = Path("evaluation"),
     assets: str = "procedural",
     compat: bool = False,
-    difficulty: str = "easy",
     prompts: str = "multimodal",
+    task_options: str = "",
     ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
@@ -69,9 +69,11 @@ def main(
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Reproduce the quirks of the original benchmark; docs/compat.md lists them.
-        difficulty: easy, as for all published results, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
             object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
+            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
+            all that have the option.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all. Also in_context and
             oracle_demonstration, which prompts with the oracle's solution of the same episode.
@@ -114,7 +116,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        env_config=EnvConfig(assets, compat, difficulty, prompts),
+        env_config=EnvConfig(assets, compat, prompts, task_options),
         batch=batch,
         force=force,
         device=device,

@@ -29,8 +29,8 @@ def main(
     keep_failed: bool = False,
     assets: str = "procedural",
     compat: bool = False,
-    difficulty: str = "easy",
     prompts: str = "multimodal",
+    task_options: str = "",
     force: bool = False,
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
@@ -59,9 +59,11 @@ def main(
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd; docs/compat.md lists the differences.
-        difficulty: easy, as for all published results, medium or hard.
         prompts: multimodal; text, which puts a description such as "the red swirl letter A" in place of each
             object image; or mixed, which does so with probability ½. With ",paraphrased": synonyms.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
+            num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
+            all that have the option.
         force: Delete the data set that is in the folder.
 
     Returns:
@@ -78,7 +80,7 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        env_config=EnvConfig(assets, compat, difficulty, prompts),
+        env_config=EnvConfig(assets, compat, prompts, task_options),
         compression=compression,
         images=images,
         keep_failed=keep_failed,

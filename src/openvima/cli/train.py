@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,11 +92,10 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     from openvima.data.reader import read_manifest
     from openvima.env import EnvConfig
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
-    from openvima.tasks.prompts import MULTIMODAL
     from openvima.tasks.registry import task_spec
 
     manifest = read_manifest(config.data)
     trained = sorted(set(manifest["tasks"]) - {*config.loader.excluded_tasks})
     playable = tuple(task for task in trained if ONLINE_EVAL_LEVEL in task_spec(task).levels)
-    prompts = manifest["config"].get("prompts", MULTIMODAL)
-    return OnlineEval(playable, config.rollout.episodes, EnvConfig(config.assets, prompts=prompts))
+    env_config = replace(EnvConfig.from_record(manifest["config"]), assets=config.assets)
+    return OnlineEval(playable, config.rollout.episodes, env_config)

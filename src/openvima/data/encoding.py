@@ -14,7 +14,7 @@ import pyarrow as pa
 from openvima.data.image_layout import ImageBuffers
 from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
-from openvima.env.config import ENV_SETTINGS, EnvConfig
+from openvima.env.config import ENV_SETTINGS, EnvConfig, without_published
 from openvima.errors import ShardError, unknown_name
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
@@ -63,8 +63,8 @@ class ShardInfo:
         assets: Name of the asset pack.
         versions: Package name to version.
         compat: Whether the original benchmark was followed also where it is odd.
-        difficulty: "easy", "medium" or "hard".
         prompts: "multimodal", or what replaces object images in prompts; only then recorded.
+        task_options: As in `EnvConfig`; only recorded if there are any.
         compression: Codec of the buffers, "lz4" or "zstd".
         images: Whether images are stored; without, they are drawn anew on reading.
 
@@ -81,8 +81,8 @@ class ShardInfo:
     assets: str
     versions: dict[str, str]
     compat: bool = False
-    difficulty: str = "easy"
     prompts: str = MULTIMODAL
+    task_options: str = ""
     compression: str = "lz4"
     images: bool = True
 
@@ -102,9 +102,9 @@ class ShardInfo:
 
     def to_metadata(self) -> dict[bytes, bytes]:
         """Return the entry for the file's schema."""
-        fields = {name: getattr(self, name) for name in self.__slots__}
-        if self.prompts == MULTIMODAL:
-            del fields["prompts"]
+        fields = without_published({name: getattr(self, name) for name in self.__slots__})
+        if not self.task_options:
+            fields["difficulty"] = "easy"  # part of schema version 1, whose bytes are published
         text = json.dumps({"schema": SCHEMA_VERSION, **fields}, sort_keys=True)
         return {_METADATA_KEY: text.encode()}
 
@@ -122,6 +122,8 @@ class ShardInfo:
                 raise ShardError("it is an Arrow file, but holds no demonstrations of this package.")
             if written_as != SCHEMA_VERSION:
                 raise ShardError(f"it has schema version {written_as}; this package reads {SCHEMA_VERSION}.")
+            if (difficulty := fields.pop("difficulty", "easy")) != "easy":
+                raise ShardError(f"its difficulty is {difficulty!r:.80}; generate it with --task-options.")
             info = ShardInfo(**fields)
             for name, kind in ShardInfo.__annotations__.items():
                 if not isinstance(value := getattr(info, name), get_origin(kind) or kind):

@@ -19,12 +19,11 @@ from openvima.data.encoding import ShardInfo
 from openvima.data.manifest import FAILED_FOLDER
 from openvima.data.records import package_versions
 from openvima.data.schema import CODECS
-from openvima.env.config import DEFAULT_ENV_CONFIG, ENV_SETTINGS, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
-from openvima.tasks.prompts import MULTIMODAL
-from openvima.tasks.sampling import check_text_form, takes_prompts
+from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 
 Engine = Literal["processes", "ray"]
@@ -57,7 +56,7 @@ class GenerateConfig:
         level: "train" or "L1" to "L4".
         start_seed: First seed.
         shard_size: Episodes in a file; None lets files grow with their number, from 4 episodes to 1,000.
-        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Settings of the environments.
         compression: Codec of the files: "lz4", or "zstd", which is smaller and slower.
         images: Store images; without, they are drawn anew on reading.
         keep_failed: Keep the episodes that the oracle did not solve too, in the folder's `failed`.
@@ -126,17 +125,21 @@ class GenerateConfig:
         Raises:
             UnknownTaskError: There is no such task.
             LevelError: There is no such level, or a task is not defined at it.
-            ConfigError: A named task has no text form, which the prompts need; "all" leaves it out.
+            ConfigError: A named task has no text form, which the prompts need; "all" leaves it out. Or a task
+                option does not fit.
         """
         if self.level not in LEVELS:
             raise LevelError(unknown_name("level", self.level, LEVELS))
         if self.tasks == ("all",):
             there = (task for task in list_tasks() if self.level in task_spec(task).levels)
-            return tuple(sorted(task for task in there if takes_prompts(task, self.env_config.prompts)))
-        for task in self.tasks:
-            task_spec(task).pool(self.level)
-            check_text_form(task, self.env_config.prompts)
-        return tuple(sorted(set(self.tasks)))
+            tasks = tuple(sorted(task for task in there if takes_prompts(task, self.env_config.prompts)))
+        else:
+            for task in self.tasks:
+                task_spec(task).pool(self.level)
+                check_text_form(task, self.env_config.prompts)
+            tasks = tuple(sorted(set(self.tasks)))
+        check_task_options(tasks, self.env_config.task_options)
+        return tasks
 
     def record(self) -> dict[str, Any]:  # Any: JSON
         """Return the settings that decide the content, as the manifest holds them: no path, no machine."""
@@ -164,14 +167,12 @@ class GenerateConfig:
         Raises:
             ConfigError: The record lacks a setting, or holds one that is not allowed.
         """
-        given = {"prompts": MULTIMODAL, **record}
         try:
             settings: dict[str, Any] = {
                 "tasks": tuple(record["tasks"]),
                 "shard_size": record["shard_size"] or None,
                 "env_config": replace(
-                    EnvConfig(**{name: given[name] for name in ENV_SETTINGS}),
-                    assets=recorded_assets(record["assets"]),
+                    EnvConfig.from_record(record), assets=recorded_assets(record["assets"])
                 ),
                 **{name: record[name] for name in ("level", "episodes", "start_seed")},
                 **{name: record[name] for name in ("compression", "images")},

@@ -91,7 +91,7 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         assets=rasteriser.assets,
         compat=info.compat,
         prompts=info.prompts,
-        **info.env_config.options(),
+        **info.env_config.options(demo.task),
     )
     return rasteriser.prompt(episode.problem.prompt)
 

@@ -138,4 +138,8 @@ def _differences(found: ShardInfo, asked: ShardInfo) -> list[str]:
     names = ("level", "domain", "shard_size", "first_seed", *ENV_SETTINGS, "compression", "images")
     pairs = [(name, getattr(found, name), getattr(asked, name)) for name in names]
     pairs += [(name, found.versions.get(name), asked.versions[name]) for name in asked.versions]
-    return [f"{name} is {there}, asked for is {here}" for name, there, here in pairs if there != here]
+    return [
+        f"{name} is {str(there) or 'none'}, asked for is {str(here) or 'none'}"
+        for name, there, here in pairs
+        if there != here
+    ]

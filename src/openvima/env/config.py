@@ -1,9 +1,12 @@
-"""Settings that all environments of a run share: assets, difficulty, fidelity, prompts."""
+"""Settings that all environments of a run share: assets, fidelity, prompts, task options."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
-from openvima.tasks.options import check_difficulty
+from openvima.errors import ConfigError, echo
+from openvima.tasks import task_spec
+from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts
 from openvima.user_code import is_code, without_folder
 
@@ -19,21 +22,36 @@ class EnvConfig:
         assets: Asset pack: "procedural", "original", MODULE:FUNCTION, FILE.py:FUNCTION, or the folder of a
             checkout of VIMA-Bench.
         compat: Reproduce VIMA-Bench's quirks.
-        difficulty: "easy", as for all published results, "medium" or "hard".
         prompts: "multimodal", as for all published results, "text" or "mixed"; see `openvima.make`.
+        task_options: [TASK.]NAME=VALUE,…, such as "num_distractors=3,rotate.difficulty=hard"; kept sorted.
+            Without a task, an option holds for all tasks that have it.
 
     Raises:
-        ConfigError: There is no such difficulty or form of prompts.
+        ConfigError: There is no such form of prompts, or the task options have another form.
     """
 
     assets: str = "procedural"
     compat: bool = False
-    difficulty: str = "easy"
     prompts: str = MULTIMODAL
+    task_options: str = ""
 
     def __post_init__(self) -> None:
-        check_difficulty(self.difficulty)
         check_prompts(self.prompts)
+        object.__setattr__(self, "task_options", str(TaskOptions.parse(self.task_options)))
+
+    @staticmethod
+    def from_record(record: Mapping[str, Any]) -> "EnvConfig":
+        """Read the settings out of a record of a data set or of results; those that it lacks are published.
+
+        Raises:
+            ConfigError: A setting is invalid, or the record is of an unsupported version.
+        """
+        if record.get("difficulty", "easy") != "easy":
+            raise ConfigError(
+                f"the recorded difficulty is {echo(repr(record['difficulty']))}, which now is a task option; "
+                "repeat the command with --task-options difficulty=…."
+            )
+        return EnvConfig(**{name: record[name] for name in ENV_SETTINGS if name in record})
 
     def make(self, task: str, level: str, *, domain: str, realtime: bool = False) -> "TabletopEnv":
         """Build an environment.
@@ -45,7 +63,7 @@ class EnvConfig:
             realtime: Record `frames` during each step.
 
         Raises:
-            ConfigError: The task does not have this difficulty, or has no text form.
+            ConfigError: The task has no text form, or an option is invalid.
         """
         from openvima.env.tabletop import TabletopEnv
 
@@ -57,22 +75,29 @@ class EnvConfig:
             compat=self.compat,
             prompts=self.prompts,
             realtime=realtime,
-            **self.options(),
+            **self.options(task),
         )
 
-    def options(self) -> dict[str, Any]:
-        """Return the options of the task."""
-        if self.difficulty == "easy":  # a task with one difficulty has no such option
-            return {}
-        return {"difficulty": self.difficulty}
+    def options(self, task: str) -> dict[str, Any]:
+        """Return the options of a task.
+
+        Raises:
+            UnknownTaskError: There is no such task.
+            ConfigError: The task does not have one of its options, or a value is not of its type.
+        """
+        return TaskOptions.parse(self.task_options).of(task_spec(task))
 
     def record(self) -> dict[str, str | bool]:
-        """Return the settings for a record, without paths and without the prompts if they are published."""
+        """Return the settings for a record, without paths; prompts and task options unless published."""
         is_named = self.assets == "procedural" or is_code(self.assets)
         record = {**asdict(self), "assets": without_folder(self.assets) if is_named else "original"}
-        if self.prompts == MULTIMODAL:
-            del record["prompts"]
-        return record
+        return without_published(record)
+
+
+def without_published(record: dict[str, Any]) -> dict[str, Any]:  # Any: JSON
+    """Return a record without prompts and task options that are as published."""
+    published = {"prompts": MULTIMODAL, "task_options": ""}
+    return {name: value for name, value in record.items() if value != published.get(name, ...)}
 
 
 ENV_SETTINGS = tuple(field.name for field in fields(EnvConfig))

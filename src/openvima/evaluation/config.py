@@ -22,7 +22,7 @@ from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
 from openvima.tasks.registry import list_tasks, task_spec
-from openvima.tasks.sampling import check_text_form, takes_prompts
+from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 from openvima.user_code import is_code, with_absolute_path
 
@@ -51,7 +51,7 @@ class EvaluationConfig:
         workers: Processes; the results do not depend on their number. None means one, or as many as the Ray
             cluster at `address` has CPUs.
         out: Folder to write to.
-        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Settings of the environments.
         batch: Episodes that are run together, with batched inference.
         force: Overwrite results of another evaluation in `out`.
         device: Where networks compute, such as "cpu" or "cuda". Only in float64 on a CPU are decisions
@@ -248,7 +248,7 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
         ConfigError: No level holds any of the tasks, or one that was named has no text form, which the
-            prompts need.
+            prompts need. Or a task option does not fit.
     """
     for level in config.levels:
         if level not in LEVELS:
@@ -274,6 +274,7 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
         raise LevelError(f"nothing to play at {asked}: {where}. Change --levels or leave the task out.")
     if not pairs:
         raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
+    check_task_options(tuple(dict.fromkeys(task for task, _ in pairs)), config.env_config.task_options)
     return pairs
 
 

@@ -19,7 +19,7 @@ class OnlineEval:
     Args:
         tasks: Names of the tasks.
         episodes: Episodes of each task, at level L1; none of them occurs in training or evaluation.
-        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Settings of the environments.
         device: Where the policy computes.
     """
 

@@ -21,6 +21,7 @@ def score(
     seed: int = 0,
     ablations: tuple[str, ...] = (),
     prompts: str = "multimodal",
+    task_options: str = "",
 ) -> Results:
     """Evaluate policy objects on the episodes of `openvima evaluate`.
 
@@ -33,6 +34,7 @@ def score(
         ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes".
         prompts: "multimodal", "text" or "mixed", see `openvima.make`; such as "text" for a policy that reads
             language alone.
+        task_options: As in `EnvConfig`, such as "num_distractors=3".
 
     Returns:
         Success rates and the outcome of every episode.
@@ -40,7 +42,7 @@ def score(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: There is no episode.
+        ConfigError: There is no episode, or a task option does not fit.
         PolicyError: A policy lacks a method, raises, or gives something else than an action for each episode.
 
     Example:
@@ -54,7 +56,7 @@ def score(
         levels=levels,
         episodes=episodes,
         seed=seed,
-        env_config=EnvConfig(prompts=prompts),
+        env_config=EnvConfig(prompts=prompts, task_options=task_options),
         ablations=ablations,
     )
     batches = plan(config)

@@ -9,7 +9,7 @@ import numpy as np
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.user_assets import recorded_assets
-from openvima.env.config import ENV_SETTINGS, EnvConfig
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import IN_CONTEXT
 from openvima.evaluation.actions import ActionReplay, read_actions
@@ -20,7 +20,6 @@ from openvima.evaluation.runner import Report
 from openvima.evaluation.versions import versions
 from openvima.input_files import read_text
 from openvima.multiprocess import imap_unordered
-from openvima.tasks.prompts import MULTIMODAL
 
 VERIFICATION_NAME = "verification.json"
 _MAX_BYTES = 1 << 28
@@ -153,7 +152,7 @@ def _row_problems(results: Results) -> Iterator[str]:
         (*config["levels"],),
         int(config["episodes"]),
         int(config["seed"]),
-        env_config=EnvConfig(prompts=config.get("prompts", MULTIMODAL)),
+        env_config=replace(EnvConfig.from_record(config), assets=DEFAULT_ENV_CONFIG.assets),
         ablations=(IN_CONTEXT,) if IN_CONTEXT in config.get("ablations", ()) else (),  # decides the tasks
     )
     expected = {(task, level) for task, level in cells(whole)}
@@ -183,12 +182,8 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
 
 def _env_config(results: Results, assets: str | None) -> EnvConfig:
     """Settings of the environments; assets are recorded without their path, and functions are not run."""
-    given = {name: value for name, value in results.config.items() if name in ENV_SETTINGS}
-    if assets is not None:
-        given["assets"] = assets
-    elif "assets" in given:
-        given["assets"] = recorded_assets(given["assets"])
-    return EnvConfig(**given)
+    given = EnvConfig.from_record(results.config)
+    return replace(given, assets=recorded_assets(given.assets) if assets is None else assets)
 
 
 def _replay_all(

@@ -24,8 +24,8 @@ _FUNCTIONS = (  # that the templates in `html/templates/report/` call
 )
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
-    "difficulty": "easy",
     "prompts": "multimodal",
+    "task_options": "",
     "batch": 16,
     "boxes": "",
     "device": "cpu",
@@ -57,7 +57,7 @@ def write_report(
         clips: Recorded episodes.
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
-        with_published: Whether to show published numbers of the same tasks, unless prompts have another form.
+        with_published: Whether to show published numbers of the same tasks, unless prompts or tasks differ.
 
     Returns:
         The file.
@@ -115,7 +115,7 @@ def default_command(results: Results, policies: Sequence[str] = ()) -> str:
         f"--levels {','.join(config.get('levels', results.levels()))} --episodes {config.get('episodes', 0)}",
         f"--seed {config.get('seed', 0)}",
         *[
-            f"--{name} {shlex.quote(str(config[name]))}"
+            f"--{name.replace('_', '-')} {shlex.quote(str(config[name]))}"
             for name, usual in _OPTIONS.items()
             if config.get(name, usual) != usual
         ],

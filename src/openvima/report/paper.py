@@ -5,7 +5,13 @@ from dataclasses import dataclass
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
-from openvima.report.published import is_comparable, leading_models, published_coverage, published_rows
+from openvima.report.published import (
+    is_comparable,
+    leading_models,
+    published_coverage,
+    published_rows,
+    unpublished_settings,
+)
 from openvima.report.text import ablation_name, counted
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
@@ -95,7 +101,7 @@ def paper_tables(
     Args:
         results: The evaluation.
         comparisons: Policies to compare.
-        published: Whether to add published level means of the same tasks, unless prompts have another form.
+        published: Whether to add published level means of the same tasks, unless prompts or tasks differ.
     """
     means = results.means()
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
@@ -234,9 +240,8 @@ def _made_of(results: Results, policy: str | None = None) -> str:
     """Say how many episodes a number is made of."""
     rows = [row for row in results.rows if not row.ablation and policy in (None, row.policy)]
     episodes = sorted({row.episodes for row in rows})
-    prompts = "" if is_comparable(results) else f" Prompts: {results.config['prompts']}."
     number = f"{episodes[0]:,} to " * (len(episodes) > 1) + counted(episodes[-1], "episode")
-    return f"{number} a task.{prompts}"
+    return f"{number} a task.{unpublished_settings(results)}"
 
 
 def _markdown_table(table: Table) -> str:

@@ -99,8 +99,16 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
 
 
 def is_comparable(results: Results) -> bool:
-    """Whether prompts have the published form; success with others is another quantity."""
-    return results.config.get("prompts", MULTIMODAL) == MULTIMODAL
+    """Whether prompts and task options are as published; success with others is another quantity."""
+    return not unpublished_settings(results)
+
+
+def unpublished_settings(results: Results) -> str:
+    """Name the form of prompts and the task options in a sentence, unless they are as published."""
+    prompts, options = results.config.get("prompts", MULTIMODAL), results.config.get("task_options", "")
+    return (f" Prompts: {prompts}." if prompts != MULTIMODAL else "") + (
+        f" Task options: {options}." if options else ""
+    )
 
 
 def published_rows(

@@ -37,7 +37,7 @@ def save_task_gallery(
     Args:
         folder: Where `index.html`, one PNG a task and `contact_sheet.png` go.
         tasks: Names of tasks; by default all.
-        env_config: Assets, difficulty, and whether to follow the original benchmark where it is odd.
+        env_config: Settings of the environments.
         seed: First seed to try for each task; the gallery contains the first episode that the oracle solves.
         report: Called with tasks done, tasks in all, and the task's name.
 

@@ -3,7 +3,7 @@
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import TRAINED_KINDS
-from openvima.report.published import is_comparable
+from openvima.report.published import unpublished_settings
 
 LEVEL_NAMES = {
     "train": "As in training",
@@ -166,7 +166,7 @@ def measured(results: Results) -> str:
         f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
         f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, {each} each; "
         f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
-        "never uses." + ("" if is_comparable(results) else f" Prompts: {results.config['prompts']}.")
+        "never uses." + unpublished_settings(results)
     )
 
 

@@ -7,6 +7,7 @@ from openvima.catalog import Assets
 from openvima.errors import ConfigError, SamplingError, unknown_name
 from openvima.scene import Episode, ObjectImage
 from openvima.tasks.ids import shuffled_ids
+from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewritten
 from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, list_tasks, task_spec
 from openvima.tasks.seeding import checked_seed, make_rng
@@ -117,6 +118,30 @@ def check_text_form(task: str, prompts: str) -> None:
         raise ConfigError(
             f"task {task!r} has no text form: its prompt images are scenes. Tasks with one: {tasks}."
         )
+
+
+@functools.cache
+def check_task_options(tasks: tuple[str, ...], text: str) -> None:
+    """Check task options for a run.
+
+    Args:
+        tasks: Tasks of the run.
+        text: As in `EnvConfig`.
+
+    Raises:
+        UnknownTaskError: An option is of an unknown task.
+        ConfigError: An option fits no task of the run, or a task refuses its value.
+    """
+    options = TaskOptions.parse(text)
+    options.check(tasks)
+    for task in tasks:
+        try:
+            if own := options.of(task_spec(task)):
+                sample_episode(task, seed=0, **own)  # the task checks its options
+        except SamplingError:  # another seed may succeed
+            continue
+        except ConfigError as error:
+            raise ConfigError(f"task option of {task!r}: {error}") from None
 
 
 def _check_options(spec: TaskSpec, options: dict[str, object]) -> None:

@@ -267,7 +267,6 @@ def _finish(config: ImportConfig, data: PublishedData, blocks: Sequence[Block], 
         "compression": info.compression,
         "assets": info.assets,
         "compat": info.compat,
-        "difficulty": info.difficulty,
         "source": {
             "digest": info.versions["vima"],
             "episodes": sum(len(block.places) for block in blocks),

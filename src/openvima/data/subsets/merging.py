@@ -159,14 +159,14 @@ def _without_duplicates(parts: Sequence[_Part], *, skip: bool) -> list[_Part]:
 def _first_of_each(parts: Sequence[_Part]) -> tuple[np.ndarray, pa.Table]:
     """Whether each episode is the first of its name and setup, shape (N,), bool; and their names.
 
-    Where only the prompts of two setups differ, episodes of equal content count as of one.
+    Where only the prompts or task options of two setups differ, episodes of equal content count as of one.
     """
     setups: dict[EnvConfig, int] = {}
     tables, numbers, hashes = [], [], []
     for part in parts:
         env_config = part.info.env_config
         setup = setups.setdefault(env_config, len(setups))
-        same_content = replace(env_config, prompts=MULTIMODAL)
+        same_content = replace(env_config, prompts=MULTIMODAL, task_options="")
         rows = part.dataset.index.select((*_NAME, "content_hash")).take(part.episodes)
         tables.append(rows.drop_columns("content_hash"))
         numbers.append(np.full(len(rows), setup))

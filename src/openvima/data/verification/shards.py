@@ -152,10 +152,11 @@ def _record_faults(
 
 def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
     """Yield contradictions between a generated shard and the manifest."""
-    settings = {"prompts": MULTIMODAL, **task.config} if task.config else {}
+    settings = {"prompts": MULTIMODAL, "task_options": "", **task.config} if task.config else {}
     for name in ("level", "domain", *ENV_SETTINGS, "compression", "images"):
         if name in settings and getattr(info, name) != settings[name]:
-            yield f"{name} is {getattr(info, name)}, in the manifest {settings[name]}"
+            there, stated = str(getattr(info, name)) or "none", str(settings[name]) or "none"
+            yield f"{name} is {there}, in the manifest {stated}"
     if task.versions and info.versions != task.versions:
         yield f"it was written by {info.versions}, says the manifest {task.versions}"
     if task.config and task.path.name != info.file_name:
