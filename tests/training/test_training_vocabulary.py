@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 from openvima.data import Dataset  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import CheckpointError, UnknownWordWarning  # noqa: E402
+from openvima.evaluation.sources import policy_sources  # noqa: E402
 from openvima.policies import load_policy, preset  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.file_names import TOKENIZER_FOLDER  # noqa: E402
@@ -52,13 +53,17 @@ def test_every_preset_with_a_vocabulary_takes_new_words(name: str, begun) -> Non
 
 
 def test_the_vocabulary_is_that_of_the_prompts_and_is_compared_when_a_run_resumes(settings) -> None:
-    config = TrainingConfig.of({**settings, "pretraining.steps": 0, "schedule.steps": 2})
+    excluded = {"loader.exclude_tasks": "sweep_without_exceeding"}
+    config = TrainingConfig.of({**settings, **excluded, "pretraining.steps": 0, "schedule.steps": 2})
     run = train(config)
+    (source,) = policy_sources([str(run)])
+    assert source.record()["excluded_tasks"] == ["sweep_without_exceeding"]
     stored = next((run / "checkpoints").glob("2-*")) / TOKENIZER_FOLDER
     vocabulary = Vocabulary.read(stored)
     assert (
         UNKNOWN in vocabulary.words and {"rotate", "into", "."} <= set(vocabulary.words) - {UNKNOWN} <= WORDS
     )
+    assert not {"sweep", "exceeding"} & set(vocabulary.words)
     assert load_policy(str(run)).processor.tokenizer.vocabulary == vocabulary  # type: ignore[attr-defined]
     assert vocabulary.digest() in (run / "config.yaml").read_text(encoding="utf-8")
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from openvima.data.reader import Dataset
@@ -27,7 +26,7 @@ def training_texts(dataset: Dataset, augmentation: AugmentationConfig) -> Iterat
     for name in dataset.shard_names():  # 0.1 ms per demonstration
         table = dataset.shard(name).table(["task", "prompt"])
         if dataset.tasks is not None:  # a shard may hold others
-            table = table.filter(pc.is_in(table.column("task"), pa.array(dataset.tasks)))
+            table = table.filter(pc.field("task").isin(dataset.tasks))
         prompts.update(table.column("prompt").unique().to_pylist())
     if augmentation.inverse_dynamics_prob:
         prompts.add(motion_text(1))
