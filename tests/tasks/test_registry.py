@@ -7,8 +7,9 @@ import sys
 import pytest
 
 from openvima.catalog import Level, levels_of, pool
-from openvima.errors import LevelError, UnknownTaskError
+from openvima.errors import ConfigError, LevelError, UnknownTaskError
 from openvima.tasks import list_tasks, register_task, sample_episode, task_spec
+from openvima.tasks.registry import MAX_EPISODE_STEPS
 
 TASKS = list_tasks()
 
@@ -36,12 +37,13 @@ def test_l1_draws_from_the_pool_of_training(task: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_a_task_describes_itself(task: str) -> None:
     spec = task_spec(task)
-    assert spec.summary.endswith(".") and spec.template.endswith(".") and spec.family
+    assert spec.summary.endswith(".") and spec.template.endswith(".") and spec.families
+    assert spec.max_steps <= MAX_EPISODE_STEPS
     assert spec.max_steps == spec.oracle_max_steps + 2
 
 
 def test_the_families_are_those_of_the_paper() -> None:
-    assert {task_spec(task).family for task in TASKS} == {
+    assert {family for task in TASKS for family in task_spec(task).families} == {
         "simple_object_manipulation",
         "visual_goal_reaching",
         "novel_concept_grounding",
@@ -108,3 +110,15 @@ def test_the_list_of_tasks_needs_no_compiled_code() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize("steps", [0, 19, True, 2.0])
+def test_episodes_have_at_most_twenty_steps(steps: object) -> None:
+    with pytest.raises(ConfigError, match=r"of task 'long' is .*; give an integer from 1 to 18"):
+        register_task("long", family="x", template="x.", oracle_max_steps=steps)  # type: ignore[arg-type]
+    assert "long" not in list_tasks()
+
+
+def test_a_task_may_belong_to_two_families() -> None:
+    assert task_spec("rearrange_then_restore").families == ("visual_goal_reaching", "visual_reasoning")
+    assert task_spec("rotate").families == ("simple_object_manipulation",)

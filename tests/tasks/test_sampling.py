@@ -20,6 +20,7 @@ from openvima.scene import (
     Outcome,
     Placement,
     Pose,
+    Problem,
     in_workspace,
 )
 from openvima.tasks import (
@@ -297,6 +298,19 @@ def test_a_hundred_unlucky_draws_are_an_error() -> None:
             sample_episode("unlucky", seed=5)
     finally:
         del registry._TASKS["unlucky"]
+
+
+def test_an_episode_of_more_than_twenty_steps_is_refused() -> None:
+    def sample(table: TableSampler) -> Problem:
+        return replace(task_spec("rotate").sample(table), oracle_max_steps=19)
+
+    pools = task_spec("rotate").pools
+    register_task("endless", family="x", template="x.", oracle_max_steps=1, pools=pools)(sample)
+    try:
+        with pytest.raises(ConfigError, match=r"oracle_max_steps of task 'endless' is 19; .* from 1 to 18"):
+            sample_episode("endless", seed=0)
+    finally:
+        del registry._TASKS["endless"]
 
 
 def test_wrong_arguments_are_refused_by_name() -> None:

@@ -58,7 +58,7 @@ def main(
     for spec in specs:
         cells = {
             "task": spec.name,
-            "family": spec.family.replace("_", " "),
+            "family": ", ".join(spec.families).replace("_", " "),
             "prompt": Text(spec.template),  # rich would read its braces and brackets as markup
             "tool": spec.end_effector,
             "levels": " ".join(spec.levels),
@@ -75,7 +75,7 @@ def main(
 def _record(spec: "TaskSpec") -> dict[str, object]:
     return {
         "name": spec.name,
-        "family": spec.family,
+        "families": list(spec.families),
         "summary": spec.summary,
         "prompt": spec.template,
         "end_effector": spec.end_effector,

@@ -15,7 +15,12 @@ from openvima.tasks.table import TableSampler
 TEMPLATE = "Rearrange objects to this setup {scene} and then restore."
 
 
-@register_task("rearrange_then_restore", family="visual_goal_reaching", template=TEMPLATE, oracle_max_steps=8)
+@register_task(
+    "rearrange_then_restore",
+    family=("visual_goal_reaching", "visual_reasoning"),  # VIMA-Bench keeps it among tasks that need memory
+    template=TEMPLATE,
+    oracle_max_steps=8,
+)
 def sample(
     table: TableSampler,
     *,

@@ -14,13 +14,14 @@ from typing import Any
 from openvima.brief import brief_repr
 from openvima.catalog import LEVELS, Level, Pool, levels_of, pool
 from openvima.catalog.registration import with_registered
-from openvima.errors import LevelError, UnknownTaskError, unknown_name
+from openvima.errors import ConfigError, LevelError, UnknownTaskError, unknown_name
 from openvima.scene import EndEffector, Problem
 from openvima.user_code import load_file
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
 EXTRA_STEPS = 2  # of a policy beyond the oracle's
+MAX_EPISODE_STEPS = 20  # of a policy; the longest of the 17 tasks has 10
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
 
 
@@ -30,7 +31,7 @@ class TaskSpec:
 
     Args:
         name: Name as in "rotate".
-        family: Group of the paper under which results are reported, as in "visual_reasoning".
+        families: Groups of the paper under which results are reported, as in "visual_reasoning".
         template: The prompt with its slots.
         end_effector: "suction" or "spatula".
         pools: Objects and textures at each level where the task is defined.
@@ -42,7 +43,7 @@ class TaskSpec:
     """
 
     name: str
-    family: str
+    families: tuple[str, ...]
     template: str
     end_effector: EndEffector
     pools: Mapping[Level, Pool]
@@ -98,7 +99,7 @@ _TASKS: dict[str, TaskSpec] = {}
 def register_task(
     name: str,
     *,
-    family: str,
+    family: str | tuple[str, ...],
     template: str,
     oracle_max_steps: int,
     end_effector: EndEffector = "suction",
@@ -109,7 +110,7 @@ def register_task(
 
     Args:
         name: Name of the task.
-        family: Group of the paper under which results are reported, as in "visual_reasoning".
+        family: Group of the paper under which results are reported, as in "visual_reasoning"; or several.
         template: The prompt with its slots.
         oracle_max_steps: Step limit of the oracle.
         end_effector: Tool of the arm.
@@ -120,15 +121,16 @@ def register_task(
         The decorator, which returns the function unchanged.
 
     Raises:
-        ValueError: The name is already registered.
+        ConfigError: The name is already registered, or episodes would have more than 20 steps.
     """
+    check_steps(name, oracle_max_steps)
 
     def register(sample: SampleFunction) -> SampleFunction:
         if name in _TASKS:
-            raise ValueError(f"task {name!r} is registered twice; task names are unique.")
+            raise ConfigError(f"task {name!r} is registered twice; task names are unique.")
         _TASKS[name] = TaskSpec(
             name=name,
-            family=family,
+            families=(family,) if isinstance(family, str) else tuple(family),
             template=template,
             end_effector=end_effector,
             pools=pools or {level: pool(name, level) for level in levels_of(name)},
@@ -140,6 +142,22 @@ def register_task(
         return sample
 
     return register
+
+
+def check_steps(task: str, oracle_max_steps: int) -> None:
+    """Check the step limit of a task or of one of its episodes.
+
+    Raises:
+        ConfigError: It is not an integer from 1 to 18, two steps below the longest episode.
+    """
+    most = MAX_EPISODE_STEPS - EXTRA_STEPS
+    if isinstance(oracle_max_steps, bool) or not (
+        isinstance(oracle_max_steps, int) and 1 <= oracle_max_steps <= most
+    ):
+        raise ConfigError(
+            f"oracle_max_steps of task {task!r} is {oracle_max_steps!r}; give an integer from 1 to {most}: "
+            f"a policy has {EXTRA_STEPS} steps more, and an episode at most {MAX_EPISODE_STEPS}."
+        )
 
 
 def _summary(sample: SampleFunction) -> str:

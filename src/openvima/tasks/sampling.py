@@ -9,7 +9,7 @@ from openvima.scene import Episode, ObjectImage
 from openvima.tasks.ids import shuffled_ids
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts, rewritten
-from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, list_tasks, task_spec
+from openvima.tasks.registry import EXTRA_STEPS, TaskSpec, check_steps, list_tasks, task_spec
 from openvima.tasks.seeding import checked_seed, make_rng
 from openvima.tasks.table import TableSampler
 
@@ -48,8 +48,8 @@ def sample_episode(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or the task is not defined there.
-        ConfigError: The seed, the domain, the form of prompts or an option is not allowed, or the task has no
-            text form.
+        ConfigError: The seed, the domain, the form of prompts or an option is not allowed, the task has no
+            text form, or the episode would have more than 20 steps.
         SamplingError: No draw in a hundred could place all objects.
 
     Example:
@@ -78,6 +78,7 @@ def sample_episode(
             rng = make_rng(domain, task, level, number, "prompt", attempt=attempt)
             problem = replace(problem, prompt=rewritten(problem.prompt, problem.scene, prompts, rng))
         oracle_max_steps = problem.oracle_max_steps or spec.oracle_max_steps
+        check_steps(task, oracle_max_steps)
         max_steps = oracle_max_steps + EXTRA_STEPS
         return Episode(task, level, domain, number, problem, oracle_max_steps, max_steps, num_redraws=attempt)
     raise SamplingError(
