@@ -16,7 +16,17 @@ from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
-from openvima.evaluation.ablations import ABLATIONS, DETECTED_BOXES, EXAMPLE_PROMPTS, IN_CONTEXT
+from openvima.evaluation.ablations import (
+    ABLATIONS,
+    DETECTED_BOXES,
+    IN_CONTEXT,
+    MORE_ABLATIONS,
+    NOISY_BOXES,
+    ablated_environment,
+    ablation_parts,
+    applies_to,
+    canonical_ablation,
+)
 from openvima.evaluation.in_context import HELD_OUT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
@@ -59,9 +69,10 @@ class EvaluationConfig:
         precision: Of networks: "float64", "float32" or "bfloat16"; None: float64 on a CPU, float32
             elsewhere. Episodes that rounding may have decided are listed in the results, row by row.
         ablations: Input ablations to evaluate besides, for each policy that reads prompts: names of
-            `openvima.evaluation.ablations.ABLATIONS`; "random" and "oracle", which are added as policies; or
-            ("all",), which leaves out "in_context" and "oracle_demonstration": these prompt with an example.
-            With "in_context" all tasks are those that have an edited prompt.
+            `openvima.evaluation.ablations.INPUT_ABLATIONS` such as "no_prompt" or "masked_words:0.2", or
+            several joined by "+"; "random" and "oracle", which are added as policies; or "all", for
+            `openvima.evaluation.ablations.ABLATIONS` and both policies. They are kept in one spelling. With
+            "in_context" all tasks are those that have an edited prompt.
         boxes: For the ablation "detected_boxes": "detector" for the bundled one,
             "detector=folder" for another trained one, or "module:function" or "file.py:function", which makes
             the `ObjectExtractor` to plug in. "all" takes this ablation in only where boxes are given.
@@ -113,10 +124,16 @@ class EvaluationConfig:
         ]
         if problems := [*problems, *self._unknown_names(), *self._contradictions()]:
             raise ConfigError(" ".join(problems))
+        spelled = (n if n in MORE_ABLATIONS else canonical_ablation(n) for n in self.ablations)
+        object.__setattr__(self, "ablations", tuple(dict.fromkeys(spelled)))
 
     def _unknown_names(self) -> Iterator[str]:
-        allowed = ("all", *ABLATIONS, *EXAMPLE_PROMPTS, *REFERENCE_POLICIES)
-        yield from (unknown_name("ablation", name, allowed) for name in self.ablations if name not in allowed)
+        for name in self.ablations:
+            try:
+                if name not in MORE_ABLATIONS and not ablation_parts(name):
+                    yield "an ablation is empty; leave it out."
+            except ConfigError as error:
+                yield str(error)
         if self.precision is not None and self.precision not in PRECISIONS:
             yield f"precision is {self.precision!r}; allowed are {', '.join(PRECISIONS)}."
         if self.engine not in ("processes", "ray"):
@@ -125,11 +142,12 @@ class EvaluationConfig:
     def _contradictions(self) -> Iterator[str]:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
-        if DETECTED_BOXES in self.ablations and self.boxes is None:
+        takes_boxes = self.uses(DETECTED_BOXES)
+        if takes_boxes and self.boxes is None:
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
-        if IN_CONTEXT in self.ablations:
+        if self.uses(IN_CONTEXT):
             yield from filter(None, (no_edited_prompt(task) for task in self.tasks if task != "all"))
-        if self.boxes is not None and not {"all", DETECTED_BOXES} & set(self.ablations):
+        if self.boxes is not None and not (takes_boxes or "all" in self.ablations):
             yield f"boxes is {self.boxes!r}, which only the ablation {DETECTED_BOXES} plugs in; ask for it."
 
     @property
@@ -152,10 +170,21 @@ class EvaluationConfig:
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
-        asked = {*self.ablations, *(ABLATIONS if "all" in self.ablations else ())}
-        usable = self.boxes is not None and source.kind not in ("code", "remote") and not source.learner
-        names = (name for name in (*ABLATIONS, *EXAMPLE_PROMPTS) if name in asked)
-        return tuple(name for name in names if name != DETECTED_BOXES or usable)
+        names = [*(ABLATIONS if "all" in self.ablations else ()), *self.asked_ablations]
+        extracts = source.kind in ("code", "remote") or source.learner is not None
+        unusable = {DETECTED_BOXES, NOISY_BOXES} if extracts else set()
+        if self.boxes is None:
+            unusable.add(DETECTED_BOXES)
+        return tuple(name for name in dict.fromkeys(names) if unusable.isdisjoint(_names_in(name)))
+
+    def uses(self, ablation: str) -> bool:
+        """Whether an ablation is named, alone or among others."""
+        return any(ablation in _names_in(name) for name in self.ablations)
+
+    @property
+    def asked_ablations(self) -> tuple[str, ...]:
+        """Input ablations that are named, without "all" and the policies."""
+        return tuple(name for name in self.ablations if name not in MORE_ABLATIONS)
 
     def record(self) -> dict[str, object]:
         """Settings that the results depend on, as plain JSON values."""
@@ -239,23 +268,28 @@ class Batch:
         return replace(self, source=source, env_config=replace(self.env_config, assets=assets), boxes=boxes)
 
 
-def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
+def _names_in(ablation: str) -> list[str]:
+    return [part.partition(":")[0].strip() for part in ablation.split("+")]
+
+
+def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]:
     """Pairs of task and level, by level and then by task.
 
-    A task is left out at levels that do not hold it, as `sweep_without_exceeding` at L3.
+    A task is left out at levels that do not hold it, as `sweep_without_exceeding` at L3, and under ablations
+    that do not apply to it.
 
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: No level holds any of the tasks, or one that was named has no text form, which the
-            prompts need. Or a task option does not fit.
+        ConfigError: No level holds any of the tasks, one that was named has no text form, which the
+            prompts need, a task option does not fit, or the ablation applies to none of the tasks.
     """
     for level in config.levels:
         if level not in LEVELS:
             raise LevelError(unknown_name("level", level, LEVELS))
     prompts = config.env_config.prompts
     if "all" in config.tasks:
-        known = HELD_OUT_TASKS if IN_CONTEXT in config.ablations else list_tasks()
+        known = HELD_OUT_TASKS if config.uses(IN_CONTEXT) else list_tasks()
         tasks = [task for task in known if takes_prompts(task, prompts)]
     else:
         tasks = list(dict.fromkeys(config.tasks))
@@ -275,7 +309,12 @@ def cells(config: EvaluationConfig) -> list[tuple[str, str]]:
     if not pairs:
         raise ConfigError(f"{asked} hold none of the tasks; `openvima tasks` shows the levels of each task.")
     check_task_options(tuple(dict.fromkeys(task for task, _ in pairs)), config.env_config.task_options)
-    return pairs
+    ablated = ablated_environment(ablation, config.env_config)
+    kept = [(task, level) for task, level in pairs if applies_to(ablation, task, ablated)]
+    if not kept:
+        tasks = list(dict.fromkeys(task for task, _ in pairs))
+        raise ConfigError(f"ablation {ablation} applies to none of the tasks {', '.join(tasks)}.")
+    return kept
 
 
 def plan(config: EvaluationConfig) -> list[Batch]:
@@ -287,8 +326,8 @@ def plan(config: EvaluationConfig) -> list[Batch]:
     played = [
         (source, ablation) for source in config.sources for ablation in ("", *config.ablations_of(source))
     ]
-    asked = [name for name in config.ablations if name in (*ABLATIONS, *EXAMPLE_PROMPTS)]
-    if useless := [name for name in asked if name not in {ablation for _, ablation in played}]:
+    used = {ablation for _, ablation in played}
+    if useless := [name for name in config.asked_ablations if name not in used]:
         raise ConfigError(
             f"ablation {', '.join(useless)} changes nothing for {', '.join(config.policies)}; add a policy "
             "that reads prompts, or leave the ablation out."
@@ -301,15 +340,15 @@ def plan(config: EvaluationConfig) -> list[Batch]:
             level=level,
             first_seed=config.seed + offset,
             episodes=min(config.batch, config.episodes - offset),
-            env_config=config.env_config,
+            env_config=ablated_environment(ablation, config.env_config),
             device=config.device,
             ablation=ablation,
             precision=config.precision or "",
-            boxes=(config.boxes or "") if ablation == DETECTED_BOXES else "",
+            boxes=(config.boxes or "") if DETECTED_BOXES in _names_in(ablation) else "",
             trust_code=config.trust_code,
         )
         for source, ablation in played
-        for task, level in cells(config)
+        for task, level in cells(config, ablation)
         for offset in range(0, config.episodes, config.batch)
     ]
 

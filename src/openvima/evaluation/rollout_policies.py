@@ -1,6 +1,7 @@
 """Rollout policies: the oracle, which reads the environment, and policies, which read observations."""
 
 import importlib.util
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -8,7 +9,7 @@ from typing import Any, Protocol
 
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
-from openvima.errors import OpenVimaError, OracleError, PolicyError
+from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning
 from openvima.evaluation.ablations import AblatedInput, ablate
 from openvima.evaluation.config import Batch
 from openvima.evaluation.sources import ORACLE, RANDOM
@@ -113,7 +114,9 @@ class PromptedRolloutPolicy:
         """
         self._envs = envs
         self._inputs = [ablate(env, self._ablation) for env in envs]
-        with self._named_errors(envs):
+        with self._named_errors(envs), warnings.catch_warnings():
+            if self._ablation:  # gibberish is unknown on purpose
+                warnings.simplefilter("ignore", UnknownWordWarning)
             self._policy.reset([seen.prompt for seen in self._inputs])
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:

@@ -3,14 +3,14 @@
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.packs import load_assets
-from openvima.detector.plugins import extractor_maker
+from openvima.detector.plugins import plugged_boxes
 from openvima.errors import ConfigError
 from openvima.evaluation.actions import ActionRecorder, Steps, write_actions
 from openvima.evaluation.config import Batch, EvaluationConfig, plan, rows_of
@@ -38,12 +38,18 @@ class PreparedEvaluation:
         batches: The batches of episodes.
         policies: What each policy is, by name.
         versions: Versions of the packages that decide the results.
+        boxes: Name and hash of the detector; empty for none.
     """
 
     config: EvaluationConfig
     batches: tuple[Batch, ...]
     policies: dict[str, dict[str, Any]]  # Any: plain values
     versions: dict[str, str]
+    boxes: str = ""
+
+    def record(self) -> dict[str, object]:
+        """Settings that the results depend on, as plain JSON values."""
+        return {**self.config.record(), **({"boxes_code": self.boxes} if self.boxes else {})}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,26 +110,25 @@ def prepare(config: EvaluationConfig) -> PreparedEvaluation:
     """
     for source in config.sources:
         source.check()
-    if config.boxes is not None:
-        extractor_maker(config.boxes)
+    boxes = "" if config.boxes is None else plugged_boxes(config.boxes).name
     batches = plan(config)
     policies = {source.name: source.record() for source in config.sources}
     found = versions(
         with_torch=any(what["kind"] in ("run", "untrained", "code") for what in policies.values())
     )
-    return PreparedEvaluation(config, tuple(batches), policies, found)
+    return PreparedEvaluation(config, tuple(batches), policies, found, boxes)
 
 
 def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None) -> Path:
     """Evaluate into a folder whose lock is held; see `evaluate`."""
-    config, policies, found = prepared.config, prepared.policies, prepared.versions
+    config = prepared.config
     path = config.out / FILE_NAME
-    results = _earlier(path, config, policies, found)
+    results = _earlier(path, prepared)
     if results is None:
         load_assets(config.env_config.assets)  # an unfit pack is named before anything is written
         _check_weights(config)
         started = time.perf_counter()
-        played = _play_all(config, prepared.batches, policies, found, report)
+        played = _play_all(prepared, report)
         rows = rows_of(prepared.batches, {batch: rollouts.outcomes for batch, rollouts in played.items()})
         episodes = (  # in the order of the rows
             episode
@@ -131,7 +136,7 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
             for episode in zip(batch.seeds, played[batch].actions, strict=True)
         )
         digest = write_actions(config.out, episodes)
-        results = Results(rows, config.record(), found, policies, digest)
+        results = Results(rows, prepared.record(), prepared.versions, prepared.policies, digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)
     shutil.rmtree(config.out / _PARTS, ignore_errors=True)
@@ -150,14 +155,13 @@ def _check_weights(config: EvaluationConfig) -> None:
             load_network(source.source)
 
 
-def _earlier(
-    path: Path, config: EvaluationConfig, policies: Mapping[str, Any], found: Mapping[str, str]
-) -> Results | None:
+def _earlier(path: Path, prepared: PreparedEvaluation) -> Results | None:
     """Results of the same evaluation that are there already, if any."""
-    if not path.exists() or config.force:
+    if not path.exists() or prepared.config.force:
         return None
     earlier = Results.read(path)
-    if (earlier.config, earlier.policies, earlier.versions) == (config.record(), policies, found):
+    same = (prepared.record(), prepared.policies, prepared.versions)
+    if (earlier.config, earlier.policies, earlier.versions) == same:
         return earlier
     raise ConfigError(
         f"{path} holds another evaluation (its settings, weights or versions differ). "
@@ -165,22 +169,16 @@ def _earlier(
     )
 
 
-def _play_all(
-    config: EvaluationConfig,
-    batches: Sequence[Batch],
-    policies: Mapping[str, Mapping[str, Any]],
-    found: Mapping[str, str],
-    report: Report | None,
-) -> dict[Batch, Rollouts]:
+def _play_all(prepared: PreparedEvaluation, report: Report | None) -> dict[Batch, Rollouts]:
     """Run the batches that are not finished yet."""
+    config, batches = prepared.config, prepared.batches
     (config.out / _PARTS).mkdir(parents=True, exist_ok=True)
     shutil.rmtree(config.out / FOLDER, ignore_errors=True)  # videos of other results
     assets = config.env_config.assets
     source = source_hash(assets, what="assets") if is_code(assets) else ""
-    prints = {
-        name: json.dumps([what, dict(found), source], sort_keys=True) for name, what in policies.items()
-    }
-    jobs = [Job(batch, prints[batch.policy]) for batch in batches]
+    code = [prepared.versions, source]
+    prints = {name: json.dumps([what, *code], sort_keys=True) for name, what in prepared.policies.items()}
+    jobs = [Job(batch, prints[batch.policy] + (prepared.boxes if batch.boxes else "")) for batch in batches]
     kept = {job.batch: _kept(job, config.out) for job in jobs}
     finished = {batch: played for batch, played in kept.items() if played is not None}
     total, done = sum(batch.episodes for batch in batches), sum(batch.episodes for batch in finished)

@@ -10,8 +10,8 @@ import numpy as np
 from openvima.atomic_io import atomic_write_file
 from openvima.catalog.user_assets import recorded_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import DatasetError, OpenVimaError, echo
-from openvima.evaluation.ablations import IN_CONTEXT
+from openvima.errors import ConfigError, DatasetError, OpenVimaError, echo
+from openvima.evaluation.ablations import ablated_environment
 from openvima.evaluation.actions import ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
 from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, Row
@@ -155,7 +155,6 @@ def _row_problems(results: Results) -> Iterator[str]:
         env_config=replace(EnvConfig.from_record(config), assets=DEFAULT_ENV_CONFIG.assets),
         ablations=(IN_CONTEXT,) if IN_CONTEXT in config.get("ablations", ()) else (),  # decides the tasks
     )
-    expected = {(task, level) for task, level in cells(whole)}
     seeds = list(range(whole.seed, whole.seed + whole.episodes))
     played: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for row in results.rows:
@@ -163,6 +162,11 @@ def _row_problems(results: Results) -> Iterator[str]:
         if [outcome.seed for outcome in row.outcomes] != seeds:
             yield f"{_named(row)} has other seeds than {seeds[0]} to {seeds[-1]}"
     for (policy, ablation), found in played.items():
+        try:
+            expected = set(cells(whole, ablation))
+        except ConfigError as error:
+            yield f"{echo(policy)} {echo(ablation)}: {error}"
+            continue
         if len(found) != len(expected) or set(found) != expected:
             yield f"{echo(policy)} {echo(ablation)} has other tasks and levels than the settings"
     named = {policy for policy, ablation in played if not ablation}
@@ -197,7 +201,7 @@ def _replay_all(
         _Replay(
             replace(row, outcomes=row.outcomes[first : first + _BATCH]),
             list(actions[index][first : first + _BATCH]),
-            env_config,
+            ablated_environment(row.ablation, env_config),
         )
         for index, row in enumerate(results.rows)
         for first in range(0, row.episodes, _BATCH)

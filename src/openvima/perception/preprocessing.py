@@ -25,9 +25,17 @@ from openvima.render.camera import VIEWS
 from openvima.scene import PromptImage, RenderedPrompt
 from openvima.scene.prompt import PLACEHOLDER
 
+FOUND = "found"  # key of an observation's objects where they were found beforehand
 InputKind = Literal["objects", "frames"]
 KINDS: tuple[InputKind, ...] = get_args(InputKind)
 IMAGE_SIZES: dict[InputKind, tuple[int, int]] = {"objects": (CROP_SIZE, CROP_SIZE), "frames": (64, 128)}
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FoundImage(PromptImage):
+    """A prompt image whose objects were found beforehand."""
+
+    found: ObjectViews
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +193,8 @@ def extract_observation(
     """Extract the objects of an observation, or take both frames whole as one object.
 
     Args:
-        observation: `rgb`, `segm` where the segmentation is used, and `ee`.
+        observation: `rgb`, `segm` where the segmentation is used, and `ee`; `FOUND` where the objects were
+            found beforehand.
         kind: "objects" or "frames".
         extractor: Finds the objects; None takes the segmentation, in left-to-right order.
         image_size: Height and width that halved frames must have; None means those of `IMAGE_SIZES`.
@@ -196,6 +205,8 @@ def extract_observation(
     """
     if kind == "frames":
         return _whole_frames(part_of(observation, "rgb"), image_size or IMAGE_SIZES[kind])
+    if FOUND in observation:
+        return observation[FOUND]
     if extractor is None:
         return GROUND_TRUTH.in_observation(observation)
     return _numbered(extractor.in_observation(observation))
@@ -229,6 +240,8 @@ def _extract_prompt_image(
 ) -> ObjectViews:
     if kind == "frames":
         return _whole_frames(image.rgb, image_size)
+    if isinstance(image, FoundImage):
+        return image.found
     if extractor is None:
         return GROUND_TRUTH.in_prompt_image(image)
     return _numbered(extractor.in_prompt_image(image))

@@ -27,7 +27,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
 from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
-from openvima.policies.tokenizer import END_ID, PADDING_ID, Tokenizer, Vocabulary, WordTokenizer
+from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer
 
 if TYPE_CHECKING:
     from transformers import PreTrainedTokenizerFast
@@ -47,7 +47,8 @@ class T5Tokenizer:
     """The T5 tokenizer, loaded through transformers.
 
     Every word is encoded separately with the word-start marker. A full stop after a placeholder becomes "▁"
-    and ".", and no marker is left before a placeholder, as in the published policies. Versions of
+    and ".", and no marker is left before a placeholder, as in the published policies. "<unknown>" becomes the
+    unknown token. Versions of
     transformers differ in how they split whole texts, but not single words.
 
     Args:
@@ -78,6 +79,10 @@ class T5Tokenizer:
         Raises:
             PromptError: A word is not in the vocabulary of T5.
         """
+        parts = text.split(UNKNOWN)
+        if len(parts) > 1:  # words that are masked on purpose
+            encoded = [self.encode(part) for part in parts]
+            return [*encoded[0], *(token for part in encoded[1:] for token in (_UNKNOWN_ID, *part))]
         words = text.split()
         unknown = [word for word in words if not self._special_ids.isdisjoint(self._encode_word(word))]
         if unknown:

@@ -26,7 +26,7 @@ from openvima.input_files import read_json
 
 PADDING_ID, END_ID = 0, 1
 LARGEST_NUMBER = 360
-UNKNOWN = "<unknown>"  # takes the place of words that a vocabulary lacks; no text has it as one piece
+UNKNOWN = "<unknown>"  # takes the place of words that a vocabulary lacks; in a text, a masked word
 VOCABULARY_FILE = "vocabulary.json"
 RESERVE = 128  # unused ids of a new vocabulary, at least
 MAX_WORDS = 20_000
@@ -36,11 +36,11 @@ _FIRST_WORD_ID = _FIRST_NUMBER_ID + LARGEST_NUMBER + 1
 _MAX_FILE_BYTES = 2**22
 _MAX_SHOWN = 100  # characters of unknown words in a warning
 _MAX_WARNED = 256  # words that a policy warns of; a server's clients may send any number
-_PIECE = re.compile(r"[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+|\S")
+_PIECE = re.compile(rf"{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+|\S")
 
 
 def split_words(text: str) -> list[str]:
-    """Split text into words, whole numbers and punctuation marks, in lower case.
+    """Split text into words, whole numbers and punctuation marks, in lower case; `UNKNOWN` is a word.
 
     Example:
         >>> split_words("Put it, counter-clockwise, 30 degrees.")
@@ -220,7 +220,8 @@ class WordTokenizer:
 
     def _warn(self, unknown: list[str]) -> None:
         """Name unknown words once each; a bounded number of them, of bounded length."""
-        new = [w for w in dict.fromkeys(word[:MAX_WORD_LENGTH] for word in unknown) if w not in self._warned]
+        words = dict.fromkeys(word[:MAX_WORD_LENGTH] for word in unknown if word != UNKNOWN)
+        new = [word for word in words if word not in self._warned]
         new = new[: _MAX_WARNED - len(self._warned)]
         if not new:
             return
@@ -244,7 +245,12 @@ def _is_number(piece: str) -> bool:
 
 
 def _is_word(word: str) -> bool:
-    if len(word) > MAX_WORD_LENGTH or not word.isprintable() or split_words(word) != [word]:
+    if (
+        len(word) > MAX_WORD_LENGTH
+        or not word.isprintable()
+        or split_words(word) != [word]
+        or word == UNKNOWN
+    ):
         return False
     return not _is_number(word)
 

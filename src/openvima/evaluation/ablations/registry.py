@@ -1,0 +1,313 @@
+"""The input ablations: what each changes, its rate, and how names are read."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+
+from openvima.env.config import EnvConfig
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import ConfigError, echo, unknown_name
+from openvima.evaluation.ablations.environments import has_form, with_paraphrased_prompts, with_text_prompts
+from openvima.evaluation.ablations.images import NEUTRAL_PROMPT, with_images_of_another
+from openvima.evaluation.ablations.inputs import AblatedInput
+from openvima.evaluation.ablations.objects import jittered, shuffled
+from openvima.evaluation.ablations.words import gibberish, masked, scrambled, swapped
+from openvima.evaluation.in_context import in_context_prompt
+from openvima.evaluation.oracle_demonstration import demonstrated
+from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.tasks.seeding import make_rng
+
+DETECTED_BOXES, NOISY_BOXES = "detected_boxes", "noisy_boxes"
+IN_CONTEXT, ORACLE_DEMONSTRATION = "in_context", "oracle_demonstration"
+_MAX_TEXT = 200  # characters of a name with its rates
+
+Change = Callable[[TabletopEnv, AblatedInput, float, np.random.Generator], AblatedInput]
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """The number in an ablation's name.
+
+    Args:
+        least: Smallest rate.
+        most: Largest rate.
+        example: A rate, for errors; an integer where rates are whole numbers.
+        is_open: Whether the smallest rate itself is excluded.
+    """
+
+    least: float
+    most: float
+    example: float
+    is_open: bool = False
+
+    def parse(self, text: str) -> float | None:
+        """Return the number, or None where the text is no rate."""
+        digits = text.replace(".", "", 0 if isinstance(self.example, int) else 1)
+        if not (digits.isascii() and digits.isdigit()):
+            return None
+        rate = int(text) if isinstance(self.example, int) else float(text)
+        return rate if self.least <= rate <= self.most and not (self.is_open and rate == self.least) else None
+
+    def __str__(self) -> str:
+        kind = "an integer" if isinstance(self.example, int) else "a number"
+        start = "above" if self.is_open else "from"
+        return f"{kind} {start} {self.least} to {self.most}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InputAblation:
+    """An input ablation. It changes the input, the environment, or (detected boxes) the policy's extractor.
+
+    Args:
+        name: Its name, without rate.
+        description: What the policy gets, in one sentence.
+        change: Changes the inputs of an episode.
+        environment: Changes the settings of the environment.
+        takes: Whether it applies to a task, given the changed settings; None for all tasks.
+        rate: The rate it takes; None for none.
+        exclusive: What only one ablation of several can set: "prompts" (their form) or "boxes".
+        changes_scenes: Whether a seed stands for another scene.
+    """
+
+    name: str
+    description: str
+    change: Change | None = None
+    environment: Callable[[EnvConfig, float], EnvConfig] | None = None
+    takes: Callable[[str, EnvConfig], bool] | None = None
+    rate: Rate | None = None
+    exclusive: str = ""
+    changes_scenes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RatedAblation:
+    """An ablation with its rate, which is 0 without one."""
+
+    ablation: InputAblation
+    rate: float = 0
+
+    def __str__(self) -> str:
+        rate = np.format_float_positional(self.rate, trim="-")
+        return f"{self.ablation.name}:{rate}" if self.ablation.rate else self.ablation.name
+
+
+def _in_words(rewrite: Callable[[str, float, np.random.Generator], str]) -> Change:
+    """Lift a change of text to a change of inputs."""
+
+    def change(env: TabletopEnv, seen: AblatedInput, rate: float, rng: np.random.Generator) -> AblatedInput:
+        return replace(seen, prompt=replace(seen.prompt, text=rewrite(seen.prompt.text, rate, rng)))
+
+    return change
+
+
+_SHARE = Rate(0, 1, 0.2, is_open=True)
+
+# Those that one name joins are applied in this order.
+INPUT_ABLATIONS = {
+    ablation.name: ablation
+    for ablation in (
+        InputAblation(
+            "text_prompts",
+            "Each object image of the prompt is replaced by a description.",
+            environment=with_text_prompts,
+            takes=has_form,
+            exclusive="prompts",
+        ),
+        InputAblation(
+            "paraphrased_prompts",
+            "Each object image of the prompt is replaced by a description with synonyms.",
+            environment=with_paraphrased_prompts,
+            takes=has_form,
+            exclusive="prompts",
+        ),
+        InputAblation(
+            "other_prompt_images",
+            "The prompt keeps its words; its images come from another episode of the task.",
+            lambda env, seen, rate, rng: AblatedInput(with_images_of_another(env, rng)),
+        ),
+        InputAblation(
+            "no_prompt",
+            "The prompt is a full stop in every episode; only the table is left.",
+            lambda env, seen, rate, rng: AblatedInput(NEUTRAL_PROMPT),
+            exclusive="prompts",
+        ),
+        InputAblation(
+            ORACLE_DEMONSTRATION,
+            "The prompt is the oracle's solution of the same episode.",
+            lambda env, seen, rate, rng: AblatedInput(demonstrated(env)),
+            exclusive="prompts",
+        ),
+        InputAblation(
+            IN_CONTEXT,
+            "The prompt is edited to contain an example from the task's own prompt, as in MIDAS.",
+            lambda env, seen, rate, rng: AblatedInput(in_context_prompt(seen.prompt, env.task)),
+            exclusive="prompts",
+        ),
+        InputAblation(
+            "scrambled_words",
+            "The prompt keeps its images; each word is replaced by a random word.",
+            _in_words(lambda text, rate, rng: scrambled(text, rng)),
+        ),
+        InputAblation(
+            "gibberish_words",
+            "The prompt keeps its images; each word is replaced by random letters.",
+            _in_words(lambda text, rate, rng: gibberish(text, rng)),
+        ),
+        InputAblation(
+            "swapped_words",
+            "The prompt keeps its images; neighbouring words are swapped, each pair with this probability.",
+            _in_words(swapped),
+            rate=_SHARE,
+        ),
+        InputAblation(
+            "masked_words",
+            "The prompt keeps its images; each word is the unknown token with this probability.",
+            _in_words(masked),
+            rate=_SHARE,
+        ),
+        InputAblation(
+            "shuffled_objects",
+            "Object ids are permuted; only with compat do they reveal the order of spawning.",
+            lambda env, seen, rate, rng: shuffled(env, seen, rng),
+        ),
+        InputAblation(
+            DETECTED_BOXES,
+            "Boxes come from a detector instead of the simulator.",
+            exclusive="boxes",
+        ),
+        InputAblation(
+            NOISY_BOXES,
+            "The borders of all boxes are moved by up to so many pixels.",
+            lambda env, seen, rate, rng: jittered(seen, int(rate), rng),
+            rate=Rate(1, 32, 3),
+            exclusive="boxes",
+        ),
+    )
+}
+ABLATIONS = ("no_prompt", "other_prompt_images", "scrambled_words", "shuffled_objects", DETECTED_BOXES)
+"""What "all" stands for; detected boxes only where a detector is given."""
+EXAMPLE_PROMPTS = (IN_CONTEXT, ORACLE_DEMONSTRATION)
+"""Replace the task's description by an example; not part of "all", as they add information."""
+MORE_ABLATIONS = ("all", RANDOM, ORACLE)
+"""Names that evaluations take beside those of ablations."""
+
+
+def ablate(env: TabletopEnv, ablation: str) -> AblatedInput:
+    """Return the inputs of a policy in the current episode of an environment.
+
+    Args:
+        env: The environment, which stays unchanged; its settings are those of `ablated_environment`.
+        ablation: As for `ablation_parts`. Detected boxes are handled by the policy, see
+            `openvima.detector.plugins`.
+
+    Raises:
+        ConfigError: As for `ablation_parts`, or the task has no in-context evaluation.
+        SamplingError: No other episode has images for the same placeholders.
+    """
+    seen, episode = AblatedInput(env.prompt), env.episode
+    for part in ablation_parts(ablation):
+        if part.ablation.change is not None:
+            purpose = f"control {part.ablation.name}"
+            rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose)
+            seen = part.ablation.change(env, seen, part.rate, rng)
+    return seen
+
+
+def ablated_environment(ablation: str, env_config: EnvConfig) -> EnvConfig:
+    """Return the settings of the environment under an ablation; most leave them as they are.
+
+    Raises:
+        ConfigError: As for `ablation_parts`, or the settings are those already.
+    """
+    for part in ablation_parts(ablation):
+        if part.ablation.environment is not None:
+            before, env_config = env_config, part.ablation.environment(env_config, part.rate)
+            if env_config == before:
+                raise ConfigError(
+                    f"ablation {part} changes nothing: the environment has these settings already."
+                )
+    return env_config
+
+
+def applies_to(ablation: str, task: str, env_config: EnvConfig) -> bool:
+    """Whether an ablation applies to a task.
+
+    Args:
+        ablation: As for `ablation_parts`.
+        task: Name of the task.
+        env_config: Settings under the ablation, from `ablated_environment`.
+    """
+    return all(
+        part.ablation.takes is None or part.ablation.takes(task, env_config)
+        for part in ablation_parts(ablation)
+    )
+
+
+def scenes_of(ablation: str) -> str:
+    """Return the parts that make a seed stand for another scene; empty where scenes are the plain ones."""
+    return "+".join(str(part) for part in ablation_parts(ablation) if part.ablation.changes_scenes)
+
+
+def canonical_ablation(text: str) -> str:
+    """Return the one spelling of an ablation: `masked_words:.20` is "masked_words:0.2".
+
+    Raises:
+        ConfigError: As for `ablation_parts`.
+    """
+    return "+".join(map(str, ablation_parts(text)))
+
+
+@lru_cache
+def ablation_parts(text: str) -> tuple[RatedAblation, ...]:
+    """Read NAME, NAME:RATE, or several of them joined by "+".
+
+    Returns:
+        The ablations in the order of `INPUT_ABLATIONS`, in which they are applied; none for an empty text.
+
+    Raises:
+        ConfigError: There is no such ablation, a rate is missing, not allowed or out of range, or two
+            ablations exclude each other.
+    """
+    if len(text) > _MAX_TEXT:
+        raise ConfigError(f"an ablation has {len(text)} characters; at most {_MAX_TEXT} are allowed.")
+    parts = [_rated(word.strip()) for word in text.split("+")] if text else []
+    order = list(INPUT_ABLATIONS)
+    parts.sort(key=lambda part: order.index(part.ablation.name))
+    for one, other in combinations(parts, 2):
+        same = one.ablation.exclusive and one.ablation.exclusive == other.ablation.exclusive
+        if same or one.ablation is other.ablation:
+            raise ConfigError(
+                f"ablation {echo(repr(text))}: {one} and {other} exclude each other; give one of them."
+            )
+    return tuple(parts)
+
+
+def _rated(text: str) -> RatedAblation:
+    name, colon, rate = text.partition(":")
+    ablation = INPUT_ABLATIONS.get(name)
+    if name in MORE_ABLATIONS:
+        raise ConfigError(
+            f"ablation {name} stands alone, got {echo(repr(text))} among others or with a rate."
+        )
+    if ablation is None:
+        allowed = ", ".join([*map(_form, INPUT_ABLATIONS.values()), *MORE_ABLATIONS])
+        raise ConfigError(
+            unknown_name("ablation", name, [*INPUT_ABLATIONS, *MORE_ABLATIONS], f"Allowed: {allowed}.")
+        )
+    if ablation.rate is None:
+        if colon:
+            raise ConfigError(f"ablation {name} takes no rate, got {echo(repr(text))}.")
+        return RatedAblation(ablation)
+    if not colon:
+        raise ConfigError(f"ablation {name} needs a rate, such as {name}:{ablation.rate.example}.")
+    number = ablation.rate.parse(rate)
+    if number is None:
+        raise ConfigError(f"ablation {echo(repr(text))}: the rate must be {ablation.rate}.")
+    return RatedAblation(ablation, number)
+
+
+def _form(ablation: InputAblation) -> str:
+    return f"{ablation.name}:{ablation.rate.example}" if ablation.rate else ablation.name
