@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 
 from openvima.env import TabletopEnv
-from openvima.evaluation.ablations import (
-    ABLATIONS,
-    NEUTRAL_PROMPT,
-    NO_PROMPT,
-    OTHER_PROMPT_IMAGES,
-    SCRAMBLED_WORDS,
-    SHUFFLED_OBJECTS,
-    ablate,
-)
+from openvima.evaluation.ablations import ABLATIONS, ablate
+from openvima.evaluation.ablations.images import NEUTRAL_PROMPT
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.perception.objects import observe, observe_prompt_image
@@ -50,7 +43,7 @@ def test_descriptions_are_of_another_episode_where_images_would_be(prompts):
     num_other = 0
     for seed in range(5):
         env.reset(seed=seed)
-        borrowed = ablate(env, OTHER_PROMPT_IMAGES).prompt
+        borrowed = ablate(env, "other_prompt_images").prompt
         assert list(borrowed.images) == list(env.prompt.images)
         assert borrowed.text.startswith("Put the ") and borrowed.text.count("{") == len(borrowed.images)
         num_other += not same(borrowed, env.prompt)
@@ -70,14 +63,14 @@ def test_ablations_of_one_episode_are_equal_whenever_they_are_drawn(task):
 
 
 def test_without_a_prompt_all_tasks_are_told_the_same():
-    told = [ablate(begun(task)[0], NO_PROMPT).prompt for task in ("rotate", "rearrange")]
+    told = [ablate(begun(task)[0], "no_prompt").prompt for task in ("rotate", "rearrange")]
     assert told == [NEUTRAL_PROMPT, NEUTRAL_PROMPT]
     assert NEUTRAL_PROMPT.sequence() == ["."]
 
 
 def test_images_of_another_episode_stand_in_the_words_of_this_one():
     env, _ = begun("visual_manipulation")
-    changed = ablate(env, OTHER_PROMPT_IMAGES).prompt
+    changed = ablate(env, "other_prompt_images").prompt
     assert changed.text == env.prompt.text
     assert list(changed.images) == list(env.prompt.images)
     assert not any(
@@ -88,13 +81,13 @@ def test_images_of_another_episode_stand_in_the_words_of_this_one():
 
 def test_scrambled_words_leave_images_and_their_order():
     env, _ = begun("twist")
-    changed = ablate(env, SCRAMBLED_WORDS).prompt
+    changed = ablate(env, "scrambled_words").prompt
     assert changed.images == env.prompt.images
     shown = [[part.name for part in p.sequence() if not isinstance(part, str)] for p in (changed, env.prompt)]
     assert shown[0] == shown[1]
     assert changed.text.split() != env.prompt.text.split()
     assert not any(character in changed.text for character in ".:,")
-    other = ablate(begun("twist", seed=4)[0], SCRAMBLED_WORDS).prompt
+    other = ablate(begun("twist", seed=4)[0], "scrambled_words").prompt
     assert changed.text != other.text
 
 
@@ -103,7 +96,7 @@ def test_scrambled_words_leave_images_and_their_order():
 )
 def test_shuffled_objects_change_ids_and_nothing_that_can_be_seen(task):
     env, observation = begun(task)
-    changed = ablate(env, SHUFFLED_OBJECTS)
+    changed = ablate(env, "shuffled_objects")
     seen = changed.observation(observation)
     plain, shuffled = observe(observation), observe(seen)
     assert sorted(plain.ids) == sorted(shuffled.ids)
@@ -119,7 +112,7 @@ def test_ids_are_dealt_out_differently_in_other_episodes():
     deals = set()
     for seed in range(8):
         env, observation = begun("rearrange", seed=seed, level="L1")
-        ids = observe(ablate(env, SHUFFLED_OBJECTS).observation(observation)).ids
+        ids = observe(ablate(env, "shuffled_objects").observation(observation)).ids
         deals.add(tuple(ids != observe(observation).ids))
     assert len(deals) > 1
     assert any(any(deal) for deal in deals)
@@ -127,7 +120,7 @@ def test_ids_are_dealt_out_differently_in_other_episodes():
 
 def test_shuffled_objects_keep_their_new_ids_through_an_episode_and_its_images():
     env, observation = begun("follow_order")
-    changed = ablate(env, SHUFFLED_OBJECTS)
+    changed = ablate(env, "shuffled_objects")
     again = changed.observation({**observation, "ee": 0})
     assert np.array_equal(again["segm"]["top"], changed.observation(observation)["segm"]["top"])
     pairs = {
@@ -163,9 +156,9 @@ class Noting(RandomPolicy):
 def test_players_show_policies_what_the_ablation_leaves():
     envs = [begun("visual_manipulation")[0] for _ in range(2)]
     noting = Noting()
-    play(envs, [5, 6], PromptedRolloutPolicy(noting, NO_PROMPT))
+    play(envs, [5, 6], PromptedRolloutPolicy(noting, "no_prompt"))
     assert noting.prompts == [NEUTRAL_PROMPT] * 2
-    play(envs, [5, 6], PromptedRolloutPolicy(noting, SHUFFLED_OBJECTS))
+    play(envs, [5, 6], PromptedRolloutPolicy(noting, "shuffled_objects"))
     for env, seed, shown in zip(envs, (5, 6), noting.segms, strict=False):
         observation, _ = env.reset(seed=seed)
-        assert np.array_equal(shown, ablate(env, SHUFFLED_OBJECTS).observation(observation)["segm"]["top"])
+        assert np.array_equal(shown, ablate(env, "shuffled_objects").observation(observation)["segm"]["top"])

@@ -7,6 +7,7 @@ from typing import Literal
 
 from openvima.brief import brief_repr
 from openvima.errors import ConfigError, UnknownPolicyError, unknown_name
+from openvima.evaluation.ablations import scenes_of
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.sources import TRAINED_KINDS
 from openvima.evaluation.statistics import Interval, PairCounts, holm, mcnemar, mean_difference
@@ -180,7 +181,8 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
             cells.append(_difference(*cell, (pair,)))
     if not cells:
         raise ConfigError(
-            f"{a} and {b} have no episode in common; evaluate both on the same tasks, levels and seeds."
+            f"{a} and {b} have no episode in common; evaluate both on the same tasks, levels and seeds, with "
+            "the same number of distractors."
         )
     levels = [
         _difference(level, "", tuple(cell.pairs[0] for cell in of_level))
@@ -194,10 +196,12 @@ def _compare(results: Results, a: str, b: str) -> Comparison:
 def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
     """Rows of a policy, plain or under an ablation, by level and task, levels one after the other."""
     known = results.policy_names()
-    is_plain = name in known  # the name may hold a separator, as in mine@10:30
-    policy, _, ablation = (name, "", "") if is_plain else name.rpartition(ABLATION_SEPARATOR)
+    # Both names may hold a separator, as in mine@10:30 and masked_words:0.2.
+    begun = [each for each in known if f"{name}{ABLATION_SEPARATOR}".startswith(each + ABLATION_SEPARATOR)]
+    policy = max(begun, key=len, default=name.partition(ABLATION_SEPARATOR)[0])
+    ablation = name[len(policy) + 1 :]
     if policy not in known:
-        raise UnknownPolicyError(unknown_name("policy", policy or name, known))
+        raise UnknownPolicyError(unknown_name("policy", policy, known))
     of_policy = [row for row in results.rows if row.policy == policy]
     rows = [row for row in of_policy if row.ablation == ablation]
     if ablation and not rows:
@@ -209,6 +213,8 @@ def _rows(results: Results, name: str) -> dict[tuple[str, str], Row]:
 
 def _pair(a: Row, b: Row) -> PairCounts | None:
     """Count outcomes on the seeds that both rows hold; None if there are none."""
+    if scenes_of(a.ablation) != scenes_of(b.ablation):  # a seed is not the same episode
+        return None
     solved_b: Mapping[int, bool] = {outcome.seed: outcome.success for outcome in b.outcomes}
     outcomes = [(o.success, solved_b[o.seed]) for o in a.outcomes if o.seed in solved_b]
     if not outcomes:

@@ -247,8 +247,13 @@ def applies_to(ablation: str, task: str, env_config: EnvConfig) -> bool:
 
 
 def scenes_of(ablation: str) -> str:
-    """Return the parts that make a seed stand for another scene; empty where scenes are the plain ones."""
-    return "+".join(str(part) for part in ablation_parts(ablation) if part.ablation.changes_scenes)
+    """Return the parts that make a seed stand for another scene; empty where scenes are the plain ones.
+
+    Args:
+        ablation: As results name it; other names than those of ablations change no scenes.
+    """
+    known = [(part, INPUT_ABLATIONS.get(part.partition(":")[0])) for part in ablation.split("+")]
+    return "+".join(part for part, found in known if found is not None and found.changes_scenes)
 
 
 def canonical_ablation(text: str) -> str:
