@@ -75,8 +75,11 @@ def main(
             num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
             all that have the option.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
-            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all. Also in_context and
-            oracle_demonstration, which prompts with the oracle's solution of the same episode.
+            scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all of these. Also
+            masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
+            paraphrased_prompts, num_distractors:2 (the numbers are examples); in_context; and
+            oracle_demonstration, which prompts with the oracle's solution of the same episode. "+" joins
+            several to one.
         boxes: Detector of detected_boxes, which it implies: "detector" for the bundled one,
             detector=FOLDER for one that `openvima detector train` made, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which makes an ObjectExtractor.
@@ -179,13 +182,15 @@ def _ablation_table(results: "Results", means: "Mapping[tuple[str, str, str], Le
     """Level means of each policy, plain and under each ablation."""
     from rich.table import Table
 
+    from openvima.report.text import ablation_name
+
     table = Table("policy", "ablation", title="input ablations: means in % (95 % interval)")
     for level in results.levels():
         table.add_column(level, justify="right", no_wrap=True)
     for policy, ablation in dict.fromkeys((row.policy, row.ablation) for row in results.rows):
-        found = (means.get((policy, ablation, level)) for level in results.levels())
-        cells = (_cell(mean.mean, mean.interval) if mean else "–" for mean in found)
-        table.add_row(policy, ablation.replace("_", " ") or "–", *cells)
+        found = ((means.get((policy, ablation, level)), level) for level in results.levels())
+        cells = (_mean_cell(mean, len(results.tasks(level))) if mean else "–" for mean, level in found)
+        table.add_row(policy, ablation_name(ablation) or "–", *cells)
     return table
 
 
@@ -199,6 +204,12 @@ def _oracle_horizon_mean(results: "Results", policy: str, level: str) -> str:
     )
 
 
+def _mean_cell(mean: "LevelMean", num_tasks: int) -> str:
+    """A mean, with its number of tasks where an ablation applies to some of them only."""
+    count = f", {len(mean.tasks)} tasks" if len(mean.tasks) < num_tasks else ""
+    return _cell(mean.mean, mean.interval) + count
+
+
 def _cell(rate: float, interval: tuple[float, float]) -> str:
     return f"{100 * rate:.1f} ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
 
@@ -207,5 +218,5 @@ def _with_boxes(ablations: tuple[str, ...], boxes: str | None) -> tuple[str, ...
     """Add the ablation that uses the boxes, if any are given."""
     from openvima.evaluation.ablations import DETECTED_BOXES
 
-    asked = boxes is None or {"all", DETECTED_BOXES} & set(ablations)
+    asked = boxes is None or any(name == "all" or DETECTED_BOXES in name.split("+") for name in ablations)
     return ablations if asked else (*ablations, DETECTED_BOXES)

@@ -170,12 +170,16 @@ class EvaluationConfig:
         """
         if source.kind in (ORACLE, RANDOM):
             return ()
-        names = [*(ABLATIONS if "all" in self.ablations else ()), *self.asked_ablations]
         extracts = source.kind in ("code", "remote") or source.learner is not None
         unusable = {DETECTED_BOXES, NOISY_BOXES} if extracts else set()
         if self.boxes is None:
             unusable.add(DETECTED_BOXES)
-        return tuple(name for name in dict.fromkeys(names) if unusable.isdisjoint(_names_in(name)))
+        return tuple(name for name in self.all_ablations if unusable.isdisjoint(_names_in(name)))
+
+    @property
+    def all_ablations(self) -> tuple[str, ...]:
+        """Input ablations that are named or that "all" stands for."""
+        return tuple(dict.fromkeys([*(ABLATIONS if "all" in self.ablations else ()), *self.asked_ablations]))
 
     def uses(self, ablation: str) -> bool:
         """Whether an ablation is named, alone or among others."""

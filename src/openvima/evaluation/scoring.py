@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 
 from openvima.env.config import EnvConfig
+from openvima.errors import ConfigError
+from openvima.evaluation.ablations import NOISY_BOXES
 from openvima.evaluation.config import DEFAULT_EPISODES, Batch, EvaluationConfig, plan, rows_of
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout import play
@@ -31,7 +33,8 @@ def score(
         levels: From "train", "L1", "L2", "L3", "L4".
         episodes: Episodes for each policy, task and level.
         seed: First seed, of domain "eval"; the others follow without gaps.
-        ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes".
+        ablations: Input ablations, as in `EvaluationConfig`, except for "detected_boxes"; "noisy_boxes" for
+            `NetworkPolicy` only.
         prompts: "multimodal", "text" or "mixed", see `openvima.make`; such as "text" for a policy that reads
             language alone.
         task_options: As in `EnvConfig`, such as "num_distractors=3".
@@ -42,7 +45,7 @@ def score(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: There is no such level, or none of the levels holds a task that was named.
-        ConfigError: There is no episode, or a task option does not fit.
+        ConfigError: There is no episode, or a task option or an ablation does not fit.
         PolicyError: A policy lacks a method, raises, or gives something else than an action for each episode.
 
     Example:
@@ -59,6 +62,11 @@ def score(
         env_config=EnvConfig(prompts=prompts, task_options=task_options),
         ablations=ablations,
     )
+    if config.uses(NOISY_BOXES) and (own := [n for n, p in policies.items() if not hasattr(p, "processor")]):
+        raise ConfigError(
+            f"policy {', '.join(own)} extracts objects by code of its own, which the ablation {NOISY_BOXES} "
+            "does not reach; leave it out."
+        )
     batches = plan(config)
     outcomes: dict[Batch, tuple[EpisodeOutcome, ...]] = {}
     for batch in batches:

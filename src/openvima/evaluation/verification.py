@@ -153,7 +153,8 @@ def _row_problems(results: Results) -> Iterator[str]:
         int(config["episodes"]),
         int(config["seed"]),
         env_config=replace(EnvConfig.from_record(config), assets=DEFAULT_ENV_CONFIG.assets),
-        ablations=(IN_CONTEXT,) if IN_CONTEXT in config.get("ablations", ()) else (),  # decides the tasks
+        ablations=(*config.get("ablations", ()),),
+        boxes=config.get("boxes"),
     )
     seeds = list(range(whole.seed, whole.seed + whole.episodes))
     played: dict[tuple[str, str], list[tuple[str, str]]] = {}
@@ -169,6 +170,9 @@ def _row_problems(results: Results) -> Iterator[str]:
             continue
         if len(found) != len(expected) or set(found) != expected:
             yield f"{echo(policy)} {echo(ablation)} has other tasks and levels than the settings"
+    ablations = {ablation for _, ablation in played if ablation}
+    if not {*whole.asked_ablations} <= ablations <= {*whole.all_ablations}:
+        yield "the ablations of the rows are not those of the settings"
     named = {policy for policy, ablation in played if not ablation}
     if named != set(config["policies"]) or named != set(results.policies):
         yield "the policies of the rows are not those of the settings"

@@ -1,5 +1,6 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
+from openvima.evaluation.ablations import INPUT_ABLATIONS
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import TRAINED_KINDS
@@ -27,28 +28,26 @@ _ROLES = {
     "code": "Policy of the user's own code: observes the prompt and two camera images.",
     "remote": "Policy behind a server: observes the prompt and two camera images.",
 }
-_ABLATION_DESCRIPTIONS = {
-    "no_prompt": "The prompt is a full stop in every episode; only the table is left.",
-    "other_prompt_images": "The prompt keeps its words; its images come from another episode of the task.",
-    "scrambled_words": "The prompt keeps its images; each word is replaced by a random word.",
-    "shuffled_objects": "Object ids are permuted; only with compat do they reveal the order of spawning.",
-    "detected_boxes": "Boxes come from a detector instead of the simulator.",
-    "in_context": "The prompt is edited to contain an example from the task's own prompt, as in MIDAS.",
-    "oracle_demonstration": "The prompt is the oracle's solution of the same episode.",
-}
-
 _OWN_COLOURS = ("--series-oracle", "--series-random", "--series-untrained")
 _NUM_COLOURS = 6  # in the style sheet, for all other policies
 
 
 def ablation_name(ablation: str) -> str:
-    """Name of an ablation as words."""
-    return ablation.replace("_", " ")
+    """Name of an ablation as words.
+
+    Example:
+        >>> ablation_name("masked_words:0.2+noisy_boxes:3")
+        'masked words 0.2 + noisy boxes 3'
+    """
+    return ablation.replace("_", " ").replace(":", " ").replace("+", " + ")
 
 
 def ablation_description(ablation: str) -> str:
-    """One sentence on an input ablation."""
-    return _ABLATION_DESCRIPTIONS.get(ablation, "See the documentation of the evaluation.")
+    """One sentence on an input ablation, or on each of several."""
+    known = (INPUT_ABLATIONS.get(part.partition(":")[0]) for part in ablation.split("+"))
+    return (
+        " ".join(found.description for found in known if found) or "See the documentation of the evaluation."
+    )
 
 
 def role(results: Results, policy: str) -> str:

@@ -10,7 +10,13 @@ import numpy as np
 from openvima.env.config import EnvConfig
 from openvima.env.tabletop import TabletopEnv
 from openvima.errors import ConfigError, echo, unknown_name
-from openvima.evaluation.ablations.environments import has_form, with_paraphrased_prompts, with_text_prompts
+from openvima.evaluation.ablations.environments import (
+    allows_num_distractors,
+    has_form,
+    with_num_distractors,
+    with_paraphrased_prompts,
+    with_text_prompts,
+)
 from openvima.evaluation.ablations.images import NEUTRAL_PROMPT, with_images_of_another
 from openvima.evaluation.ablations.inputs import AblatedInput
 from openvima.evaluation.ablations.objects import jittered, shuffled
@@ -122,6 +128,14 @@ INPUT_ABLATIONS = {
             environment=with_paraphrased_prompts,
             takes=has_form,
             exclusive="prompts",
+        ),
+        InputAblation(
+            "num_distractors",
+            "So many distractors lie on the table, in scenes of their own.",
+            environment=with_num_distractors,
+            takes=allows_num_distractors,
+            rate=Rate(0, 20, 6),
+            changes_scenes=True,
         ),
         InputAblation(
             "other_prompt_images",

@@ -1,0 +1,199 @@
+"""Corrupted words: which words change, what stays, and what tokenizers make of them."""
+
+import re
+
+import numpy as np
+import pytest
+
+from openvima.env import EnvConfig, TabletopEnv
+from openvima.errors import ConfigError
+from openvima.evaluation import EvaluationConfig
+from openvima.evaluation.ablations import (
+    INPUT_ABLATIONS,
+    ablate,
+    ablated_environment,
+    applies_to,
+    canonical_ablation,
+)
+from openvima.evaluation.ablations.words import gibberish, masked, swapped
+from openvima.evaluation.config import cells, plan
+from openvima.evaluation.rollout import play
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
+from openvima.policies import RandomPolicy
+from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer
+from openvima.scene.prompt import PLACEHOLDER
+
+TEXT = "Put the red counter-clockwise {dragged_obj} into the {base}, then rotate it 30 degrees."
+WORDS = {"masked_words:0.5", "swapped_words:0.5", "gibberish_words"}
+
+
+def generators(count: int):
+    return (np.random.default_rng(seed) for seed in range(count))
+
+
+def words(text: str) -> list[str]:
+    return re.findall(r"<unknown>|[\w-]+", PLACEHOLDER.sub("", text))
+
+
+def begun(task: str, seed: int = 3, **settings) -> TabletopEnv:
+    env = TabletopEnv(task, level="L1", domain="eval", **settings)
+    env.reset(seed=seed)
+    return env
+
+
+@pytest.mark.parametrize("rewrite", [masked, swapped, lambda text, _, rng: gibberish(text, rng)])
+def test_image_slots_marks_and_their_order_stay(rewrite):
+    for rng in generators(20):
+        changed = rewrite(TEXT, 0.5, rng)
+        assert PLACEHOLDER.findall(changed) == ["dragged_obj", "base"]
+        shape = [re.sub(r"<unknown>|[\w-]+", "w", piece) for piece in PLACEHOLDER.split(changed)[::2]]
+        assert shape == ["w w w w ", " w w ", ", w w w w w."]
+
+
+def test_each_word_is_masked_with_the_probability_and_more_at_higher_rates():
+    counts = []
+    for seed in range(200):
+        few, many = (words(masked(TEXT, rate, np.random.default_rng(seed))) for rate in (0.2, 0.6))
+        assert all(b == UNKNOWN for a, b in zip(few, many, strict=True) if a == UNKNOWN)
+        counts.append((few.count(UNKNOWN), many.count(UNKNOWN)))
+    assert np.mean(counts, axis=0) == pytest.approx([0.2 * 11, 0.6 * 11], rel=0.12)
+
+
+def test_neighbours_are_swapped_with_the_probability_and_never_across_an_image():
+    num_swapped = []
+    for rng in generators(300):
+        changed = PLACEHOLDER.split(swapped(TEXT, 0.2, rng))[::2]
+        for own, other in zip(PLACEHOLDER.split(TEXT)[::2], changed, strict=True):
+            assert sorted(words(own)) == sorted(words(other))
+        num_swapped.append(words(changed[1]) != ["into", "the"])
+    assert np.mean(num_swapped) == pytest.approx(0.2, abs=0.07)
+    assert swapped("a b c d", 1, np.random.default_rng(0)) == "b c d a"
+
+
+def test_gibberish_keeps_lengths_and_says_one_word_always_alike():
+    text = "The red block, the RED blocks: {a} counter-clockwise 30"
+    seen = set()
+    for rng in generators(10):
+        changed = words(gibberish(text, rng))
+        assert [len(word) for word in changed] == [len(word) for word in words(text)]
+        assert changed[0].lower() == changed[3] and changed[1] == changed[4].lower()
+        assert changed[0][0].isupper() and changed[-1] == "30" and changed[-2][7] == "-"
+        seen.add(changed[1])
+    assert len(seen) == 10
+
+
+def test_a_masked_word_is_the_unknown_token_of_a_vocabulary_or_left_out():
+    with_unknown, without = Vocabulary((UNKNOWN, "put", ".")), Vocabulary(("put", "."))
+    ids = WordTokenizer(with_unknown)
+    assert ids.encode("put <unknown>.") == [*ids.encode("put"), with_unknown.ids()[UNKNOWN], *ids.encode(".")]
+    assert WordTokenizer(without).encode("put <unknown>.") == WordTokenizer(without).encode("put.")
+    assert without.extended(["put <unknown> there"]).words == ("put", ".", "there")
+
+
+def test_descriptions_in_text_prompts_are_words():
+    env = begun("visual_manipulation", prompts="text")
+    changed = ablate(env, "masked_words:1").prompt
+    assert changed.images == env.prompt.images == {}
+    assert set(words(changed.text)) == {UNKNOWN}
+
+
+class Noting(RandomPolicy):
+    """Notes the prompts; its actions depend on nothing."""
+
+    def reset(self, prompts):
+        super().reset([type(prompt)("", {}) for prompt in prompts])
+        self.prompts = prompts
+
+
+@pytest.mark.parametrize("ablation", sorted(WORDS))
+def test_words_follow_from_the_episode_and_change_nothing_for_who_ignores_them(ablation):
+    env, policy = begun("twist"), Noting()
+    (plain,) = play([env], [3], PromptedRolloutPolicy(policy))
+    (corrupted,) = play([env], [3], PromptedRolloutPolicy(policy, ablation))
+    assert corrupted == plain
+    alone = policy.prompts[0].text
+    assert alone != env.prompt.text
+    others = [begun("twist", seed) for seed in (7, 3)]
+    play(others, [7, 3], PromptedRolloutPolicy(policy, ablation))
+    assert policy.prompts[1].text == alone != policy.prompts[0].text
+    assert policy.prompts[1].images == others[1].prompt.images
+
+
+def test_several_at_once_are_one_ablation_in_one_spelling():
+    assert canonical_ablation("noisy_boxes:3+masked_words:.50") == "masked_words:0.5+noisy_boxes:3"
+    env = begun("visual_manipulation")
+    both = ablate(env, "masked_words:0.5+noisy_boxes:3")
+    assert both.prompt.text == ablate(env, "masked_words:0.5").prompt.text
+    assert both.jitter is not None
+    config = EvaluationConfig(
+        ("mine=a",), ablations=("masked_words:.2", "masked_words:0.20", "gibberish_words")
+    )
+    assert config.ablations == ("masked_words:0.2", "gibberish_words")
+    assert config.record()["ablations"] == ["masked_words:0.2", "gibberish_words"]
+
+
+@pytest.mark.parametrize(
+    ("ablation", "message"),
+    [
+        ("masked_word:0.2", "Did you mean 'masked_words'"),
+        ("masked_words", "needs a rate, such as masked_words:0.2"),
+        ("masked_words:0", "must be a number above 0 to 1"),
+        ("masked_words:1.5", "must be a number above 0 to 1"),
+        ("masked_words:nan", "must be a number"),
+        ("noisy_boxes:2.5", "must be an integer from 1 to 32"),
+        ("num_distractors:99", "must be an integer from 0 to 20"),
+        ("gibberish_words:0.2", "gibberish_words takes no rate"),
+        ("no_prompt+random", "random stands alone"),
+        ("text_prompts+paraphrased_prompts", "exclude each other"),
+        ("detected_boxes+noisy_boxes:3", "exclude each other"),
+        ("masked_words:0.2+masked_words:0.4", "exclude each other"),
+        ("+".join(["no_prompt"] * 50), "at most 200 are allowed"),
+        ("", "empty"),
+    ],
+)
+def test_ablations_that_cannot_be_are_refused_in_one_line(ablation, message):
+    with pytest.raises(ConfigError, match=message) as found:
+        EvaluationConfig(("untrained",), ablations=(ablation,))
+    assert "\n" not in str(found.value)
+
+
+def test_environments_change_for_the_tasks_that_have_the_form_or_the_option():
+    plain = EnvConfig(task_options="num_distractors=1,rotate.num_distractors=2,rotate.difficulty=medium")
+    assert ablated_environment("text_prompts", plain).prompts == "text"
+    assert (
+        ablated_environment("paraphrased_prompts", EnvConfig(prompts="mixed")).prompts == "mixed,paraphrased"
+    )
+    crowded = ablated_environment("num_distractors:6", plain)
+    assert crowded.task_options == "num_distractors=6,rotate.difficulty=medium"
+    assert ablated_environment("masked_words:0.2", plain) == plain
+    assert applies_to("num_distractors:6", "rotate", crowded)
+    config = EvaluationConfig(("untrained",), ("rotate", "rearrange", "same_shape"), ("L1",), 1)
+    tasks = {
+        ablation: [task for task, _ in cells(config, ablation)]
+        for ablation in ("", "text_prompts", "num_distractors:2", "num_distractors:6+masked_words:0.1")
+    }
+    assert list(tasks.values()) == [
+        ["rotate", "rearrange", "same_shape"],
+        ["rotate", "same_shape"],
+        ["rotate", "same_shape"],
+        ["rotate"],
+    ]
+    asked = EvaluationConfig(("untrained",), ("rotate", "rearrange"), ("L1",), 1, ablations=("text_prompts",))
+    assert [(b.ablation, b.task, b.env_config.prompts) for b in plan(asked)] == [
+        ("", "rotate", "multimodal"),
+        ("", "rearrange", "multimodal"),
+        ("text_prompts", "rotate", "text"),
+    ]
+
+
+def test_an_environment_that_is_so_already_or_fits_no_task_is_an_error():
+    with pytest.raises(ConfigError, match="text_prompts changes nothing"):
+        ablated_environment("text_prompts", EnvConfig(prompts="text"))
+    with pytest.raises(ConfigError, match="num_distractors:6 applies to none of the tasks rearrange"):
+        cells(EvaluationConfig(("untrained",), ("rearrange",)), "num_distractors:6")
+
+
+def test_every_ablation_says_what_it_does_in_one_sentence():
+    assert all(
+        each.description.endswith(".") and len(each.description) < 100 for each in INPUT_ABLATIONS.values()
+    )

@@ -1,0 +1,81 @@
+"""Jittered boxes: which borders move and how far, and what stays."""
+
+import numpy as np
+import pytest
+
+from openvima.env import TabletopEnv
+from openvima.perception.image_stack import ImageStack
+from openvima.perception.jitter import BoxJitter
+from openvima.perception.kernels import CROP_SIZE
+from openvima.perception.objects import ObjectViews, crop_box, observe
+from openvima.perception.preprocessing import FOUND, extract_observation, preprocess_prompt
+from openvima.render.camera import VIEWS
+
+
+def edges(objects: ObjectViews) -> np.ndarray:
+    """First and last column, first and last row of visible boxes, from centre and size."""
+    x, y, tall, wide = np.moveaxis(objects.boxes[objects.masks], -1, 0)
+    left, upper = (2 * x + wide % 2 - wide) // 2, (2 * y + tall % 2 - tall) // 2
+    return np.stack([left, left + wide, upper, upper + tall], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def begun():
+    env = TabletopEnv("rearrange", level="L1", domain="eval")
+    return env, env.reset(seed=3)[0]
+
+
+def by_id(objects: ObjectViews) -> ObjectViews:
+    return objects.select(np.argsort(objects.ids))
+
+
+def test_no_jitter_gives_the_boxes_and_crops_of_the_segmentation(begun):
+    _, observation = begun
+    true, found = observe(observation), BoxJitter(0, np.random.default_rng(0)).observation(observation)[FOUND]
+    for name in ("ids", "crops", "boxes", "masks", "grasps"):
+        assert np.array_equal(getattr(true, name), getattr(found, name)), name
+
+
+def test_borders_move_by_up_to_so_many_pixels_and_crops_with_them(begun):
+    _, observation = begun
+    jitter, true, shifts = BoxJitter(3, np.random.default_rng(0)), by_id(observe(observation)), []
+    for _ in range(20):
+        found = by_id(jitter.observation(observation)[FOUND])
+        shifts.append(edges(found) - edges(true))
+        assert np.array_equal(found.ids, true.ids) and np.array_equal(found.masks, true.masks)
+        visible = np.argwhere(found.masks)
+        for (v, k), extent in zip(visible, edges(found), strict=True):
+            crop, box = crop_box(observation["rgb"][VIEWS[v]], extent.tolist())
+            assert np.array_equal(crop, found.crops[v, k]) and np.array_equal(box, found.boxes[v, k])
+            column, row = found.grasps[v, k]
+            assert extent[0] <= column <= extent[1] and extent[2] <= row <= extent[3]
+    shifts = np.concatenate(shifts)
+    assert set(np.unique(shifts)) == set(range(-3, 4))
+    assert all(len(np.unique(border)) == 7 for border in shifts.T)  # each border by its own draw
+    assert np.abs(shifts.mean(axis=0)).max() < 0.5
+
+
+def test_boxes_stay_within_the_image(begun):
+    _, observation = begun
+    found = BoxJitter(32, np.random.default_rng(1)).observation(observation)[FOUND]
+    left, right, upper, lower = edges(found).T
+    assert (left >= 0).all() and (right < 256).all() and (upper >= 0).all() and (lower < 128).all()
+    assert (left <= right).all() and (upper <= lower).all()
+
+
+def test_networks_on_objects_get_the_moved_boxes_and_those_on_frames_see_no_difference(begun):
+    env, observation = begun
+    jitter = BoxJitter(3, np.random.default_rng(0))
+    moved = jitter.observation(observation)
+    assert extract_observation(moved, "objects") is moved[FOUND]
+    whole = [extract_observation(seen, "frames") for seen in (observation, moved)]
+    assert np.array_equal(whole[0].crops, whole[1].crops)
+    names = list(env.prompt.images)
+    prompt = type(env.prompt)(env.prompt.text, {n: jitter.prompt_image(env.prompt.images[n]) for n in names})
+    size = (CROP_SIZE, CROP_SIZE)
+    plain, noisy = (
+        preprocess_prompt(each, "objects", None, ImageStack(size)) for each in (env.prompt, prompt)
+    )
+    assert np.array_equal(plain.objects.ids, noisy.objects.ids)
+    assert (plain.objects.boxes != noisy.objects.boxes).any()
+    assert prompt.images[names[0]].rgb is env.prompt.images[names[0]].rgb
