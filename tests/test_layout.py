@@ -27,6 +27,7 @@ ORDER = (
     "training",
     "evaluation",
     "report",
+    "studies",
     "cli",
 )
 FORBIDDEN = {

@@ -28,6 +28,7 @@ VERBS = {
     "detector": "train and evaluate the object detector",
     "evaluate": "evaluate policies on levels L1 to L4",
     "verify-results": "confirm an evaluation from its recorded actions",
+    "study": "run an experiment of the papers: train, evaluate, plot",
     "serve": "serve a policy over WebSockets",
     "report": "write the HTML report of an evaluation",
 }
@@ -38,17 +39,18 @@ _MEMORY_REMEDIES = {
     "train": "lower --loader.batch-size or raise --optimizer.grad-accum-steps",
     "detector": "lower --loader.batch-size",
     "evaluate": "lower --batch or --workers",
+    "study": "lower --workers",
     "generate": "lower --workers",
     "quickstart": "lower --workers",
     "data": "lower --workers",
 }
 _RESUMES = "interrupted; complete files were kept, and the same command resumes."
 _INTERRUPTED = {
-    **dict.fromkeys(("generate", "data", "train", "detector", "evaluate", "quickstart"), _RESUMES),
+    **dict.fromkeys(("generate", "data", "train", "detector", "evaluate", "study", "quickstart"), _RESUMES),
     "serve": "the policy is no longer served; goodbye.",
 }
 # Least address space of the verbs that simulate or train, in 2**20 bytes.
-_LEAST_MB = dict.fromkeys(("demo", "generate", "train", "detector", "evaluate", "quickstart"), 1000)
+_LEAST_MB = dict.fromkeys(("demo", "generate", "train", "detector", "evaluate", "study", "quickstart"), 1000)
 
 OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 

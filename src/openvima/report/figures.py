@@ -15,6 +15,9 @@ from openvima.report.rate_curves import RateFigure
 _INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
 _PANEL_WIDTH_IN = 3.9
 _LEAST_GAP = 0.12  # between named values of an axis, as a fraction of its length
+_DODGE = 0.1  # between the curves of named values, which are 1 apart
+_CHARACTER_IN = 0.055  # height of a tilted name, for each of its characters
+_MAX_TILTED = 24  # characters of a tilted name
 _STYLE: Any = {  # Any: the type of matplotlib's settings is not public
     "svg.hashsalt": "openvima",  # element names in the file are the same in every run
     "svg.fonttype": "none",
@@ -110,24 +113,30 @@ def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str
         An `<svg>` element.
     """
     panel = rates.panels[index]
-    figure, axes = _panel(2.6, margins_in=(0.5, 0.45, 0.16, 0.08))
-    for curve in panel.curves:
+    ticks = _ticks(rates)
+    longest = max((len(rates.tick(x)) for x in ticks), default=0)
+    bottom = 0.45 + (_CHARACTER_IN * min(_MAX_TILTED, longest) if rates.named else 0.0)
+    figure, axes = _panel(2.15 + bottom, margins_in=(0.5, bottom, 0.16, 0.08))
+    for number, curve in enumerate(panel.curves):
         colour = _series(colours[curve.name])
-        at = [point.x for point in curve.points]
+        shift = _DODGE * (number - (len(panel.curves) - 1) / 2) if rates.named else 0.0
+        at = [point.x + shift for point in curve.points]
         style: dict[str, Any] = {"color": colour, "marker": "o", "linewidth": 1.8, "markersize": 4.5}
         if curve.published:
             style |= {"linestyle": (0, (3, 2)), "linewidth": 1.2, "markerfacecolor": "none", "markersize": 4}
+        if rates.named:
+            style["linestyle"] = "none"
         axes.plot(at, [100 * point.rate for point in curve.points], **style)
-        for point in curve.points:
+        for x, point in zip(at, curve.points, strict=True):
+            seeds = [100 * rate for rate in point.seeds]
+            axes.plot([x] * len(seeds), seeds, "_", color=colour, markersize=8, markeredgewidth=1.2)
             if point.interval:
                 ends = [100 * end for end in point.interval]
-                axes.plot([point.x] * 2, ends, color=colour, linewidth=2.4, alpha=0.4, solid_capstyle="round")
+                axes.plot([x] * 2, ends, color=colour, linewidth=2.4, alpha=0.4, solid_capstyle="round")
     if rates.logarithmic:
         axes.set_xscale("log")
-    ticks = _spaced(
-        {p.x for panel in rates.panels for c in panel.curves for p in c.points}, rates.logarithmic
-    )
-    axes.set_xticks(ticks, [rates.tick(x) for x in ticks])
+    tilt: Any = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if rates.named else {}
+    axes.set_xticks(ticks, [_cut(rates.tick(x)) for x in ticks], **tilt)
     axes.set_xticks([], minor=True)
     axes.set_ylim(-3, 103)
     axes.set_yticks(range(0, 101, 25), [f"{tick} %" for tick in range(0, 101, 25)])
@@ -135,6 +144,16 @@ def rate_chart(rates: RateFigure, index: int, colours: Mapping[str, str]) -> str
     axes.tick_params(length=0)
     title = f"{rates.caption} {panel.title}"
     return _themed(figure, f"{rates.label}-{index}", title, [colours[c.name] for c in panel.curves])
+
+
+def _ticks(rates: RateFigure) -> list[float]:
+    """Values to name on the axis."""
+    values = {p.x for panel in rates.panels for curve in panel.curves for p in curve.points}
+    return sorted(values) if rates.named else _spaced(values, rates.logarithmic)
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _MAX_TILTED else f"{name[: _MAX_TILTED - 1]}…"
 
 
 def _spaced(values: Iterable[float], logarithmic: bool) -> list[float]:

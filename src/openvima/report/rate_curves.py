@@ -16,12 +16,14 @@ class RatePoint:
         rate: Success rate, as a fraction.
         interval: Its 95 % interval; None where it is not known.
         mark: Put behind the number in tables.
+        seeds: Rates of single training seeds, drawn as dashes.
     """
 
     x: float
     rate: float
     interval: Interval | None = None
     mark: str = ""
+    seeds: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +60,7 @@ class RateFigure:
         panels: One chart each.
         ticks: Names of values of the quantity, where they are not plain numbers.
         logarithmic: Whether the horizontal axis is.
+        named: Whether values are 0, 1, 2, … for the names in `ticks`, in any order: curves are not joined.
     """
 
     label: str
@@ -66,6 +69,7 @@ class RateFigure:
     panels: tuple[RatePanel, ...]
     ticks: Mapping[float, str] = field(default_factory=dict)
     logarithmic: bool = False
+    named: bool = False
 
     @property
     def curves(self) -> dict[str, RateCurve]:

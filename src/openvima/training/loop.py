@@ -124,7 +124,7 @@ class Trainer:
             is_first=parallel.is_first,
         )
         parallel.wait()
-        self._started = time.monotonic()
+        self._started, self._cpu_started = time.monotonic(), time.process_time()
         self._last = (0, self._started)  # step and time of the last line of metrics
         self.progress = self.run.resume(learner)
         learner.to(parallel.device)
@@ -142,6 +142,7 @@ class Trainer:
             self.run.rewind_to(self.progress)
             origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
             self.run.append(SESSIONS_FILE, {**self._here(), **origin})
+            self._log_times()
         try:
             for number in range(self.progress.stage, len(stages)):
                 if number > self.progress.stage:
@@ -208,14 +209,19 @@ class Trainer:
     def _log(self, stage: Stage, metrics: Metrics) -> None:
         self._write(stage, metrics)
         if self.parallel.is_first:
-            seconds = round(time.monotonic() - self._started, 2)
-            self.run.append(TIMINGS_FILE, {**self._here(), "seconds_since_start": seconds})
+            self._log_times()
         now, step = time.monotonic(), self.progress.step
         rate = max(0, step - self._last[0]) / max(1e-9, now - self._last[1])
         self._last = (step, now)
         shown = [(name, value) for name, value in metrics.items() if "/" not in name][:3]
         note = "  ".join(f"{name} {value:.3f}" for name, value in shown)
         self.report(f"{stage.name}: {note}  {rate:.1f} steps/s")
+
+    def _log_times(self) -> None:
+        seconds = round(time.monotonic() - self._started, 2)
+        cpu_seconds = round(time.process_time() - self._cpu_started, 2)
+        times = {"seconds_since_start": seconds, "cpu_seconds_since_start": cpu_seconds}
+        self.run.append(TIMINGS_FILE, {**self._here(), **times})
 
     def _save(self, stage: Stage, optimizer: torch.optim.Optimizer) -> None:
         """Validate, update the best checkpoint, and write one.

@@ -1,0 +1,71 @@
+"""`openvima study`: an experiment of several trainings and evaluations, and its page."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from openvima.cli.lists import parse_list
+from openvima.cli.progress import progress_bar
+
+
+def main(
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")],
+    *,
+    out: Path,
+    scale: Literal["nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m"] = "nano",
+    seeds: int = 1,
+    policy: str = "",
+    t5: str | None = None,
+    assets: str = "procedural",
+    checkpoint: str | None = None,
+    workers: int | None = None,
+    engine: Literal["processes", "ray"] = "processes",
+    address: str | None = None,
+    device: str | None = None,
+) -> int:
+    """Run an experiment of the papers: generate, train, evaluate, and write report.html and study.json.
+
+    The same command resumes an interrupted study, with the same numbers.
+
+    Example: openvima study data-scaling --scale nano --seeds 3 --workers 2 --out data_scaling
+
+    Args:
+        name: data-scaling; or FILE.py:FUNCTION for a study of your own.
+        out: Folder of the study.
+        scale: Sizes of networks, data and evaluation. nano takes minutes to an hour on two cores; the others
+            follow the papers.
+        seeds: Training seeds; 3 show the variation between trainings. More can be added later.
+        policy: Policies to evaluate, comma-separated, for studies that train none.
+        t5: T5 weights and tokenizer, for networks that use them: a folder, or an id such as t5-base.
+        assets: procedural, original, a checkout of the original benchmark, or FILE.py:FUNCTION.
+        checkpoint: A published checkpoint, for studies of one.
+        workers: Trainings at a time, and processes of generating and evaluating; by default one, or all CPUs
+            of the Ray cluster at --address.
+        engine: processes of this machine, or ray.
+        address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
+        device: Where networks are trained and act: cpu or cuda. By default they are trained on a GPU if
+            there is one, and act on a CPU.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.studies import Execution, StudyInputs, make_study, run_study, scale_named
+
+    inputs = StudyInputs(scale_named(scale), parse_list(policy), t5, assets, checkpoint)
+    study = make_study(name, inputs)
+    options = {"policy": policy, "t5": t5, "assets": assets if assets != "procedural" else None}
+    options |= {"checkpoint": checkpoint, "device": device}
+    words = [f"--{option} {shlex.quote(value)}" for option, value in options.items() if value]
+    start = f"openvima study {shlex.quote(name)} --scale {scale} --seeds {seeds}"
+    command = " ".join([start, *words, "--out DIR"])
+    execution = Execution(workers, engine, address)
+    with progress_bar("stages") as bar:
+        page = run_study(
+            study, inputs, out, seeds=seeds, device=device, execution=execution, command=command, report=bar
+        )
+    print(f"Report: {page}", file=sys.stderr)
+    print(page)
+    return 0

@@ -1,0 +1,34 @@
+"""Studies: experiments of several runs, each a list of runs as data, ending in one page."""
+
+from openvima.lazy import lazy_names
+from openvima.studies.scales import SCALES, Scale, scale_named
+from openvima.studies.study import (
+    Demonstrations,
+    EvaluationSettings,
+    PublishedPoint,
+    Run,
+    Study,
+    StudyInputs,
+    published_points,
+)
+
+__all__ = [
+    "SCALES",
+    "STUDIES",
+    "Demonstrations",
+    "EvaluationSettings",
+    "Execution",
+    "PublishedPoint",
+    "Run",
+    "Scale",
+    "Study",
+    "StudyInputs",
+    "make_study",
+    "published_points",
+    "run_study",
+    "scale_named",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__, {"Execution": "runner", "run_study": "runner", "STUDIES": "registry", "make_study": "registry"}
+)

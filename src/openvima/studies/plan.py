@@ -1,0 +1,233 @@
+"""The stages of a study: demonstrations, subsets, trainings and evaluations, each with its own folder.
+
+STUDY/settings.json                        what the folder holds
+STUDY/data/1                               demonstrations
+STUDY/data/1-0.01-seed-0                   a fraction of them
+STUDY/initial/1/seed-0                     trainings that others start from
+STUDY/runs/LABEL/seed-0                    trainings
+STUDY/evaluations/LABEL/seed-0             evaluations
+STUDY/study.json, report.html              results
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from openvima.errors import ConfigError
+from openvima.evaluation.config import EvaluationConfig
+from openvima.studies.study import Demonstrations, EvaluationSettings, Run, Settings, Study, StudyInputs
+from openvima.training.config import TrainingConfig
+from openvima.training.recipes import overridden, recipe_settings
+
+COST_FILE = "cost.json"  # in the folder of a training that is done
+
+
+@dataclass(frozen=True, slots=True)
+class Subset:
+    """A fraction of a data set."""
+
+    source: Path
+    out: Path
+    fraction: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """One training.
+
+    Args:
+        config: Its settings.
+        run: Label of the run; empty for a training that others start from.
+    """
+
+    config: TrainingConfig
+    run: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """The evaluation of one run and seed.
+
+    Args:
+        run: The run.
+        seed: Training seed; 0 for a policy that exists.
+        config: Its settings.
+    """
+
+    run: Run
+    seed: int
+    config: EvaluationConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All stages of a study, in order.
+
+    Args:
+        data: Folder of each data set.
+        subsets: Fractions of data sets.
+        initial: Trainings that others start from.
+        trainings: Trainings of the runs.
+        evaluations: Evaluations of the runs.
+    """
+
+    data: Mapping[Demonstrations, Path]
+    subsets: tuple[Subset, ...]
+    initial: tuple[Training, ...]
+    trainings: tuple[Training, ...]
+    evaluations: tuple[Evaluation, ...]
+
+    @property
+    def num_stages(self) -> int:
+        """Number of stages."""
+        return sum(map(len, (self.data, self.subsets, self.initial, self.trainings, self.evaluations)))
+
+
+def plan_study(
+    study: Study, inputs: StudyInputs, out: Path, *, seeds: int, device: str | None = None
+) -> Plan:
+    """Divide a study into stages; policies that exist have a single seed.
+
+    Args:
+        study: The study.
+        inputs: What it was made from.
+        out: Its folder.
+        seeds: Training seeds.
+        device: Where networks are trained and act; None trains on a GPU if there is one, and acts on a CPU.
+
+    Raises:
+        ConfigError: Settings are not allowed, or two labels give the same folder.
+    """
+    if seeds < 1:
+        raise ConfigError(f"seeds is {seeds}; it must be at least 1.")
+    names = {run.label: _folder_name(run.label) for run in study.runs}
+    if len(set(names.values())) < len(names):
+        raise ConfigError(f"labels {', '.join(names)} give the same folders; choose others.")
+    planner = _Planner(study, inputs, out, device)
+    for run in study.runs:
+        for seed in range(seeds if run.policy is None else 1):
+            planner.add(run, names[run.label], seed)
+    return planner.plan()
+
+
+class _Planner:
+    """Collects stages; what several runs share is planned once."""
+
+    def __init__(self, study: Study, inputs: StudyInputs, out: Path, device: str | None) -> None:
+        self.study, self.inputs, self.out, self.device = study, inputs, out, device
+        self.data: dict[Demonstrations, Path] = {}
+        self.subsets: dict[Path, Subset] = {}
+        self.kinds: list[tuple[Settings, Demonstrations]] = []  # of initial trainings
+        self.initial: dict[Path, Training] = {}
+        self.trainings: list[Training] = []
+        self.evaluations: list[Evaluation] = []
+
+    def plan(self) -> Plan:
+        return Plan(
+            self.data,
+            tuple(self.subsets.values()),
+            tuple(self.initial.values()),
+            tuple(self.trainings),
+            tuple(self.evaluations),
+        )
+
+    def add(self, run: Run, name: str, seed: int) -> None:
+        """Plan a run and seed."""
+        policy = run.policy
+        if policy is None:
+            policy = f"{name}={self._training(run, name, seed)}"
+        settings = run.evaluation or self.study.evaluation
+        out = self.out / "evaluations" / name / f"seed-{seed}"
+        config = _evaluation_config(settings, policy, out, seed, self.device)
+        self.evaluations.append(Evaluation(run, seed, config))
+
+    def _training(self, run: Run, name: str, seed: int) -> Path:
+        demonstrations = run.data or self.study.data
+        assert demonstrations is not None  # checked by `Study`
+        data = self._subset(demonstrations, run.data_fraction, seed)
+        settings = dict(run.settings)
+        if run.init is not None:
+            settings["init_from"] = str(self._initial(run.init, demonstrations, data, seed))
+        out = self.out / "runs" / name / f"seed-{seed}"
+        self.trainings.append(Training(self._config(settings, data, out, seed), run.label))
+        return out
+
+    def _initial(self, settings: Settings, of: Demonstrations, data: Path, seed: int) -> Path:
+        kind = (settings, of)
+        if kind not in self.kinds:
+            self.kinds.append(kind)
+        out = self.out / "initial" / str(1 + self.kinds.index(kind)) / f"seed-{seed}"
+        self.initial[out] = Training(self._config(settings, data, out, seed))
+        return out
+
+    def _subset(self, demonstrations: Demonstrations, fraction: float, seed: int) -> Path:
+        source = self.data.setdefault(demonstrations, self.out / "data" / str(1 + len(self.data)))
+        if fraction == 1:
+            return source
+        out = source.with_name(f"{source.name}-{fraction:g}-seed-{seed}")
+        self.subsets[out] = Subset(source, out, fraction, seed)
+        return out
+
+    def _config(self, settings: Settings, data: Path, out: Path, seed: int) -> TrainingConfig:
+        scale, inputs = self.inputs.scale, self.inputs
+        merged: dict[str, Any] = recipe_settings(scale.recipe)  # Any: values of settings
+        for others in (scale.settings, self.study.settings, settings):
+            merged = overridden(merged, others)
+        paths = {"data": data, "out": out, "seed": seed, "assets": inputs.assets}
+        device = {} if self.device is None else {"runtime.device": self.device}
+        return TrainingConfig.of({**merged, **paths, **device})
+
+
+def _evaluation_config(
+    settings: EvaluationSettings, policy: str, out: Path, seed: int, device: str | None
+) -> EvaluationConfig:
+    """Each training seed is evaluated on episodes of its own; those of one seed are the same for all runs."""
+    return EvaluationConfig(
+        policies=(policy,),
+        tasks=settings.tasks,
+        levels=settings.levels,
+        episodes=settings.episodes,
+        seed=seed * settings.episodes,
+        out=out,
+        env_config=settings.env_config,
+        ablations=settings.ablations,
+        device=device or "cpu",
+    )
+
+
+def _folder_name(label: str) -> str:
+    """Return a label as the name of a folder and policy.
+
+    Example:
+        >>> _folder_name("0.1 %"), _folder_name("object perceiver")
+        ('0.1', 'object-perceiver')
+    """
+    return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"
+
+
+def record_of(study: Study, inputs: StudyInputs) -> dict[str, Any]:  # Any: JSON
+    """Return what identifies the content of a study's folder, the number of seeds apart."""
+    return {
+        "study": study.name,
+        "scale": inputs.scale.name,
+        "assets": inputs.assets,
+        "recipe": inputs.scale.recipe,
+        "settings": _plain({**inputs.scale.settings, **study.settings}),
+        "data": _plain(study.data),
+        "evaluation": _plain(study.evaluation),
+        "runs": {run.label: _plain(run) for run in study.runs},
+    }
+
+
+def _plain(value: Any) -> Any:  # Any: JSON
+    """Return plain JSON values."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    return value if value is None or isinstance(value, str | int | float | bool) else str(value)

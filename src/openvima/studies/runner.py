@@ -1,0 +1,286 @@
+"""Running a study: stage after stage, each of which resumes after any kill."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from openvima.atomic_io import atomic_write_file
+from openvima.catalog.packs import load_assets
+from openvima.data import Dataset, GenerateConfig, generate
+from openvima.data.resuming import is_finished
+from openvima.data.subsets import SubsetConfig, sample
+from openvima.errors import ConfigError, InputFileError
+from openvima.evaluation.results import Results
+from openvima.evaluation.runner import evaluate_prepared, prepare
+from openvima.folder_lock import folder_lock, is_lock_file
+from openvima.input_files import read_json
+from openvima.multiprocess import check_workers, imap_unordered
+from openvima.policies.base import require_torch
+from openvima.report.assets import require_extra
+from openvima.studies.page import study_page
+from openvima.studies.plan import COST_FILE, Evaluation, Plan, Subset, Training, plan_study, record_of
+from openvima.studies.results import study_costs, study_points
+from openvima.studies.study import Demonstrations, Study, StudyInputs
+from openvima.training.validation import flattened
+
+SETTINGS_FILE = "settings.json"
+RESULTS_FILE = "study.json"
+PAGE_FILE = "report.html"
+SCHEMA = 1
+_MAX_DIFFERENCES = 3  # in a message
+
+Report = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Execution:
+    """How a study is run; nothing of it changes the results.
+
+    Args:
+        workers: Trainings at a time, of one thread each, and processes of generating and evaluating; None is
+            one, or all CPUs of the Ray cluster at `address`.
+        engine: "processes" of this machine, or "ray".
+        address: Ray cluster, whose machines share the folder; None starts Ray on this machine.
+    """
+
+    workers: int | None = None
+    engine: Literal["processes", "ray"] = "processes"
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers is not None:
+            check_workers(self.workers)
+        if self.address is not None and self.engine != "ray":
+            raise ConfigError(f"address is {self.address!r}, but only the engine ray takes one.")
+
+    @property
+    def is_serial(self) -> bool:
+        """Whether all work is done in this process."""
+        return self.engine == "processes" and self.workers in (None, 1)
+
+    def imap(self, job: Callable[..., Any], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:  # Any: jobs
+        """Apply a job to every item."""
+        if self.engine == "processes":
+            yield from imap_unordered(job, items, self.workers or 1)
+            return
+        from openvima.ray_backend import ray_imap_unordered
+
+        workers = self.workers or (1 if self.address is None else None)
+        yield from ray_imap_unordered(job, items, workers, address=self.address)
+
+
+DEFAULT_EXECUTION = Execution()
+
+
+def run_study(
+    study: Study,
+    inputs: StudyInputs,
+    out: Path,
+    *,
+    seeds: int = 1,
+    device: str | None = None,
+    execution: Execution = DEFAULT_EXECUTION,
+    command: str = "",
+    report: Report | None = None,
+) -> Path:
+    """Run a study, or what an interrupted one lacks, and write its page.
+
+    Args:
+        study: The study.
+        inputs: What it was made from.
+        out: Its folder.
+        seeds: Training seeds; more can be added later.
+        device: As for `plan_study`.
+        execution: Processes, or Ray.
+        command: The command, for the page.
+        report: Called with stages done, stages in all and a note.
+
+    Returns:
+        The page; `study.json` is beside it.
+
+    Raises:
+        ConfigError: The folder holds another study, or settings contradict each other.
+        MissingExtraError: A package for training or the page is not installed.
+        FolderLockedError: Another process writes to the folder.
+        OpenVimaError: As for `generate`, `train` and `evaluate`.
+    """
+    out = out.absolute()
+    plan = plan_study(study, inputs, out, seeds=seeds, device=device)
+    check_plan(plan, inputs)
+    with folder_lock(out):
+        _claim(out, record_of(study, inputs))
+        _Runner(plan, execution, report or (lambda *_: None)).run()
+        return _write(study, inputs, plan, out, command)
+
+
+def _write(study: Study, inputs: StudyInputs, plan: Plan, out: Path, command: str) -> Path:
+    """Write `study.json` and the page."""
+    points, costs = study_points(study, plan), study_costs(plan)
+    versions = Results.read(plan.evaluations[0].config.out).versions
+    content = {
+        "schema": SCHEMA,
+        "settings": record_of(study, inputs),
+        "points": [asdict(point) for point in points],
+        "published": [asdict(point) for point in study.published],
+        "costs": costs,
+        "versions": versions,
+    }
+    atomic_write_file(out / RESULTS_FILE, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    page = study_page(study, inputs, points, costs=costs, versions=versions, command=command)
+    return atomic_write_file(out / PAGE_FILE, page)
+
+
+def check_plan(plan: Plan, inputs: StudyInputs) -> None:
+    """Check everything that can be checked before any work.
+
+    Raises:
+        OpenVimaError: As for `run_study`.
+    """
+    require_extra()
+    load_assets(inputs.assets)
+    for demonstrations, out in plan.data.items():
+        _generate_config(demonstrations, out).resolved_tasks()
+    if plan.trainings:
+        require_torch("training")
+        from openvima.training.building import resolved
+
+        for training in (*plan.initial, *plan.trainings):
+            resolved(training.config)
+    for evaluation in plan.evaluations:
+        if evaluation.run.policy is not None:
+            prepare(evaluation.config)
+
+
+def _claim(out: Path, record: dict[str, Any]) -> None:  # Any: JSON
+    """Note what the folder holds, or check it.
+
+    Raises:
+        ConfigError: It holds something else.
+    """
+    file = out / SETTINGS_FILE
+    if not file.is_file():
+        if not all(is_lock_file(path) for path in out.iterdir()):
+            raise ConfigError(f"{out} is not empty and holds no study; give another --out.")
+        atomic_write_file(file, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+        return
+    try:
+        there = flattened(read_json(file))
+    except (OSError, ValueError, InputFileError) as error:
+        raise ConfigError(f"{file} cannot be read ({error}); give another --out.") from None
+    here = flattened(record)
+    names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+    if names:
+        shown = [f"{n} is {there.get(n)!r} there and {here.get(n)!r} here" for n in names[:_MAX_DIFFERENCES]]
+        more = f"; and {len(names) - _MAX_DIFFERENCES} more" if len(names) > _MAX_DIFFERENCES else ""
+        raise ConfigError(f"{out} holds another study: {'; '.join(shown)}{more}. Give another --out.")
+
+
+class _Runner:
+    """Runs the stages that are not done."""
+
+    def __init__(self, plan: Plan, execution: Execution, report: Report) -> None:
+        self.plan, self.execution, self.report = plan, execution, report
+        self.done = 0
+
+    def run(self) -> None:
+        for demonstrations, out in self.plan.data.items():
+            self._generate(demonstrations, out)
+            self._finish(f"demonstrations in {out.name}")
+        for subset in self.plan.subsets:
+            self._sample(subset)
+            self._finish(f"{subset.out.name}")
+        self._train(self.plan.initial)
+        self._train(self.plan.trainings)
+        for evaluation in self.plan.evaluations:
+            self._evaluate(evaluation)
+            self._finish(f"evaluated {evaluation.run.label}, seed {evaluation.seed}")
+
+    def _finish(self, note: str) -> None:
+        self.done += 1
+        self._say(note)
+
+    def _say(self, note: str) -> None:
+        self.report(self.done, self.plan.num_stages, note)
+
+    def _generate(self, demonstrations: Demonstrations, out: Path) -> None:
+        if is_finished(out):
+            return
+        config = replace(
+            _generate_config(demonstrations, out),
+            workers=self.execution.workers,
+            engine=self.execution.engine,
+            address=self.execution.address,
+        )
+        generate(config, lambda p: self._say(f"generating, {p.done:,} of {p.total:,}"))
+
+    def _sample(self, subset: Subset) -> None:
+        if is_finished(subset.out):
+            return
+        config = SubsetConfig(subset.source, subset.out, seed=subset.seed)
+        sample(config, subset.fraction, report=lambda d, t, _: self._say(f"sampling, {d:,} of {t:,}"))
+
+    def _train(self, trainings: Sequence[Training]) -> None:
+        missing = []
+        for training in trainings:
+            if (training.config.out / COST_FILE).is_file():
+                self._finish(_described(training))
+            else:
+                missing.append(training)
+        if self.execution.is_serial:
+            for training in missing:  # with its progress
+                _train(
+                    training,
+                    lambda d, t, note, of=training: self._say(f"{_described(of)}: {d} of {t}, {note}"),
+                )
+                self._finish(_described(training))
+            return
+        for training, _ in self.execution.imap(train_one, missing):
+            self._finish(_described(training))
+
+    def _evaluate(self, evaluation: Evaluation) -> None:
+        config = replace(
+            evaluation.config,
+            workers=self.execution.workers,
+            engine=self.execution.engine,
+            address=self.execution.address,
+        )
+        name = f"evaluating {evaluation.run.label}, seed {evaluation.seed}"
+        with folder_lock(config.out):
+            evaluate_prepared(prepare(config), lambda d, t, _: self._say(f"{name}: {d:,} of {t:,} episodes"))
+
+
+def train_one(training: Training, count: Callable[[int], None]) -> None:
+    """Run a training in a worker process, possibly on another machine."""
+    _train(training, lambda done, total, note: count(done))
+
+
+def _train(training: Training, report: Report) -> None:
+    """Train, and note the costs, which also says that it is done."""
+    from openvima.policies.checkpoint import load_network
+    from openvima.training import train
+    from openvima.training.costs import logged_costs
+
+    config = training.config
+    train(config, report)
+    network, _ = load_network(config.out)
+    costs = {
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "demonstrations": len(Dataset(config.data)),
+        **logged_costs(config.out),
+    }
+    atomic_write_file(config.out / COST_FILE, json.dumps(costs, indent=1) + "\n")
+
+
+def _described(training: Training) -> str:
+    return f"training {training.run or 'initial weights'}, seed {training.config.seed}"
+
+
+def _generate_config(demonstrations: Demonstrations, out: Path) -> GenerateConfig:
+    return GenerateConfig(
+        out=out,
+        tasks=demonstrations.tasks,
+        episodes=demonstrations.episodes,
+        env_config=demonstrations.env_config,
+    )

@@ -1,0 +1,184 @@
+"""A study as data: a question, a list of runs, how they are evaluated, and published numbers beside."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.errors import ConfigError
+from openvima.report.rate_curves import RateCurve
+from openvima.studies.scales import Scale
+
+Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name. Any: values of any setting
+
+
+@dataclass(frozen=True, slots=True)
+class StudyInputs:
+    """What a study is made from: the scale, and options of the command.
+
+    Args:
+        scale: Sizes.
+        policies: Policies to evaluate, for studies that train none.
+        t5: Source of the T5 weights and tokenizer.
+        assets: Asset pack.
+        checkpoint: A published checkpoint.
+    """
+
+    scale: Scale
+    policies: tuple[str, ...] = ()
+    t5: str | None = None
+    assets: str = "procedural"
+    checkpoint: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Demonstrations:
+    """Demonstrations to generate; runs with equal ones share them.
+
+    Args:
+        tasks: Names of tasks.
+        episodes: Demonstrations of each task.
+        env_config: Assets and task options.
+    """
+
+    tasks: tuple[str, ...]
+    episodes: int
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationSettings:
+    """How runs are evaluated.
+
+    Args:
+        tasks: Names of tasks; each is played at the levels that hold it.
+        levels: Levels.
+        episodes: Episodes of each task, level and seed.
+        ablations: Input ablations.
+        env_config: Assets, task options, prompts, compatibility.
+        plain: Whether to report scores without ablation.
+    """
+
+    tasks: tuple[str, ...]
+    levels: tuple[str, ...]
+    episodes: int
+    ablations: tuple[str, ...] = ()
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG
+    plain: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One training, or one policy that exists, and its evaluation.
+
+    Args:
+        label: Name, unique in the study.
+        x: Value of the quantity that is varied, or its name; by default the label.
+        series: Curve of the figure; empty if there is one only.
+        settings: Training settings that differ from those of the study.
+        data_fraction: Fraction of the demonstrations of each task; each seed draws its own.
+        init: Settings of a training whose weights this one starts from; it is trained once for each seed and
+            shared by all runs with the same.
+        data: Demonstrations, if not those of the study.
+        policy: A policy to evaluate as it is, as `openvima evaluate --policy` takes it; nothing is trained.
+        evaluation: Evaluation, if not that of the study.
+    """
+
+    label: str
+    x: float | str = ""
+    series: str = ""
+    settings: Settings = field(default_factory=dict)
+    data_fraction: float = 1.0
+    init: Settings | None = None
+    data: Demonstrations | None = None
+    policy: str | None = None
+    evaluation: EvaluationSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedPoint:
+    """A published success rate.
+
+    Args:
+        series: Name of the model.
+        x: Value or name on the x axis, as that of runs.
+        level: Level.
+        rate: Success rate, as a fraction.
+        mark: Put behind the number in tables.
+    """
+
+    series: str
+    x: float | str
+    level: str
+    rate: float
+    mark: str = ""
+
+
+def published_points(
+    levels: Iterable[str], curves_of: Callable[[str], Iterable[RateCurve]]
+) -> tuple[PublishedPoint, ...]:
+    """Return the points of published curves, such as those of `openvima.report.published_curves`.
+
+    Args:
+        levels: Levels.
+        curves_of: Curves of a level.
+    """
+    return tuple(
+        PublishedPoint(curve.name, point.x, level, point.rate, point.mark)
+        for level in levels
+        for curve in curves_of(level)
+        for point in curve.points
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """An experiment: several runs that differ in one respect.
+
+    Args:
+        name: Name.
+        question: What it asks, one sentence.
+        quantity: What is varied, with its unit: label of the x axis.
+        runs: The runs, in the order of the table.
+        evaluation: How they are evaluated.
+        data: Demonstrations of the runs that train.
+        settings: Training settings of all runs, over those of the scale.
+        x_axis: What is on the axis: "run", the quantity of the runs; "level"; or "ablation".
+        logarithmic: Whether the x axis is.
+        ticks: Names of values of the quantity, where they are not plain numbers.
+        published: Published numbers to show beside.
+        notes: Sentences for the page: what the numbers do not show.
+
+    Raises:
+        ConfigError: There is no run, two have the same label, or one trains and there are no demonstrations.
+    """
+
+    name: str
+    question: str
+    quantity: str
+    runs: tuple[Run, ...]
+    evaluation: EvaluationSettings
+    data: Demonstrations | None = None
+    settings: Settings = field(default_factory=dict)
+    x_axis: Literal["run", "level", "ablation"] = "run"
+    logarithmic: bool = False
+    ticks: Mapping[float, str] = field(default_factory=dict)
+    published: tuple[PublishedPoint, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        labels = [run.label for run in self.runs]
+        if not labels or len(set(labels)) < len(labels):
+            raise ConfigError(
+                f"study {self.name!r} has runs {labels}; give at least one, all of other labels."
+            )
+        for run in self.runs:
+            if not 0 < run.data_fraction <= 1:
+                raise ConfigError(
+                    f"data_fraction of run {run.label!r} is {run.data_fraction}; it must be above 0, and at "
+                    "most 1."
+                )
+            if run.policy is None and run.data is None and self.data is None:
+                raise ConfigError(
+                    f"run {run.label!r} trains, but has no demonstrations; give the study `data`."
+                )

@@ -1,0 +1,101 @@
+"""Stages of studies: what is shared, seeds, checks before any work."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from openvima.errors import ConfigError
+from openvima.studies import (
+    SCALES,
+    STUDIES,
+    Demonstrations,
+    EvaluationSettings,
+    Run,
+    Study,
+    StudyInputs,
+    make_study,
+    scale_named,
+)
+from openvima.studies.plan import plan_study
+from openvima.studies.runner import check_plan
+
+INPUTS = StudyInputs(scale_named("nano"))
+OUT = Path("/study")
+
+
+def study_of(*runs: Run, **values: object) -> Study:
+    made = Study(
+        "test",
+        "Does it work?",
+        "run",
+        runs,
+        EvaluationSettings(("rotate",), ("L1",), 5),
+        Demonstrations(("rotate",), 10),
+    )
+    return replace(made, **values)
+
+
+def test_fractions_differ_by_seed_and_share_their_source() -> None:
+    study = study_of(Run("all"), Run("tenth", data_fraction=0.1))
+    plan = plan_study(study, INPUTS, OUT, seeds=2)
+    assert list(plan.data.values()) == [OUT / "data/1"]
+    assert [(s.out.name, s.seed) for s in plan.subsets] == [("1-0.1-seed-0", 0), ("1-0.1-seed-1", 1)]
+    assert [t.config.data.name for t in plan.trainings] == ["1", "1", "1-0.1-seed-0", "1-0.1-seed-1"]
+    assert [t.config.seed for t in plan.trainings] == [0, 1, 0, 1]
+    assert [e.config.seed for e in plan.evaluations] == [0, 5, 0, 5]  # episodes of their own
+
+
+def test_pretraining_of_several_runs_is_trained_once_for_each_seed() -> None:
+    init = {"augmentation.inverse_dynamics_prob": 1.0}
+    study = study_of(Run("a", init=init), Run("b", init=init, settings={"schedule.steps": 7}), Run("c"))
+    plan = plan_study(study, INPUTS, OUT, seeds=2)
+    assert [t.config.out for t in plan.initial] == [OUT / f"initial/1/seed-{seed}" for seed in (0, 1)]
+    sources = [t.config.init_from for t in plan.trainings]
+    assert sources == [str(OUT / f"initial/1/seed-{seed}") for seed in (0, 1, 0, 1)] + [None] * 2
+    assert plan.trainings[2].config.schedule.steps == 7
+
+
+def test_policies_that_exist_are_evaluated_once() -> None:
+    plan = plan_study(study_of(Run("oracle", policy="oracle"), data=None), INPUTS, OUT, seeds=3)
+    assert not plan.trainings and len(plan.evaluations) == 1
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_can_be_planned_at_every_scale(name: str, scale: str) -> None:
+    inputs = StudyInputs(scale_named(scale), ("oracle",), "t5-base", "procedural", "checkpoint.ckpt")
+    study = make_study(name, inputs)
+    plan = plan_study(study, inputs, OUT, seeds=2)
+    assert study.name == name
+    assert plan.num_stages > len(study.runs)
+    if scale == "nano":
+        inputs = replace(inputs, t5=None, checkpoint=None)
+        check_plan(plan_study(make_study(name, inputs), inputs, OUT, seeds=2), inputs)
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ((), "at least one"),
+        ((Run("a"), Run("a")), "other labels"),
+        ((Run("a", data_fraction=0.0),), "data_fraction"),
+    ],
+)
+def test_runs_that_cannot_be_are_refused(runs: tuple[Run, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        study_of(*runs)
+
+
+def test_labels_with_the_same_folder_and_no_seed_are_refused() -> None:
+    with pytest.raises(ConfigError, match="same folders"):
+        plan_study(study_of(Run("1 %"), Run("1")), INPUTS, OUT, seeds=1)
+    with pytest.raises(ConfigError, match="seeds is 0"):
+        plan_study(study_of(Run("a")), INPUTS, OUT, seeds=0)
+
+
+def test_a_mistyped_study_gets_a_suggestion() -> None:
+    with pytest.raises(ConfigError, match="data-scaling"):
+        make_study("data-scalin", INPUTS)
