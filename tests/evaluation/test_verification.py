@@ -9,7 +9,7 @@ import pytest
 
 from forge_results import KINDS, forge, is_found
 from openvima.env import EnvConfig
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, OpenVimaError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
 from openvima.evaluation.actions import ACTIONS_NAME, ActionRecorder, ActionReplay
 from openvima.evaluation.rollout import BAD_ACTION, play
@@ -46,6 +46,21 @@ def test_text_prompts_of_all_tasks_are_confirmed(tmp_path):
     evaluate(EvaluationConfig(("random",), levels=("L1",), episodes=1, out=tmp_path, env_config=text))
     found = verify_results(tmp_path)
     assert (found.problems, found.episodes) == ((), 8)
+
+
+def test_task_options_are_replayed_and_those_of_a_stranger_checked(tmp_path):
+    hard = EnvConfig(task_options="difficulty=hard")
+    config = EvaluationConfig(("oracle",), ("twist",), ("L1",), episodes=2, out=tmp_path, env_config=hard)
+    evaluate(config)
+    assert Results.read(tmp_path / "results.json").config["task_options"] == "difficulty=hard"
+    assert verify_results(tmp_path).problems == ()
+    path = tmp_path / "results.json"
+    text = path.read_text()
+    path.write_text(text.replace('"difficulty=hard"', '""'))
+    assert len(verify_results(tmp_path).problems) > 0
+    path.write_text(text.replace("difficulty=hard", "__class__.x=1"))
+    with pytest.raises(OpenVimaError, match="there is no task '__class__'"):
+        verify_results(tmp_path)
 
 
 def test_the_mark_belongs_to_the_results_that_were_confirmed(copy):

@@ -253,7 +253,7 @@ def test_words_and_number_of_comparisons_can_be_chosen() -> None:
         ({"meanings": ["shorter", "darkr"]}, "no meaning 'darkr'. Did you mean 'darker'"),
         ({"meanings": []}, "no meaning ''"),
         ({"num_comparisons": 0}, "num_comparisons is 0; give an integer from 1 to 9"),
-        ({"num_distractors": 4}, "num_distractors is 4"),
+        ({"num_distractors": 7}, "num_distractors is 7"),
         ({"difficulty": "insane"}, "no difficulty 'insane'"),
     ],
 )

@@ -137,7 +137,7 @@ def test_words_can_be_chosen() -> None:
     [
         ({"nouns": ("dax",)}, "nouns holds 'dax'; give at least 2 different words"),
         ({"adjectives": ("a", "a")}, "adjectives holds 'a', 'a'; give at least 1 different"),
-        ({"num_distractors": -1}, "num_distractors is -1; give an integer from 0 to 3"),
+        ({"num_distractors": -1}, "num_distractors is -1; give an integer from 0 to 6"),
     ],
 )
 def test_unfit_options_are_refused(options: dict[str, object], message: str) -> None:

@@ -147,8 +147,8 @@ def test_unfit_words_are_refused(nouns: object, message: str) -> None:
 
 
 def test_other_unfit_options_are_refused() -> None:
-    with pytest.raises(ConfigError, match="num_distractors is 4; give an integer from 0 to 3"):
-        sample_episode(TASK, seed=0, num_distractors=4)
+    with pytest.raises(ConfigError, match="num_distractors is 7; give an integer from 0 to 6"):
+        sample_episode(TASK, seed=0, num_distractors=7)
     with pytest.raises(ConfigError, match="no difficulty 'eas'"):
         sample_episode(TASK, seed=0, difficulty="eas")
 

@@ -184,7 +184,7 @@ def test_the_numbers_of_distractors_can_be_chosen(num_distractors: int, num_pict
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("num_distractors", 4, "num_distractors is 4; give an integer from 0 to 3"),
+        ("num_distractors", 7, "num_distractors is 7; give an integer from 0 to 6"),
         ("num_prompt_distractors", -1, "num_prompt_distractors is -1"),
         ("difficulty", "hardest", "no difficulty 'hardest'. Did you mean 'hard'"),
     ],

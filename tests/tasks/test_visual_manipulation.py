@@ -158,7 +158,7 @@ def test_a_lost_target_is_a_failure() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"num_distractors": 4}, {"num_distractors": -1}, {"difficulty": "Easy!"}]
+    "options", [{"num_distractors": 7}, {"num_distractors": -1}, {"difficulty": "Easy!"}]
 )
 def test_bad_options_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -10,7 +10,7 @@ from openvima.errors import ConfigError, unknown_name
 from openvima.scene import ObjectImage, Placement, Pose
 from openvima.tasks.into_base import APART_M, of_a_third_shape, place_distractors
 from openvima.tasks.novel_words import choose_words
-from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
 from openvima.tasks.table import NO_SCALE, TableSampler
 
 MEANINGS = ("shorter", "taller", "lighter", "darker")
@@ -119,7 +119,7 @@ def place_base_and_pair(
         Base, target, and all other objects, the twin first.
     """
     check_difficulty(difficulty)
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     pool = table.pool
     if len(pool.dragged_objects) < 2:
         raise ConfigError(f"dragged objects are {pool.dragged_objects}; give at least two shapes.")

@@ -19,12 +19,14 @@ from openvima.tasks.frames import (
     goals_between,
     with_frame_slots,
 )
+from openvima.tasks.options import check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
 TEMPLATE = "Follow this motion for {dragged_obj}: {frames}."
 CENTRE = Pose.planar(0.5, 0.0)
 RADIUS_M = 0.19
+CIRCLE_MARGIN_M = 0.1  # of further distractors
 NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
 
 
@@ -34,14 +36,22 @@ NUM_POINTS = 5  # 0.22 m from each other, 0.19 m from the centre
     template=with_frame_slots(TEMPLATE, NUM_FRAMES["easy"]),
     oracle_max_steps=NUM_FRAMES["easy"] - 1,
 )
-def sample(table: TableSampler, *, num_frames: int | None = None, difficulty: str = "easy") -> Problem:
+def sample(
+    table: TableSampler,
+    *,
+    num_frames: int | None = None,
+    num_distractors: int = 1,
+    difficulty: str = "easy",
+) -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
         num_frames: Frames of the motion, 2 … 10; by default that of the difficulty.
+        num_distractors: Distractors on the table, 0 … 6: one in the middle, the others away from the circle.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 frames.
     """
+    check_num_distractors(num_distractors)
     num_frames = checked_num_frames(num_frames, difficulty, high=10)
     appearances = [
         (name, texture) for name in table.pool.dragged_objects for texture in table.pool.dragged_textures
@@ -51,8 +61,17 @@ def sample(table: TableSampler, *, num_frames: int | None = None, difficulty: st
 
     walk = _sample_walk(table, num_frames)
     dragged = _put(table, appearance, walk[0])
-    _put(table, table.choose(other_appearances), CENTRE)
+    if num_distractors:
+        _put(table, table.choose(other_appearances), CENTRE)
     in_frames = _put(table.blank(), table.choose(other_appearances), CENTRE)
+
+    table.place(
+        "distractor",
+        lambda: table.choose(other_appearances),
+        count=max(num_distractors - 1, 0),
+        tries=20 * max(num_distractors, 1),
+        reject=_is_near_circle,
+    )
 
     frames = [(dragged.at(place.moved(dz=dragged.pose.z)),) for place in walk]
     images = frame_images([(*frame, in_frames) for frame in frames])
@@ -75,6 +94,10 @@ def _sample_walk(table: TableSampler, num_places: int) -> list[Pose]:
     steps = (table.choose((-1, 1)) for _ in range(num_places - 1))
     angles = (2 * math.pi * point / NUM_POINTS for point in accumulate(steps, initial=start))
     return [CENTRE.moved(RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle)) for angle in angles]
+
+
+def _is_near_circle(placement: Placement) -> bool:
+    return placement.pose.planar_distance(CENTRE) < RADIUS_M + CIRCLE_MARGIN_M
 
 
 def _put(table: TableSampler, appearance: tuple[str, str], pose: Pose) -> Placement:

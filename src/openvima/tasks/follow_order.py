@@ -21,7 +21,7 @@ from openvima.tasks.frames import (
     goals_between,
     with_frame_slots,
 )
-from openvima.tasks.options import check_count
+from openvima.tasks.options import check_count, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -52,13 +52,13 @@ def sample(
         table: Sampler of the scene.
         num_blocks: Objects to stack, 2 … 4; by default that of the difficulty.
         num_frames: Frames, 2 … 5; by default that of the difficulty.
-        num_distractors: Further objects, 0 … 3.
+        num_distractors: Further objects, 0 … 6.
         difficulty: "easy", "medium" or "hard": 3, 4 or 4 objects in 3, 4 or 5 frames.
     """
     num_frames = checked_num_frames(num_frames, difficulty, high=5)
     num_blocks = NUM_BLOCKS[difficulty] if num_blocks is None else num_blocks
     check_count("num_blocks", num_blocks, low=2, high=4)
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     shape = table.choose(objects)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from openvima.scene import AtPose, DistractorsApart, ObjectImage, Placement, Problem, Prompt, Tolerance
-from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
 from openvima.tasks.table import TableSampler, is_in_the_way
 
 TOLERANCE_M, BOWL_TOLERANCE_M = 0.125, 0.0875
@@ -19,7 +19,7 @@ def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int
     Args:
         difficulty: Default for numbers that are None.
         num_dragged: 1 … 3.
-        num_distractors: 0 … 3.
+        num_distractors: 0 … 6.
 
     Raises:
         ConfigError: An option is invalid.
@@ -28,7 +28,7 @@ def object_counts(difficulty: str, num_dragged: int | None, num_distractors: int
     num_dragged = NUM_DRAGGED[difficulty] if num_dragged is None else num_dragged
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
     check_count("num_dragged", num_dragged, low=1, high=3)
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     return num_dragged, num_distractors
 
 

@@ -21,7 +21,7 @@ from openvima.scene import (
     Prompt,
     Tolerance,
 )
-from openvima.tasks.options import check_difficulty
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -32,25 +32,32 @@ TEMPLATE = (
 TOLERANCE = Tolerance(position_m=0.1)
 NEIGHBOURS = {"north": (-1, 0), "south": (1, 0), "west": (0, -1), "east": (0, 1)}  # steps in (row, column)
 NUM_ROWS = 3
+NUM_MOVED = 2
 NUM_COLUMNS = {"easy": 2, "medium": 3, "hard": 4}
 NUM_EMPTY = {"easy": 1, "medium": 3, "hard": 4}
 
 
 @register_task("manipulate_old_neighbor", family="visual_reasoning", template=TEMPLATE, oracle_max_steps=4)
-def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
+def sample(table: TableSampler, *, num_distractors: int | None = None, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
+        num_distractors: Objects besides the two to move, 0 … 10; by default those of the difficulty. Columns
+            are added as needed.
         difficulty: "easy", "medium" or "hard": 2, 3 or 4 columns with 1, 3 or 4 empty cells.
     """
     check_difficulty(difficulty)
     pool, num_columns = table.pool, NUM_COLUMNS[difficulty]
+    if num_distractors is None:
+        num_distractors = NUM_ROWS * num_columns - NUM_MOVED - NUM_EMPTY[difficulty]
+    check_num_distractors(num_distractors, high=NUM_ROWS * max(NUM_COLUMNS.values()) - NUM_MOVED)
+    num_columns = max(num_columns, -(-(num_distractors + NUM_MOVED) // NUM_ROWS))
     cells = [(row, column) for row in range(NUM_ROWS) for column in range(num_columns)]
     dragged_cell = table.choose(cells)
     direction, neighbour_cell = _choose_neighbour(table, dragged_cell, cells)
     others = [cell for cell in cells if cell not in (dragged_cell, neighbour_cell)]
-    chosen = table.rng.choice(len(others), size=NUM_EMPTY[difficulty], replace=False)
+    chosen = table.rng.choice(len(others), size=len(others) - num_distractors, replace=False)
     empty_cells = {others[index] for index in chosen}
 
     appearances = [(name, texture) for name in pool.dragged_objects for texture in pool.dragged_textures]

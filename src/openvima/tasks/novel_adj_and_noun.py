@@ -51,7 +51,7 @@ def sample(
         nouns: Invented nouns, at least two.
         meanings: Possible meanings: "shorter", "taller", "lighter", "darker", "smaller", "larger".
         num_comparisons: Pairs of objects that illustrate the meaning, 1 … 9.
-        num_distractors: Further objects of other shapes, 0 … 3.
+        num_distractors: Further objects of other shapes, 0 … 6.
         difficulty: "easy"; "medium" and "hard" add an object of another shape with the attribute of the
             twin or of the target.
     """

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from openvima.scene import Problem, Prompt
 from openvima.tasks.into_base import into_base, of_a_third_shape, place_base_and_target, place_distractors
 from openvima.tasks.novel_words import NOUNS, choose_words, gray_image, in_any_order
-from openvima.tasks.options import check_count, textures_by_difficulty
+from openvima.tasks.options import check_num_distractors, textures_by_difficulty
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -39,10 +39,10 @@ def sample(
     Args:
         table: Sampler of the scene.
         nouns: Invented nouns, at least two.
-        num_distractors: Further objects, 0 … 3.
+        num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     noun, base_noun = choose_words(table, "nouns", nouns, count=2)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(

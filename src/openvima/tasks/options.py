@@ -13,6 +13,7 @@ from openvima.tasks.registry import TaskSpec, list_tasks, task_spec
 from openvima.tasks.table import TableSampler
 
 MAX_OPTIONS_TEXT = 1000  # characters
+MAX_DISTRACTORS = 6  # that find a place beside the other objects
 _ENTRY = re.compile(r"(?:([\w-]+)\.)?([^\W\d]\w*)=([^\s,=]+)", re.ASCII)
 _SCALARS: dict[type, str] = {bool: "true or false", int: "an integer", float: "a number", str: "a word"}
 
@@ -38,6 +39,15 @@ def check_count(name: str, count: object, *, high: int, low: int = 0) -> None:
     """
     if isinstance(count, bool) or not isinstance(count, int) or not low <= count <= high:
         raise ConfigError(f"{name} is {count!r}; give an integer from {low} to {high}.")
+
+
+def check_num_distractors(count: object, *, high: int = MAX_DISTRACTORS) -> None:
+    """Check a number of distractors.
+
+    Raises:
+        ConfigError: It is not in 0 … `high`.
+    """
+    check_count("num_distractors", count, high=high)
 
 
 def check_fraction(name: str, value: object) -> None:

@@ -25,6 +25,7 @@ def sample(
     table: TableSampler,
     *,
     num_objects: int | None = None,
+    num_distractors: int | None = None,
     conflict_rate: float = CONFLICT_RATE,
     distractor_textures: str = "all",
     restore_distractor: bool = False,
@@ -35,6 +36,7 @@ def sample(
     Args:
         table: Sampler of the scene.
         num_objects: Objects to move, 1 … 3; by default 1, 2 or 3 with probabilities 0.4, 0.4 and 0.2.
+        num_distractors: Distractors, 0 … 6; by default one for a single object, else none.
         conflict_rate: Probability that the distractor is on the target of a single object.
         distractor_textures: "all" 49 light textures, as in the benchmark at every level, or "pool": only
             those of the level.
@@ -46,6 +48,7 @@ def sample(
     arrangement = sample_arrangement(
         table,
         num_objects=num_objects,
+        num_distractors=num_distractors,
         conflict_rate=conflict_rate,
         distractor_textures=distractor_textures,
         difficulty=difficulty,

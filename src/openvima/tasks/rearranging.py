@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from openvima.catalog import TEXTURE_SETS
 from openvima.errors import ConfigError, SamplingError, unknown_name
 from openvima.scene import AtPose, Placement, SceneImage, Tolerance
-from openvima.tasks.options import check_count, check_difficulty, check_fraction
+from openvima.tasks.options import check_count, check_difficulty, check_fraction, check_num_distractors
 from openvima.tasks.table import Reject, TableSampler, is_in_the_way
 
 TOLERANCE = Tolerance(position_m=0.1)
@@ -25,12 +25,14 @@ class Arrangement:
         targets: The same objects at their targets.
         distractor: The distractor; only with a single object.
         parking: The distractor at a free place, if it is on the target.
+        more_distractors: Distractors beyond the published number, away from all targets.
     """
 
     starts: tuple[Placement, ...]
     targets: tuple[Placement, ...]
     distractor: Placement | None = None
     parking: Placement | None = None
+    more_distractors: tuple[Placement, ...] = ()
 
     @property
     def goal_image(self) -> SceneImage:
@@ -49,14 +51,16 @@ class Arrangement:
 
     @property
     def distractor_ids(self) -> tuple[int, ...]:
-        """Id of the distractor, if there is one."""
-        return () if self.distractor is None else (self.distractor.id,)
+        """Ids of all distractors."""
+        first = () if self.distractor is None else (self.distractor,)
+        return tuple(distractor.id for distractor in (*first, *self.more_distractors))
 
 
 def sample_arrangement(
     table: TableSampler,
     *,
     num_objects: int | None,
+    num_distractors: int | None,
     conflict_rate: float,
     distractor_textures: str,
     difficulty: str,
@@ -66,7 +70,8 @@ def sample_arrangement(
     Args:
         table: Sampler of the scene.
         num_objects: Objects to move, 1 … 3; None draws the number.
-        conflict_rate: Probability that the distractor is on the target.
+        num_distractors: Distractors, 0 … 6; None: one for a single object, else none.
+        conflict_rate: Probability that the distractor of a single object is on the target.
         distractor_textures: "all", or "pool": those of the objects to move.
         difficulty: Checked, without effect.
 
@@ -85,6 +90,9 @@ def sample_arrangement(
     if num_objects is None:
         num_objects = 1 + int(table.rng.choice(MAX_OBJECTS, p=NUM_OBJECTS_WEIGHTS))
     check_count("num_objects", num_objects, low=1, high=MAX_OBJECTS)
+    if num_distractors is None:
+        num_distractors = int(num_objects == 1)
+    check_num_distractors(num_distractors)
 
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
     targets = table.place(
@@ -98,20 +106,30 @@ def sample_arrangement(
         table.move(target, table.find_place("start", target, reject=in_the_way))
         for target in reversed(targets)
     ][::-1]
-    if num_objects > 1:
-        return Arrangement(tuple(starts), tuple(targets))
-    appearance = (
-        table.choose([name for name in objects if name != targets[0].object]),
-        table.choose(textures_of[distractor_textures]),
-    )
-    if table.rng.random() < conflict_rate:
-        distractor, parking = _on_target(table, appearance, starts[0], targets[0])
-    else:
-        distractor = table.place_one(
-            "distractor", lambda: appearance, tries=_TRIES, apart_m=_APART_M, reject=in_the_way
+    moved = {target.object for target in targets}
+    distractors: list[Placement] = []
+    parking = None
+    for n in range(num_distractors):
+        appearance = (
+            table.choose([name for name in objects if name not in moved]),
+            table.choose(textures_of[distractor_textures]),
         )
-        parking = None
-    return Arrangement(tuple(starts), tuple(targets), distractor, parking)
+        if n == 0 and num_objects == 1 and table.rng.random() < conflict_rate:
+            distractor, parking = _on_target(table, appearance, starts[0], targets[0])
+            in_the_way = _in_the_way_of([*targets, parking], table)
+        else:
+            distractor = table.place_one(
+                "distractor",
+                lambda drawn=appearance: drawn,
+                tries=_TRIES,
+                apart_m=_APART_M,
+                reject=in_the_way,
+            )
+        distractors.append(distractor)
+    if num_objects > 1:
+        return Arrangement(tuple(starts), tuple(targets), more_distractors=tuple(distractors))
+    first = distractors[0] if distractors else None
+    return Arrangement(tuple(starts), tuple(targets), first, parking, tuple(distractors[1:]))
 
 
 def _on_target(

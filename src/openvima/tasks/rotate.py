@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Rotate".
 from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, ObjectImage, Problem, Prompt
-from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.rotation import ANGLES_DEG, check_angles, check_asymmetric, rotation_goal
 from openvima.tasks.table import TableSampler
@@ -43,7 +43,7 @@ def sample(
     """
     check_difficulty(difficulty)
     num_distractors = NUM_DISTRACTORS[difficulty] if num_distractors is None else num_distractors
-    check_count("num_distractors", num_distractors, high=6)
+    check_num_distractors(num_distractors)
     check_angles(angles_deg)
     check_asymmetric(table.pool)
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures

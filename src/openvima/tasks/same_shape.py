@@ -32,7 +32,7 @@ def sample(
     Args:
         table: Sampler of the scene.
         num_dragged: Objects to put into the base, 1 … 3; by default that of the difficulty.
-        num_distractors: Distractors, 0 … 3; by default that of the difficulty.
+        num_distractors: Distractors, 0 … 6; by default that of the difficulty.
         after_bowl: Whether the bowl's tolerance applies to every base; see `gathering_problem`.
         difficulty: "easy", "medium" or "hard": 2 objects and 1 distractor, 2 and 2, or 3 and 3.
     """

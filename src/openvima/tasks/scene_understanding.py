@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Scene understanding".
 
 from openvima.scene import Placement, Problem, Prompt, SceneImage
 from openvima.tasks.into_base import APART_M, into_base, place_base_and_target
-from openvima.tasks.options import check_count, textures_by_difficulty
+from openvima.tasks.options import check_count, check_num_distractors, textures_by_difficulty
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -30,11 +30,11 @@ def sample(
 
     Args:
         table: Sampler of the scene.
-        num_distractors: Distractors on the table, 0 … 3.
+        num_distractors: Distractors on the table, 0 … 6.
         num_prompt_distractors: Distractors in the scene image, 0 … 3.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     check_count("num_prompt_distractors", num_prompt_distractors, high=3)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     textures = (*dragged_textures, *base_textures)

@@ -16,7 +16,7 @@ from openvima.scene import (
     ZoneKeptClear,
 )
 from openvima.tasks.blocks import scattered_blocks
-from openvima.tasks.options import check_difficulty
+from openvima.tasks.options import check_difficulty, check_num_distractors
 from openvima.tasks.table import TableSampler
 
 Corner = tuple[float, float]
@@ -34,12 +34,14 @@ class Roles:
     """Objects of a sweeping task.
 
     Args:
-        num_swept: Number of blocks to sweep; there are as many distractors.
+        num_swept: Number of blocks to sweep.
+        num_distractors: Number of distractors.
         swept_texture, bounds_texture, line_texture, distractor_texture: Their textures.
         swept_corner, distractor_corner: Lower corners of the blocks' squares, x and y in metres.
     """
 
     num_swept: int
+    num_distractors: int
     swept_texture: str
     bounds_texture: str
     line_texture: str
@@ -48,17 +50,19 @@ class Roles:
     distractor_corner: Corner
 
 
-def sample_roles(table: TableSampler, difficulty: str) -> Roles:
+def sample_roles(table: TableSampler, difficulty: str, num_distractors: int | None = None) -> Roles:
     """Draw the number of blocks, the textures and the sides.
 
     Args:
         table: Sampler of the scene.
         difficulty: "easy", "medium" or "hard": increasing probability of two or three blocks.
+        num_distractors: Distractors, 0 … 6; None: as many as blocks to sweep.
 
     Raises:
-        ConfigError: There is no such difficulty.
+        ConfigError: There is no such difficulty, or the number is out of range.
     """
     check_difficulty(difficulty)
+    check_num_distractors(0 if num_distractors is None else num_distractors)
     rng, pool = table.rng, table.pool
     num_swept = 1 + int(rng.choice(3, p=NUM_SWEPT_WEIGHTS[difficulty]))
     swept = table.choose(pool.dragged_textures)
@@ -66,7 +70,8 @@ def sample_roles(table: TableSampler, difficulty: str) -> Roles:
     line = table.choose([texture for texture in pool.base_textures if texture != bounds])
     corners = CORNERS if rng.random() < 0.5 else CORNERS[::-1]
     distractor = table.choose([texture for texture in pool.dragged_textures if texture != swept])
-    return Roles(num_swept, swept, bounds, line, distractor, *corners)
+    num_distractors = num_swept if num_distractors is None else num_distractors
+    return Roles(num_swept, num_distractors, swept, bounds, line, distractor, *corners)
 
 
 def place_flat(
@@ -114,13 +119,15 @@ def sweep_problem(
         SamplingError: No valid group of blocks was found.
     """
 
-    def scatter(texture: str, corner: Corner, spread_m: float) -> list[Placement]:
-        return scattered_blocks(
-            table, texture, corner=corner, spread_m=spread_m, count=roles.num_swept, outside=zone
-        )
+    def scatter(texture: str, corner: Corner, spread_m: float, count: int) -> list[Placement]:
+        return scattered_blocks(table, texture, corner=corner, spread_m=spread_m, count=count, outside=zone)
 
-    swept = scatter(roles.swept_texture, roles.swept_corner, SWEPT_SPREAD_M)
-    distractors = scatter(roles.distractor_texture, roles.distractor_corner, distractor_spread_m)
+    if roles.num_distractors > len(NUMBER_WORDS):  # more than published find no place in a small square
+        distractor_spread_m = SWEPT_SPREAD_M
+    swept = scatter(roles.swept_texture, roles.swept_corner, SWEPT_SPREAD_M, roles.num_swept)
+    distractors = scatter(
+        roles.distractor_texture, roles.distractor_corner, distractor_spread_m, roles.num_distractors
+    )
     words = ("any", *NUMBER_WORDS[: roles.num_swept], "all")
     word = table.choose(words)
     ids = tuple(block.id for block in swept)

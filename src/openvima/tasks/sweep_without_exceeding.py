@@ -27,14 +27,15 @@ DISTRACTOR_SPREAD_M = 0.09
     end_effector="spatula",
     oracle_max_steps=8,
 )
-def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
+def sample(table: TableSampler, *, num_distractors: int | None = None, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
+        num_distractors: Blocks of another texture, 0 … 6; by default as many as blocks to sweep.
         difficulty: "easy", "medium" or "hard": more and more often two or three blocks.
     """
-    roles = sample_roles(table, difficulty)
+    roles = sample_roles(table, difficulty, num_distractors)
     bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
     low, high = (AREA_X + (fraction - 0.5) * bounds.size[0] for fraction in LINE_RANGE)
     line = place_flat(table, "line", roles.line_texture, x=table.rng.uniform(low, high), scale=LINE_SCALE)

@@ -28,15 +28,16 @@ DISTRACTOR_SPREAD_M = 0.18
     end_effector="spatula",
     oracle_max_steps=14,
 )
-def sample(table: TableSampler, *, difficulty: str = "easy") -> Problem:
+def sample(table: TableSampler, *, num_distractors: int | None = None, difficulty: str = "easy") -> Problem:
     """Sample one problem.
 
     Args:
         table: Sampler of the scene.
+        num_distractors: Blocks of another texture, 0 … 6; by default as many as blocks to sweep.
         difficulty: "easy": the line leaves gaps on both sides of the mouth; "medium" and "hard": it is
             wider than the mouth, and two or three blocks are more frequent.
     """
-    roles = sample_roles(table, difficulty)
+    roles = sample_roles(table, difficulty, num_distractors)
     bounds = place_flat(table, table.pool.base_objects[0], roles.bounds_texture, x=AREA_X, scale=AREA_SCALE)
     line = place_flat(table, "line", roles.line_texture, x=LINE_X, scale=LINE_SCALE[difficulty])
     return sweep_problem(

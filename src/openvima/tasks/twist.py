@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 
 from openvima.scene import DistractorsApart, Placement, Pose, Problem, Prompt, SceneImage
-from openvima.tasks.options import check_count, check_difficulty
+from openvima.tasks.options import check_count, check_difficulty, check_num_distractors
 from openvima.tasks.registry import register_task
 from openvima.tasks.rotation import (
     ANGLES_DEG,
@@ -52,6 +52,7 @@ def sample(
     angles_deg: Sequence[float] = ANGLES_DEG,
     num_examples: int = NUM_EXAMPLES,
     num_objects: int | None = None,
+    num_distractors: int | None = None,
     difficulty: str = "easy",
 ) -> Problem:
     """Sample one problem.
@@ -62,6 +63,7 @@ def sample(
         num_examples: Image pairs in the prompt, 1 … 6.
         num_objects: Objects on the table, 2 … 6; by default that of the difficulty. At least one is a
             target and at least one a distractor.
+        num_distractors: Distractors in place of those, 0 … 6.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects.
     """
     check_difficulty(difficulty)
@@ -73,7 +75,9 @@ def sample(
     objects, textures = table.pool.dragged_objects, table.pool.dragged_textures
 
     num_targets = int(table.rng.integers(1, num_objects))
-    num_distractors = num_objects - num_targets
+    if num_distractors is None:
+        num_distractors = num_objects - num_targets
+    check_num_distractors(num_distractors)
     angle_deg, texture = table.choose(angles_deg), table.choose(textures)
     others = [other for other in textures if other != texture]
     targets = table.place(

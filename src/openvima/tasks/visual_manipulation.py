@@ -9,7 +9,7 @@ Source:   VIMA paper, task list of the appendix, "Simple object manipulation".
 
 from openvima.scene import ObjectImage, Problem, Prompt
 from openvima.tasks.into_base import into_base, place_base_and_target, place_distractors
-from openvima.tasks.options import check_count, textures_by_difficulty
+from openvima.tasks.options import check_num_distractors, textures_by_difficulty
 from openvima.tasks.registry import register_task
 from openvima.tasks.table import TableSampler
 
@@ -28,10 +28,10 @@ def sample(table: TableSampler, *, num_distractors: int = 1, difficulty: str = "
 
     Args:
         table: Sampler of the scene.
-        num_distractors: Further objects, 0 … 3.
+        num_distractors: Further objects, 0 … 6.
         difficulty: "easy", or "medium" and "hard", which mix and swap the textures of the two roles.
     """
-    check_count("num_distractors", num_distractors, high=3)
+    check_num_distractors(num_distractors)
     dragged_textures, base_textures = textures_by_difficulty(table, difficulty)
     base, target = place_base_and_target(
         table, dragged_textures=dragged_textures, base_textures=base_textures

@@ -1,0 +1,118 @@
+"""Task options as text, and distractors in every task that has some."""
+
+import pytest
+
+from openvima.env.config import EnvConfig
+from openvima.errors import ConfigError, UnknownTaskError
+from openvima.scene import DistractorsApart, ZoneKeptClear
+from openvima.tasks import list_tasks, sample_episode, task_spec
+from openvima.tasks.options import MAX_DISTRACTORS, TaskOptions
+from openvima.tasks.sampling import check_task_options
+
+WITH_DISTRACTORS = [task for task in list_tasks() if "num_distractors" in task_spec(task).options]
+UNCHECKED = ("follow_motion", "follow_order")  # their distractors may be anywhere
+
+
+def test_a_specific_option_overrides_a_general_one() -> None:
+    options = TaskOptions.parse(" rotate.num_distractors=2,num_distractors=6 ")
+    assert str(options) == "num_distractors=6,rotate.num_distractors=2"
+    assert options.of(task_spec("rotate")) == {"num_distractors": 2}
+    assert options.of(task_spec("novel_noun")) == {"num_distractors": 6}
+    assert options.of(task_spec("pick_in_order_then_restore")) == {}
+    assert TaskOptions.parse(str(options)) == options
+
+
+def test_settings_keep_options_in_one_spelling_and_record_them_only_if_there_are_any() -> None:
+    settings = EnvConfig(task_options="twist.num_objects=4, difficulty=hard")
+    assert settings == EnvConfig(task_options="difficulty=hard,twist.num_objects=4,")
+    assert settings.record()["task_options"] == "difficulty=hard,twist.num_objects=4"
+    assert EnvConfig.from_record(settings.record()) == settings
+    assert "task_options" not in EnvConfig().record()
+    assert EnvConfig.from_record({"difficulty": "easy"}) == EnvConfig()
+    with pytest.raises(ConfigError, match="the recorded difficulty is 'hard', which now is a task option"):
+        EnvConfig.from_record({"difficulty": "hard"})
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"),
+    [
+        ("rotate.angles_deg=30+60", (30.0, 60.0)),
+        ("rearrange.conflict_rate=1", 1.0),
+        ("same_shape.after_bowl=True", True),
+        ("pick_in_order_then_restore.same_bases=false", False),
+        ("novel_noun.nouns=dax+wug", ("dax", "wug")),
+        ("rearrange.distractor_textures=pool", "pool"),
+        ("rotate.num_distractors=3", 3),
+    ],
+)
+def test_values_have_the_type_of_the_option(entry: str, value: object) -> None:
+    (found,) = TaskOptions.parse(entry).of(task_spec(entry.partition(".")[0])).values()
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("num_distractors", r"'num_distractors' is not \[TASK.\]NAME=VALUE"),
+        ("a=1\x1b[2J", "is not"),
+        ("a=1,a=2", "a is given twice"),
+        ("a=" + "1" * 1000, "has 1002 characters; at most 1000"),
+        (7, "task_options is 7; give text"),
+    ],
+)
+def test_text_of_another_form_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        EnvConfig(task_options=text)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("angle=3", "there is no task option 'angle'"),
+        ("num_comparisons=3", "there is no option of rotate, twist: 'num_comparisons'"),
+        ("rotate.angle=3", "there is no option of task 'rotate': 'angle'. Did you mean 'angles_deg'"),
+        ("novel_adj.num_comparisons=3", "this run has no novel_adj; its tasks are rotate, twist"),
+        ("num_distractors=two", "option num_distractors of task 'rotate' is 'two'; give an integer"),
+        ("num_distractors=1.5", "is '1.5'; give an integer"),
+        ("angles_deg=30+x", "is '30.x'; give a number, or several with . between them"),
+        ("angles_deg=nan", "give a number"),
+        ("num_distractors=7", "option of 'rotate': num_distractors is 7; give an integer from 0 to 6"),
+        ("twist.num_objects=1", "option of 'twist': num_objects is 1; give an integer from 2 to 6"),
+        ("difficulty=harder", "no difficulty 'harder'. Did you mean 'hard'"),
+    ],
+)
+def test_an_option_that_does_not_fit_the_run_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_task_options(("rotate", "twist"), text)
+
+
+def test_an_unknown_task_is_suggested() -> None:
+    with pytest.raises(UnknownTaskError, match="Did you mean 'rotate'"):
+        check_task_options(("rotate",), "rotat.difficulty=hard")
+
+
+def test_the_tasks_without_the_option_are_those_without_distractors() -> None:
+    assert set(list_tasks()) - set(WITH_DISTRACTORS) == {"pick_in_order_then_restore"}
+
+
+@pytest.mark.parametrize("task", WITH_DISTRACTORS)
+def test_every_task_takes_up_to_six_distractors(task: str) -> None:
+    level = task_spec(task).levels[-1]
+    none, most = (
+        sample_episode(task, level=level, seed=1, num_distractors=count).problem
+        for count in (0, MAX_DISTRACTORS)
+    )
+    assert most.goals
+    assert len(most.scene.placements) - len(none.scene.placements) == MAX_DISTRACTORS
+    (fewer,), (more,) = (
+        [
+            constraint.object_ids
+            for constraint in problem.constraints
+            if isinstance(constraint, DistractorsApart | ZoneKeptClear)
+        ]
+        or [()]
+        for problem in (none, most)
+    )
+    assert len(more) - len(fewer) == (0 if task in UNCHECKED else MAX_DISTRACTORS)
