@@ -61,7 +61,7 @@ def rewritten(prompt: Prompt, scene: Scene, prompts: str, rng: np.random.Generat
     nouns = _nouns({name: shown.get(name) for name, _ in prompt.images}, prompts, rng)
     return replace(
         prompt,
-        text=_with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns}),
+        text=with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns}),
         images=tuple((name, fill) for name, fill in prompt.images if name not in nouns),
         is_ambiguous=any(_is_ambiguous(shown[n], noun, shown.values(), scene) for n, noun in nouns.items()),
     )
@@ -90,8 +90,27 @@ def described(prompt: RenderedPrompt, prompts: str) -> RenderedPrompt:
         if len(record.object) + len(record.texture) > _MAX_NAMES:
             raise PromptError(f"image {echo(name)} has names of over {_MAX_NAMES} characters; shorten them.")
     nouns = _nouns({name: shown.get(name) for name in records}, prompts, rng)
-    text = _with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns})
+    text = with_phrases(prompt.text, {name: _description(shown[name], nouns[name]) for name in nouns})
     return RenderedPrompt(text, {name: image for name, image in prompt.images.items() if name not in nouns})
+
+
+def image_descriptions(prompt: RenderedPrompt) -> dict[str, str]:
+    """Return the description of the object in each object image by placeholder, where there is one."""
+    found = {
+        name: description_of(image.objects[0])
+        for name, image in prompt.images.items()
+        if image.kind == "object" and image.objects
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def description_of(record: ObjectRecord) -> str:
+    """Return texture and name of an object, such as "red swirl letter A".
+
+    Empty for names that no prompt can hold: those of over 200 characters, or with braces.
+    """
+    text = _description(record, record.object)
+    return text if len(text) <= _MAX_NAMES and not {"{", "}"} & set(text) else ""
 
 
 def _nouns(
@@ -132,8 +151,13 @@ def _is_ambiguous(image: Placement, noun: str, shown: Iterable[Placement], scene
     return any(differs(other, True) for other in rivals) or any(differs(other, False) for other in shown)
 
 
-def _with_phrases(text: str, phrases: Mapping[str, str]) -> str:
-    """Put phrases in place of placeholders, each with the article that its sentence needs."""
+def with_phrases(text: str, phrases: Mapping[str, str]) -> str:
+    """Put phrases in place of placeholders, each with the article that its sentence needs.
+
+    Example:
+        >>> with_phrases("Put any {a} into the {b}.", {"a": "red cross", "b": "blue bowl"})
+        'Put any red cross into the blue bowl.'
+    """
     result = ""
     for number, piece in enumerate(PLACEHOLDER.split(text)):
         if number % 2 == 0:

@@ -180,6 +180,8 @@ class AugmentationConfig:
             only some of several comparisons.
         distractor_prob: Probability of inserting up to three distractors from another demonstration, in tasks
             whose prompts allow it.
+        text_description_prob: Probability for each object image of a task's prompt of the text "red swirl
+            letter A" in its place.
     """
 
     false_positive_prob: Probability = 0.05
@@ -188,6 +190,7 @@ class AugmentationConfig:
     rename_objects_prob: Probability = 0.0
     shuffle_sentences_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
+    text_description_prob: Probability = 0.0
 
 
 @dataclass(frozen=True, slots=True)

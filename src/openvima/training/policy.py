@@ -131,11 +131,18 @@ class _Stages:
         caches, config, learner = self._caches, self.config, self.learner
         if isinstance(learner, PolicyLearner):
             prob = config.augmentation.inverse_dynamics_prob
-            check_words(caches[0], learner.processor)
+            describes = config.augmentation.text_description_prob > 0
+            check_words(caches[0], learner.processor, describes=describes)
             if prob:
                 learner.processor.tokenizer.encode(MOTION_TEXT.format(frames=""))
             for cache in caches:
-                check_lengths(cache, learner.network, learner.processor, inverse_dynamics_prob=prob)
+                check_lengths(
+                    cache,
+                    learner.network,
+                    learner.processor,
+                    inverse_dynamics_prob=prob,
+                    describes=describes,
+                )
             if freezes_crops(learner.network, config):
                 freeze_crops(learner, caches)
         if config.runtime.compile:

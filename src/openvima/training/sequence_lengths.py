@@ -13,13 +13,19 @@ from openvima.policies.nn.decoder import MAX_POSITIONS, MAX_PROMPT_POSITIONS
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.processor import Processor
 from openvima.render.camera import VIEWS
+from openvima.training.augmentation.describe_objects import with_descriptions
 from openvima.training.augmentation.inverse_dynamics import motion_text, with_motion_prompt
 
 MAX_READ = 256  # of those that may be too long the longest are checked
 
 
 def check_lengths(
-    cache: ObjectCache, network: PolicyNetwork, processor: Processor, *, inverse_dynamics_prob: float = 0.0
+    cache: ObjectCache,
+    network: PolicyNetwork,
+    processor: Processor,
+    *,
+    inverse_dynamics_prob: float = 0.0,
+    describes: bool = False,
 ) -> None:
     """Run the network on the longest demonstrations, if they may be too long.
 
@@ -28,6 +34,7 @@ def check_lengths(
         network: The network; it is left in evaluation mode.
         processor: Its processor.
         inverse_dynamics_prob: Probability of inverse dynamics.
+        describes: Whether descriptions take the place of object images.
 
     Raises:
         DatasetError: A demonstration has more tokens than the network takes.
@@ -39,15 +46,19 @@ def check_lengths(
         *([False] if inverse_dynamics_prob < 1 else []),
         *([True] if inverse_dynamics_prob else []),
     ]:
-        prompt, whole = _upper_bounds(cache, processor, is_motion)
+        prompt, whole = _upper_bounds(cache, processor, is_motion, describes)
         excess = np.maximum(prompt / MAX_PROMPT_POSITIONS, whole / MAX_POSITIONS)
         longest = np.argsort(-excess, kind="stable")[:MAX_READ]
         for row in longest[excess[longest] > 1]:
             episode = cache[int(row)]
             _forward(network, processor, with_motion_prompt(episode) if is_motion else episode, is_motion)
+            if describes and not is_motion:  # longer than any image
+                _forward(network, processor, with_descriptions(episode, 1.0, np.random.default_rng()), False)
 
 
-def _upper_bounds(cache: ObjectCache, processor: Processor, is_motion: bool) -> tuple[np.ndarray, np.ndarray]:
+def _upper_bounds(
+    cache: ObjectCache, processor: Processor, is_motion: bool, describes: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Return bounds on the positions of each prompt, and of prompt and history together, shape (N,)."""
     steps, (in_prompt, in_view) = cache.lengths()[:, 0], cache.widths().T
     texts = [motion_text(1)] if is_motion else cache.texts()
@@ -58,9 +69,11 @@ def _upper_bounds(cache: ObjectCache, processor: Processor, is_motion: bool) -> 
     if is_motion:
         images = (steps + 1) * _tokens_of(in_view, processor)
     else:
-        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * _tokens_of(
-            in_prompt, processor
-        )
+        described = cache.descriptions() if describes else ()
+        # A description comes with an article, a colon or an ending.
+        longest = max((len(processor.tokenizer.encode(text)) + 3 for text in described), default=0)
+        per_image = np.maximum(_tokens_of(in_prompt, processor), longest)
+        images = max(sum(isinstance(p, int) for p in text) for text in pieces) * per_image
     prompt = words + images + 1  # end of prompt
     return prompt, prompt + 1 + steps * (_tokens_of(in_view + len(VIEWS), processor) + 1 + ACTION_WIDTH)
 

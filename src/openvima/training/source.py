@@ -14,6 +14,7 @@ from openvima.errors import ConfigError, DatasetError, unknown_name
 from openvima.perception.preprocessing import split_prompt
 from openvima.policies.processor import Processor
 from openvima.tasks.registry import list_tasks
+from openvima.training.augmentation.describe_objects import text_of
 from openvima.training.augmentation.distractor_insertion import allows_distractors
 from openvima.training.dataset import Example, StoredEpisode
 from openvima.training.hash_split import split_hashes
@@ -186,13 +187,18 @@ def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource
     return ExampleSource(detected, source.rows, bases, detected.lengths()[source.rows])
 
 
-def check_words(cache: ObjectCache, processor: Processor) -> None:
+def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = False) -> None:
     """Check before training that T5 has the words of every prompt; other vocabularies are built of them.
+
+    Args:
+        cache: All demonstrations.
+        processor: It has the tokenizer.
+        describes: Whether descriptions take the place of object images.
 
     Raises:
         PromptError: A prompt has a word that T5 lacks.
     """
-    for text in cache.texts():
+    for text in (*cache.texts(), *(map(text_of, cache.descriptions()) if describes else ())):
         for piece in split_prompt(text):
             if isinstance(piece, str):
                 processor.tokenizer.encode(piece)

@@ -76,9 +76,9 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     one, two = Boxes("clumsy-1", partial(make, 1)), Boxes("clumsy-2", partial(make, 2))
     caches = [open_object_cache(dataset, boxes=boxes) for boxes in (None, one, two)]
     assert [cache.folder.name for cache in caches] == [
-        "objects-v5",
-        "objects-v5-clumsy-1",
-        "objects-v5-clumsy-2",
+        "objects-v6",
+        "objects-v6-clumsy-1",
+        "objects-v6-clumsy-2",
     ]
     assert made == [1, 2]  # once, for all shards
     reopened = open_object_cache(dataset, boxes=two)
@@ -114,7 +114,7 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
 
     with pytest.raises(WorkerError, match="enough"):
         open_object_cache(dataset, boxes=Boxes("clumsy-1", Tiring))
-    folder = copy / "object_cache" / "objects-v5-clumsy-1"
+    folder = copy / "object_cache" / "objects-v6-clumsy-1"
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.cache")}
     assert 1 <= len(before) <= 5
     cache = open_object_cache(dataset, boxes=CLUMSY)
@@ -150,7 +150,7 @@ def test_verifying_compares_what_does_not_depend_on_the_detector(copy: Path) -> 
     write_cache_file(path, changed, "objects", CacheFile(path).source, "clumsy-1")
     (problem,) = verify(copy).problems
     assert "it differs from the demonstration" in problem.cause
-    assert problem.file.endswith("objects-v5-clumsy-1/rotate-train-00000.cache")
+    assert problem.file.endswith("objects-v6-clumsy-1/rotate-train-00000.cache")
 
 
 def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,6 +158,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     assert main(words) == 0
     (folder,) = (copy / "object_cache").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
-    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v5-"))) == 10
+    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v6-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2
     assert "whole frames have none" in capsys.readouterr().err

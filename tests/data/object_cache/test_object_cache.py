@@ -206,11 +206,19 @@ def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path, fiel
         CacheFile(path)
 
 
+def test_a_description_that_is_not_there_is_damage(demos: Path) -> None:
+    file = CacheFile(next(iter(sorted(open_object_cache(Dataset(demos)).folder.iterdir()))))
+    count = len(file.descriptions)
+    assert file._descriptions_of(0, "Put {a} on {b}.", [0, count - 1]) == {"b": file.descriptions[-1]}
+    with pytest.raises(ShardError, match="counts more descriptions"):
+        file._descriptions_of(0, "Put {a} on {b}.", [0, count])
+
+
 def test_files_of_another_version_are_named_and_made_anew(copy: Path, monkeypatch) -> None:
     monkeypatch.setattr(cache_file, "CACHE_VERSION", 3)
     path = next(open_object_cache(Dataset(copy)).folder.iterdir())
     monkeypatch.undo()
-    with pytest.raises(ShardError, match=r"of version 3, not 5\)\. .*`openvima data preprocess` makes it"):
+    with pytest.raises(ShardError, match=r"of version 3, not 6\)\. .*`openvima data preprocess` makes it"):
         CacheFile(path)
     with pytest.raises(DatasetError, match=r"lacks 6 shards, .*`openvima data preprocess .*` writes them"):
         ObjectCache(Dataset(copy))

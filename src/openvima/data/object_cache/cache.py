@@ -128,6 +128,10 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         """Return the different prompts, with their placeholders."""
         return {text for file in self._files.values() for text in file.texts()}
 
+    def descriptions(self) -> set[str]:
+        """Return the different descriptions of object images."""
+        return {text for file in self._files.values() for text in file.descriptions} - {""}
+
     def _gathered(self, *names: str) -> np.ndarray:
         """Read columns of the indices of all files, and put them into the order of the episodes."""
         of_file = {

@@ -1,7 +1,7 @@
 """One file of the object cache: a head, and one record per episode, memory-mapped.
 
     preamble   PREAMBLE
-    head       JSON; the index, an `Entry` per episode; the different prompt texts
+    head       JSON, with the different descriptions; the index, an `Entry` per episode; the different prompts
     records    tables of `OBJECT`, `STEP` and `PROMPT_IMAGE`, then the images; each at a multiple of 64 bytes
 
 The head has a checksum, compared when the file is opened; the index holds those of each record, compared at
@@ -12,7 +12,7 @@ contiguous bytes.
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +30,11 @@ from openvima.perception.preprocessing import (
     InputKind,
     ObjectTable,
     PreprocessedPrompt,
+    image_names,
 )
 from openvima.scene import ACTION_SHAPES
 
-CACHE_VERSION = 5  # grows whenever the same demonstration gives another record
+CACHE_VERSION = 6  # grows whenever the same demonstration gives another record
 SUFFIX = ".cache"
 _ALIGNMENT = 64
 _MAGIC = b"ovcache\n"
@@ -56,7 +57,7 @@ STEP = np.dtype(
     ],
     align=True,
 )
-PROMPT_IMAGE = np.dtype([("num_objects", "<i2"), ("is_scene", "?")], align=True)
+PROMPT_IMAGE = np.dtype([("description", "<u4"), ("num_objects", "<i2"), ("is_scene", "?")], align=True)
 
 
 class Entry(NamedTuple):
@@ -124,7 +125,9 @@ def write_cache_file(
         boxes: Name of the extractor of the objects; empty for the segmentation.
     """
     tasks = sorted({episode.task for episode in episodes})
+    descriptions = ["", *sorted({text for episode in episodes for text in episode.descriptions.values()})]
     about = {"kind": kind, "source": source, "boxes": boxes, "tasks": tasks, "rows": len(episodes)}
+    about["descriptions"] = descriptions  # the first is that of images without any
     heading = json.dumps({"version": CACHE_VERSION, **about}).encode()
     texts, places = b"", {}
     for text in dict.fromkeys(episode.prompt.text for episode in episodes):
@@ -132,7 +135,8 @@ def write_cache_file(
         texts += text.encode()
     texts_start = PREAMBLE.itemsize + len(heading) + len(episodes) * INDEX.itemsize
     head_bytes = start = _aligned(texts_start + len(texts))
-    tables, entries = [_tables_of(episode) for episode in episodes], []
+    numbers = {text: number for number, text in enumerate(descriptions)}
+    tables, entries = [_tables_of(episode, numbers) for episode in episodes], []
     for episode, content in zip(episodes, tables, strict=True):
         prompt, images = episode.prompt, np.ascontiguousarray(episode.images)
         num_inputs = max(int(table.crop_index.max(initial=0)) for table in (prompt.objects, episode.objects))
@@ -194,6 +198,7 @@ class CacheFile:
         self.source: str = about["source"]
         self.boxes: str = about["boxes"]
         self.tasks: list[str] = about["tasks"]
+        self.descriptions: list[str] = about["descriptions"]
         height, width = IMAGE_SIZES[self.kind]
         self.image_shape, self.image_bytes = (3, height, width), 3 * height * width
         self._texts: dict[tuple[int, int], str] = {}
@@ -217,12 +222,13 @@ class CacheFile:
         steps = np.frombuffer(tables, STEP, entry.num_steps, offset)
         offset += steps.nbytes
         prompt_images = np.frombuffer(tables, PROMPT_IMAGE, entry.num_prompt_images, offset)
+        text = self.text(entry.text_start, entry.text_bytes)
         return PreprocessedEpisode(
             task=self.tasks[entry.task],
             seed=entry.seed,
             end_effector=entry.end_effector,
             prompt=PreprocessedPrompt(
-                self.text(entry.text_start, entry.text_bytes),
+                text,
                 object_table(objects[:first]),
                 prompt_images["num_objects"],
                 prompt_images["is_scene"],
@@ -235,7 +241,15 @@ class CacheFile:
             final=object_table(objects[second:]),
             actions=steps["actions"],
             images=self.images(row),
+            descriptions=self._descriptions_of(row, text, prompt_images["description"].tolist()),
         )
+
+    def _descriptions_of(self, row: int, text: str, numbers: Sequence[int]) -> dict[str, str]:
+        """Return the descriptions of a prompt's images by name."""
+        if max(numbers, default=0) >= len(self.descriptions):
+            raise ShardError(_unfit(self.path, f"record {row} of {len(self)} counts more descriptions"))
+        pairs = zip(image_names(text), numbers, strict=False)
+        return {name: self.descriptions[number] for name, number in pairs if number}
 
     def entry_bytes(self, row: int) -> memoryview:
         """Return the entry of an episode as it is stored."""
@@ -288,6 +302,8 @@ class CacheFile:
         about = json.loads(bytes(content[size : size + json_bytes]))
         if about["version"] != CACHE_VERSION or about["kind"] not in KINDS:
             raise ValueError(f"it is of version {about['version']}, not {CACHE_VERSION}")
+        if not all(isinstance(text, str) for text in about["descriptions"]):
+            raise ValueError("its descriptions are no texts")
         self._index_bytes = content[size + json_bytes :][: about["rows"] * INDEX.itemsize]
         self.index = np.frombuffer(self._index_bytes, INDEX)
         return about
@@ -316,8 +332,13 @@ def _fits(index: np.ndarray, file_bytes: int) -> bool:
     return bool(all((count >= 0).all() for count in counts) and np.all(has_room))
 
 
-def _tables_of(episode: PreprocessedEpisode) -> bytes:
-    """All tables of a record, with zeros behind them up to where images may begin."""
+def _tables_of(episode: PreprocessedEpisode, descriptions: Mapping[str, int]) -> bytes:
+    """All tables of a record, with zeros behind them up to where images may begin.
+
+    Args:
+        episode: What to write.
+        descriptions: Number of each description.
+    """
     prompt, false_positives = episode.prompt, episode.false_positives
     steps = np.zeros(episode.num_steps, STEP)
     for name in ("actions", "objects_per_step", "pick_ids", "place_ids"):
@@ -326,6 +347,8 @@ def _tables_of(episode: PreprocessedEpisode) -> bytes:
     steps["false_positive_boxes"] = false_positives.boxes
     prompt_images = np.zeros(len(prompt.is_scene), PROMPT_IMAGE)
     prompt_images["num_objects"], prompt_images["is_scene"] = prompt.objects_per_image, prompt.is_scene
+    described = [descriptions[episode.descriptions.get(name, "")] for name in prompt.image_names]
+    prompt_images["description"] = described
     tables = [_object_rows(table) for table in (prompt.objects, episode.objects, episode.final)]
     content = b"".join(table.tobytes() for table in (*tables, steps, prompt_images))
     return content.ljust(_aligned(len(content)), b"\0")

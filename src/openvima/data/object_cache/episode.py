@@ -1,6 +1,7 @@
 """One demonstration as a policy takes it: tables of objects, and the actions to learn."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from openvima.perception.preprocessing import (
     preprocess_prompt,
 )
 from openvima.scene import ACTION_SHAPES, END_EFFECTORS, Action
+from openvima.tasks.prompts import image_descriptions
 
 ACTION_PARTS = tuple(ACTION_SHAPES)
 _SMALL_BOX = 16  # pixels, of a false positive where a view shows nothing to take the size from
@@ -59,6 +61,8 @@ class PreprocessedEpisode:
         actions: Actions of the oracle, shape (T, 12), float32: positions in metres and quaternions.
         images: All crops or halved frames but the blank one, shape (K, 3, height, width), uint8; index n is
             `images[n - 1]`.
+        descriptions: Texture and name of the objects in object images of the task's prompt, by placeholder;
+            see `openvima.tasks.prompts.image_descriptions`.
     """
 
     task: str
@@ -73,6 +77,7 @@ class PreprocessedEpisode:
     final: ObjectTable
     actions: np.ndarray
     images: np.ndarray
+    descriptions: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def num_steps(self) -> int:
@@ -137,6 +142,7 @@ def preprocess(
         final=ObjectTable.from_views(final, stack),
         actions=np.array([_action_row(action) for action in demo.actions], np.float32).reshape(-1, 12),
         images=stack.images()[1:],
+        descriptions=image_descriptions(demo.prompt),
     )
 
 

@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.training.augmentation.describe_objects import DescribeObjects
 from openvima.training.augmentation.distractor_insertion import with_distractors
 from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt
@@ -56,7 +57,7 @@ class DemonstrationAugmentation:
         """Whether demonstrations stay as they are, those without a source of distractors."""
         transforms = [each for each in self.of_tasks if each is not with_distractors]
         return not self.inverse_dynamics_prob and all(
-            isinstance(each, Randomly) and not each.prob for each in transforms
+            isinstance(each, Randomly | DescribeObjects) and not each.prob for each in transforms
         )
 
     def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
@@ -83,5 +84,6 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             with_distractors,  # acts where the loader supplies another demonstration
             Randomly(config.rename_objects_prob, renamed),
             Randomly(config.shuffle_sentences_prob, shuffled),
+            DescribeObjects(config.text_description_prob),  # last: the others look for images
         ),
     )

@@ -23,11 +23,11 @@ def with_prompt(
     episode: PreprocessedEpisode, text: str, images: Mapping[str, tuple[ObjectTable, bool]]
 ) -> PreprocessedEpisode:
     """Return the demonstration with another prompt, which contains some of these images."""
-    tables, is_scene = zip(*(images[name] for name in image_names(text)), strict=True)
+    shown = [images[name] for name in image_names(text)]
     prompt = PreprocessedPrompt(
         text=text,
-        objects=ObjectTable.concatenate(tables),
-        objects_per_image=np.array([len(table) for table in tables], np.int16),
-        is_scene=np.array(is_scene, np.bool_),
+        objects=ObjectTable.concatenate([table for table, _ in shown]),
+        objects_per_image=np.array([len(table) for table, _ in shown], np.int16),
+        is_scene=np.array([is_scene for _, is_scene in shown], np.bool_),
     )
     return replace(episode, prompt=prompt)

@@ -1,0 +1,57 @@
+"""Prompt augmentation: text descriptions in place of object images, at random.
+
+"Put the {a} into the {b}."    "Put the red swirl letter A into the {b}."
+
+Source: MIDAS (Li et al. 2023), fine-tuning for in-context learning. Its probability is not published.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openvima.data.object_cache.episode import PreprocessedEpisode
+from openvima.tasks.prompts import with_phrases
+from openvima.training.augmentation.prompt_images import images_by_name, with_prompt
+from openvima.training.dataset import Example
+
+_FORMS = "all {x}. {x}. is a zup {x}"  # plural, articles and colon, which descriptions bring with them
+
+
+@dataclass(frozen=True, slots=True)
+class DescribeObjects:
+    """Replaces object images of task prompts by texture and name of the object.
+
+    Args:
+        prob: Probability for each image.
+    """
+
+    prob: float
+
+    def __call__(self, example: Example, rng: np.random.Generator) -> Example:
+        """Augment a demonstration."""
+        if not self.prob:
+            return example
+        return replace(example, content=with_descriptions(example.episode, self.prob, rng))
+
+
+def with_descriptions(
+    episode: PreprocessedEpisode, prob: float, rng: np.random.Generator
+) -> PreprocessedEpisode:
+    """Replace some object images by their descriptions; images without one stay.
+
+    Args:
+        episode: The demonstration.
+        prob: Probability for each image.
+        rng: Draws the images.
+    """
+    names = [name for name in episode.prompt.image_names if name in episode.descriptions]
+    chosen = [name for name, draw in zip(names, rng.random(len(names)), strict=True) if draw < prob]
+    if not chosen:
+        return episode
+    text = with_phrases(episode.prompt.text, {name: episode.descriptions[name] for name in chosen})
+    return with_prompt(episode, text, images_by_name(episode.prompt))
+
+
+def text_of(description: str) -> str:
+    """Return a text with all words that a description brings into prompts: article and plural, too."""
+    return with_phrases(_FORMS, {"x": description})

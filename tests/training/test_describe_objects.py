@@ -1,0 +1,140 @@
+"""Prompt augmentation: text descriptions in place of object images."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from object_rows import rows_of  # noqa: E402
+from openvima.data import Dataset  # noqa: E402
+from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.object_cache.episode import preprocess  # noqa: E402
+from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.perception.preprocessing import split_prompt  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
+from openvima.scene import ObjectRecord  # noqa: E402
+from openvima.tasks.prompts import described, description_of, image_descriptions  # noqa: E402
+from openvima.training import sequence_lengths  # noqa: E402
+from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
+from openvima.training.augmentation.describe_objects import text_of, with_descriptions  # noqa: E402
+from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
+from openvima.training.config import AugmentationConfig  # noqa: E402
+from openvima.training.dataset import Example  # noqa: E402
+from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.vocabulary import training_texts  # noqa: E402
+
+TASKS = (
+    "visual_manipulation",
+    "sweep_without_exceeding",
+    "novel_noun",
+    "scene_understanding",
+    "follow_motion",
+)
+ALWAYS = AugmentationConfig(text_description_prob=1.0)
+
+
+@pytest.fixture(scope="module")
+def demos() -> dict[str, Demonstration]:
+    def demo(task: str) -> Demonstration:
+        env = TabletopEnv(task, level="L4" if task == "follow_motion" else "train", domain="user")
+        return rollout_oracle(env, 1)
+
+    return {task: demo(task) for task in TASKS}
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("kind", ["objects", "frames"])
+def test_all_object_images_become_the_text_of_text_prompts(demos, task, kind) -> None:
+    episode = preprocess(demos[task], kind)
+    changed = with_descriptions(episode, 1.0, np.random.default_rng(0))
+    text = described(demos[task].prompt, "text")
+    assert changed.prompt.text == text.text
+    assert changed.prompt.image_names == tuple(text.images)
+    assert all(changed.prompt.is_scene) and len(changed.prompt.is_scene) == len(text.images)
+    assert sum(changed.prompt.objects_per_image) == len(changed.prompt.objects)
+    assert changed.objects is episode.objects and changed.actions is episode.actions
+
+
+def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos) -> None:
+    episode = preprocess(demos["visual_manipulation"], "objects")
+    rows = dict(zip(episode.prompt.image_names, rows_of(episode.prompt.objects).tolist(), strict=True))
+    shown = []
+    for seed in range(200):
+        prompt = with_descriptions(episode, 0.25, np.random.default_rng(seed)).prompt
+        shown.append(prompt.image_names)
+        assert rows_of(prompt.objects).tolist() == [rows[name] for name in prompt.image_names]
+        assert all(
+            (text in prompt.text) != (name in shown[-1]) for name, text in episode.descriptions.items()
+        )
+    for name in rows:
+        assert 0.65 < np.mean([name in names for names in shown]) < 0.85
+    assert len(set(shown)) == 4  # independently
+
+
+def test_names_that_no_prompt_can_hold_keep_their_image(demos) -> None:
+    demo = demos["visual_manipulation"]
+    name, *others = demo.prompt.images
+    for bad in ("x" * 300, "a {frame_0}"):
+        image = replace(demo.prompt.images[name], objects=(ObjectRecord(0, bad, "red"),))
+        prompt = replace(demo.prompt, images={**demo.prompt.images, name: image})
+        assert list(image_descriptions(prompt)) == others
+
+
+def test_the_object_cache_holds_the_descriptions(data) -> None:
+    dataset = Dataset(data)
+    cache = open_object_cache(dataset)
+    for demo, episode in zip(dataset, cache, strict=True):
+        assert episode.descriptions == image_descriptions(demo.prompt) != {}
+    assert cache.descriptions() == {text for episode in cache for text in episode.descriptions.values()}
+
+
+def test_words_of_descriptions_are_in_the_vocabulary(data) -> None:
+    dataset = Dataset(data)
+    augmentation = replace(ALWAYS, rename_objects_prob=1.0)
+    tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, augmentation)))
+    for episode in open_object_cache(dataset):
+        for changed in (episode, renamed(episode, np.random.default_rng(episode.seed))):
+            text = with_descriptions(changed, 1.0, np.random.default_rng(0)).prompt.text
+            for piece in split_prompt(text):
+                if isinstance(piece, str):
+                    tokenizer.encode(piece)  # a warning of unknown words is an error in tests
+    without = Vocabulary().extended(training_texts(dataset, AugmentationConfig()))
+    assert {"red", "bowl"} & set(tokenizer.vocabulary.words) - set(without.words)
+
+
+def test_it_changes_prompts_of_tasks_in_training_only(demos) -> None:
+    processor = Processor("objects")
+    example = Example(preprocess(demos["visual_manipulation"], "objects"))
+
+    def batch(augmentation: AugmentationConfig, rngs: list[np.random.Generator] | None):
+        transforms = demonstration_augmentation(augmentation)
+        return PolicyCollate(processor, 0.0, with_images=True, augmentation=transforms)([example], rngs)
+
+    def words(augmentation: AugmentationConfig, *, is_training: bool) -> list[int]:
+        made = batch(augmentation, [np.random.default_rng(0)] if is_training else None)
+        return made.prompts.word_ids_BL[0].tolist()
+
+    plain = words(AugmentationConfig(), is_training=True)
+    assert words(ALWAYS, is_training=False) == plain != words(ALWAYS, is_training=True)
+    motion = replace(ALWAYS, inverse_dynamics_prob=1.0)
+    never = replace(motion, text_description_prob=0.0)
+    assert words(motion, is_training=True) == words(never, is_training=True)
+
+
+def test_descriptions_count_for_the_length_of_prompts(data) -> None:
+    dataset = Dataset(data)
+    tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, ALWAYS)))
+    cache, processor = open_object_cache(dataset), Processor("objects", tokenizer)
+    bounds, _ = sequence_lengths._upper_bounds(cache, processor, False, True)
+    for episode, bound in zip(cache, bounds, strict=True):
+        text = with_descriptions(episode, 1.0, np.random.default_rng(0)).prompt.text
+        assert len(tokenizer.encode(text)) <= bound
+
+
+def test_a_description_comes_with_its_article_and_plural() -> None:
+    assert description_of(ObjectRecord(0, "letter A", "red swirl")) == "red swirl letter A"
+    assert text_of("iron box") == "all iron boxes. The iron box. is a zup: an iron box"
