@@ -207,7 +207,7 @@ def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path, fiel
 
 
 def test_a_description_that_is_not_there_is_damage(demos: Path) -> None:
-    file = CacheFile(next(iter(sorted(open_object_cache(Dataset(demos)).folder.iterdir()))))
+    file = CacheFile(open_object_cache(Dataset(demos)).folder / "rotate-train-00000.cache")
     count = len(file.descriptions)
     assert file._descriptions_of(0, "Put {a} on {b}.", [0, count - 1]) == {"b": file.descriptions[-1]}
     with pytest.raises(ShardError, match="counts more descriptions"):
