@@ -30,6 +30,25 @@ def test_tasks_speaks_json(capsys):
     assert "{" in tasks["visual_manipulation"]["prompt"]
 
 
+def test_tasks_describes_the_options_of_a_task(capsys):
+    assert main(["tasks", "rotate"]) == 0
+    shown = capsys.readouterr().out
+    assert "30+60+90" in shown and "Further objects, 0 … 6" in shown
+    assert main(["tasks", "rotate", "--json"]) == 0
+    options = json.loads(capsys.readouterr().out)["options"]
+    assert options["difficulty"]["default"] == "easy" and "3 or 5" in options["difficulty"]["description"]
+    assert main(["tasks", "rotat"]) == 2
+    assert "Did you mean 'rotate'" in capsys.readouterr().err
+
+
+def test_demo_takes_task_options(tmp_path, capsys):
+    words = ["demo", "rotate", "--out", str(tmp_path / "video.mp4"), "--task-options"]
+    assert main([*words, "num_distractors=9"]) == 2
+    assert "num_distractors is 9; give an integer from 0 to 6" in capsys.readouterr().err
+    assert main([*words, "twist.num_objects=3"]) == 2
+    assert "this run has no twist" in capsys.readouterr().err
+
+
 def test_demo_records_the_oracle(tmp_path, capsys):
     path = tmp_path / "video.mp4"
     assert main(["demo", "rotate", "--seed", "1", "--out", str(path)]) == 0

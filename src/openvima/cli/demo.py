@@ -73,6 +73,7 @@ def main(
     from openvima.evaluation.recording import record_episode
     from openvima.evaluation.rollout_policies import load_rollout_policy
     from openvima.evaluation.sources import PolicySource
+    from openvima.tasks.sampling import check_task_options
 
     PolicySource(policy, policy, trust_code).check()  # before a scene is built
     if episode is not None:
@@ -89,6 +90,7 @@ def main(
         )
     assert task is not None  # as checked
     env_config = EnvConfig(assets, compat, prompts, task_options)
+    check_task_options((task,), env_config.task_options)
     batch = Batch(
         policy,
         policy,

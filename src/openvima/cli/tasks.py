@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from openvima.cli.tables import print_table, table_console
+from openvima.tasks.options import option_descriptions
 from openvima.tasks.oracle_success import oracle_record
 
 if TYPE_CHECKING:
@@ -17,16 +18,18 @@ FULL_WIDTH = 110  # columns of the terminal that all columns of the table need
 
 
 def main(
+    name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None,
     *,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     gallery: Path | None = None,
     assets: str = "procedural",
 ) -> int:
-    """List the tasks: prompt, tool, levels, steps and success rate of the oracle.
+    """List the tasks: prompt, tool, levels, steps and success rate of the oracle; or describe one.
 
-    Example: openvima tasks
+    Example: openvima tasks rotate
 
     Args:
+        name: Task to describe, with its options for --task-options.
         as_json: Print JSON instead of a table.
         gallery: Write an HTML page with an image of each task into this folder.
         assets: Asset pack of the gallery: procedural, original, the folder of a checkout of VIMA-Bench, or
@@ -39,6 +42,8 @@ def main(
 
     if gallery is not None:
         return _write_gallery(gallery, assets)
+    if name is not None:
+        return _describe(task_spec(name), as_json=as_json)
     specs = [task_spec(name) for name in list_tasks()]
     if as_json:
         print(json.dumps([_record(spec) for spec in specs], indent=1, ensure_ascii=False))
@@ -69,7 +74,46 @@ def main(
     print_table(table, console)
     console.print("steps: step limit of the oracle, and what a policy may use beyond it")
     console.print("oracle: its success rate in %, over all levels; --json has each level")
+    console.print("`openvima tasks TASK` lists the options of a task")
     return 0
+
+
+def _describe(spec: "TaskSpec", *, as_json: bool) -> int:
+    """Print one task with its options."""
+    from rich.table import Table
+
+    if as_json:
+        print(json.dumps(_record(spec), indent=1, ensure_ascii=False))
+        return 0
+    options = _options(spec)
+    table = Table("option", "default", "description", title=f"options of {spec.name}")
+    for name, option in options.items():
+        table.add_row(name, _shown(option["default"]), str(option["description"]))
+    families = ", ".join(spec.families).replace("_", " ")
+    for line in (f"{spec.name}: {spec.summary}", f"Prompt: {spec.template}"):
+        print(line)
+    print(f"Levels: {', '.join(spec.levels)}. At most {spec.max_steps} steps. Family: {families}.")
+    print_table(table)
+    if "difficulty" in options:
+        print(f"Example: openvima demo {spec.name} --task-options difficulty=hard")
+    return 0
+
+
+def _options(spec: "TaskSpec") -> dict[str, dict[str, object]]:
+    descriptions = option_descriptions(spec)
+    return {
+        name: {"default": default, "description": descriptions[name]}
+        for name, default in spec.options.items()
+    }
+
+
+def _shown(default: object) -> str:
+    """Write a default as --task-options takes it."""
+    if isinstance(default, bool):
+        return str(default).lower()
+    if isinstance(default, tuple | list):
+        return "+".join(map(str, default))
+    return "" if default is None else str(default)
 
 
 def _record(spec: "TaskSpec") -> dict[str, object]:
@@ -83,6 +127,7 @@ def _record(spec: "TaskSpec") -> dict[str, object]:
         "oracle_max_steps": spec.oracle_max_steps,
         "max_steps": spec.max_steps,
         "oracle": oracle_record(spec.name),
+        "options": _options(spec),
     }
 
 

@@ -1,5 +1,6 @@
 """Task options: validation, and their text form such as "num_distractors=3,rotate.difficulty=hard"."""
 
+import inspect
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -139,6 +140,16 @@ class TaskOptions:
                 raise ConfigError(unknown_name(kind, name, sorted(known)))
         for task in tasks:
             self.of(task_spec(task))
+
+
+def option_descriptions(spec: TaskSpec) -> dict[str, str]:
+    """Return what the docstring of a task's `sample` says of each option; empty where it says nothing."""
+    descriptions = dict.fromkeys(spec.options, "")
+    for entry in re.split(r"\n(?: {4})?(?=\w)", inspect.getdoc(spec.sample) or ""):
+        name, _, text = entry.partition(": ")
+        if name in descriptions:
+            descriptions[name] = " ".join(text.split())
+    return descriptions
 
 
 @lru_cache

@@ -63,7 +63,7 @@ def sample(
         num_examples: Image pairs in the prompt, 1 … 6.
         num_objects: Objects on the table, 2 … 6; by default that of the difficulty. At least one is a
             target and at least one a distractor.
-        num_distractors: Distractors in place of those, 0 … 6.
+        num_distractors: Distractors, 0 … 6; by default the objects that are no targets.
         difficulty: "easy", "medium" or "hard": 3, 4 or 5 objects.
     """
     check_difficulty(difficulty)
