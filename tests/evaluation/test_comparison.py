@@ -136,3 +136,24 @@ def test_a_colon_in_the_name_of_a_policy_is_no_mark_of_a_ablation(found):
     renamed = replace(found, rows=tuple(replace(r, policy=f"{r.policy}@10:30") for r in found.rows))
     pairs = [("a@10:30", "b@10:30"), ("a@10:30:no_prompt", "a@10:30")]
     assert [c.a for c in compare_pairs(renamed, pairs)] == [a for a, _ in pairs]
+
+
+def test_ablations_with_rates_are_named_after_their_policy_and_paired_where_scenes_are_the_same():
+    rows = (
+        row("a@10:30", "rotate", "L1", "xxxx......"),
+        row("a@10:30", "rotate", "L1", "x.........", ablation="masked_words:0.2"),
+        row("a@10:30", "rotate", "L1", "xx........", ablation="text_prompts"),
+        row("a@10:30", "rotate", "L1", "xxx.......", ablation="num_distractors:2"),
+        row("a@10:30", "rotate", "L1", "xx........", ablation="num_distractors:2+masked_words:0.2"),
+        row("a", "rotate", "L1", "x.........", ablation="num_distractors:3"),
+    )
+    results = Results(rows, policies={"a@10:30": {"kind": "run"}, "a": {"kind": "run"}})
+    assert compare(results, "a@10:30:masked_words:0.2", "a@10:30").overall.difference == pytest.approx(-0.3)
+    assert compare(results, "a@10:30:text_prompts", "a@10:30").overall.difference == pytest.approx(-0.2)
+    crowded = "a@10:30:num_distractors:2"
+    assert compare(results, f"{crowded}+masked_words:0.2", crowded).overall.difference == pytest.approx(-0.1)
+    for other in ("a@10:30", "a:num_distractors:3"):
+        with pytest.raises(ConfigError, match="no episode in common"):
+            compare(results, crowded, other)
+    with pytest.raises(UnknownPolicyError, match=r"Did you mean 'masked_words:0\.2'"):
+        compare(results, "a@10:30:masked_word:0.2", "a@10:30")

@@ -19,7 +19,7 @@ from openvima.evaluation.ablations.words import gibberish, masked, swapped
 from openvima.evaluation.config import cells, plan
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
-from openvima.policies import RandomPolicy
+from openvima.policies import RandomPolicy, load_policy
 from openvima.policies.tokenizer import UNKNOWN, Vocabulary, WordTokenizer
 from openvima.scene.prompt import PLACEHOLDER
 
@@ -130,6 +130,22 @@ def test_several_at_once_are_one_ablation_in_one_spelling():
     )
     assert config.ablations == ("masked_words:0.2", "gibberish_words")
     assert config.record()["ablations"] == ["masked_words:0.2", "gibberish_words"]
+
+
+def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_on_objects():
+    pytest.importorskip("torch")
+    env, (nano, random) = begun("rearrange"), (load_policy("nano"), Noting())
+    observation, _ = env.reset(seed=3)
+    acted = []
+    for ablation in ("", "noisy_boxes:8", "noisy_boxes:8"):
+        seen = ablate(env, ablation)
+        nano.reset([seen.prompt])
+        acted.append(
+            [nano.act([seen.observation(observation)])[0]["pose0_position"].tolist() for _ in range(2)]
+        )
+    assert acted[1] == acted[2] and acted[1] != acted[0]
+    outcomes = [play([env], [3], PromptedRolloutPolicy(random, a)) for a in ("", "noisy_boxes:8")]
+    assert outcomes[0] == outcomes[1]
 
 
 @pytest.mark.parametrize(

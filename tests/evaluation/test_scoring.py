@@ -2,7 +2,7 @@
 
 import pytest
 
-from openvima.errors import UnknownTaskError
+from openvima.errors import ConfigError, UnknownTaskError
 from openvima.evaluation import EvaluationConfig, Results, evaluate, score
 from openvima.policies import RandomPolicy
 
@@ -51,3 +51,16 @@ def test_ablations_are_played_with_objects_too():
 def test_a_task_that_is_not_there_is_named():
     with pytest.raises(UnknownTaskError, match="rotat"):
         score({"random": RandomPolicy()}, tasks=("rotat",))
+
+
+def test_harder_episodes_leave_out_other_tasks_and_moved_boxes_need_a_network():
+    cells = {"tasks": ("rotate", "rearrange"), "levels": ("L1",), "episodes": 1}
+    rows = score({"idle": Idle()}, **cells, ablations=("text_prompts", "num_distractors:6")).rows
+    assert [(row.ablation, row.task) for row in rows] == [
+        ("", "rotate"),
+        ("", "rearrange"),
+        ("text_prompts", "rotate"),
+        ("num_distractors:6", "rotate"),
+    ]
+    with pytest.raises(ConfigError, match="policy idle extracts objects by code of its own"):
+        score({"idle": Idle()}, **cells, ablations=("noisy_boxes:3+masked_words:0.2",))

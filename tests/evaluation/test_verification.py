@@ -3,6 +3,7 @@
 import json
 import random
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,3 +135,24 @@ def test_an_episode_that_an_invalid_action_ends_is_replayed_up_to_it():
     env = EnvConfig().make("rotate", "L1", domain="eval")
     (again,) = play([env], [3], ActionReplay([np.array(steps, np.float32) for steps in recorder.steps]))
     assert (again.success, again.steps) == (False, 1)
+
+
+def test_harder_episodes_are_replayed_with_their_own_environment(tmp_path):
+    ablations, policy = ("num_distractors:6", "paraphrased_prompts"), "mine=openvima.policies:RandomPolicy"
+    config = EvaluationConfig(
+        (policy,), ("rotate", "rearrange"), ("L1",), 1, out=tmp_path, ablations=ablations
+    )
+    path = evaluate(config)
+    found = verify_results(tmp_path)
+    assert (found.problems, found.episodes) == ((), 2 + 1 + 1)  # `rearrange` has neither
+    results = Results.read(path)
+    rows = tuple(replace(row, ablation=row.ablation.replace("6", "2")) for row in results.rows)
+    settings = {**results.config, "ablations": ["num_distractors:2", "paraphrased_prompts"]}
+    path.write_text(replace(results, rows=rows, config=settings).to_json())
+    assert "num_distractors:2), rotate, L1, seed 0: reason is" in verify_results(tmp_path).problems[0]
+    path.write_text(replace(results, rows=rows).to_json())
+    assert "the ablations of the rows are not those of the settings" in verify_results(tmp_path).problems
+    for row in results.rows:  # under an ablation that does not exist, or for another task
+        edited = (replace(row, ablation="nothing"), replace(row, task="twist", ablation="num_distractors:6"))
+        path.write_text(replace(results, rows=(*results.rows[:-1], edited[row.ablation == ""])).to_json())
+        assert is_found(tmp_path)

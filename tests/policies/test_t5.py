@@ -127,6 +127,17 @@ def test_words_without_ids_are_all_named(tokenizer) -> None:
     assert "'Put'" not in str(caught.value)
 
 
+def test_a_masked_word_is_the_unknown_token(tokenizer) -> None:
+    assert tokenizer.encode("Put <unknown> the <unknown>.") == [
+        *ids("▁Put"),
+        2,
+        *ids("▁the"),
+        2,
+        *ids("▁", "."),
+    ]
+    assert tokenizer.encode("<unknown>") == [2]
+
+
 def test_a_saved_tokenizer_is_read_again(tokenizer, tmp_path) -> None:
     tokenizer.save(tmp_path / "new" / "folder")
     again = T5Tokenizer(tmp_path / "new" / "folder")
