@@ -7,7 +7,8 @@ import pytest
 
 from openvima.evaluation.comparison import compare_pairs
 from openvima.evaluation.results import Results
-from openvima.report.paper import latex, latex_text, markdown, paper_tables
+from openvima.report.paper import paper_tables
+from openvima.report.typesetting import latex, latex_text, markdown
 
 
 @pytest.fixture

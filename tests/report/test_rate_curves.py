@@ -3,7 +3,6 @@
 import re
 
 from openvima.report.fragments import rate_figure_html
-from openvima.report.paper import markdown
 from openvima.report.published_curves import data_fraction_curves, model_size_curves, size_ticks
 from openvima.report.rate_curves import (
     RateCurve,
@@ -12,6 +11,7 @@ from openvima.report.rate_curves import (
     RatePoint,
     rate_table,
 )
+from openvima.report.typesetting import markdown
 
 
 def figure() -> RateFigure:

@@ -56,10 +56,10 @@ def main(
     """
     from openvima.atomic_io import atomic_write_file
     from openvima.evaluation.comparison import compare_pairs, default_pairs
-    from openvima.report.paper import latex as as_latex
-    from openvima.report.paper import markdown as as_markdown
     from openvima.report.paper import paper_tables
     from openvima.report.text import finding
+    from openvima.report.typesetting import latex as as_latex
+    from openvima.report.typesetting import markdown as as_markdown
 
     _check(results, out)
     evaluations = _read(results)

@@ -5,8 +5,8 @@ from itertools import cycle
 
 from openvima.html import render_page
 from openvima.report.figures import rate_chart
-from openvima.report.paper import Table
 from openvima.report.rate_curves import RateFigure, rate_table
+from openvima.report.typesetting import Table
 
 # CSS variables of the style sheet.
 _COLOURS = tuple(f"--series-{name}" for name in (1, 2, 3, 4, 5, 6, "untrained", "random", "oracle"))

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from openvima.evaluation.statistics import Interval
-from openvima.report.paper import Estimate, Line, Table
+from openvima.report.typesetting import Estimate, Line, Table
 
 
 @dataclass(frozen=True, slots=True)
