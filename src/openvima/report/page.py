@@ -10,9 +10,13 @@ from openvima.evaluation.comparison import Comparison, compare_pairs, default_pa
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
-from openvima.report import figures, published, tables, text
+from openvima.report import figures, fragments, published, tables, text
 from openvima.report.ablations import ablated_policies
 from openvima.report.curves import read_run_charts
+from openvima.report.families import family_table
+from openvima.report.level_drop import level_drop_table, level_figure
+from openvima.report.published_tasks import published_task_table
+from openvima.report.rated_ablations import rate_figures
 from openvima.video.clips import Clip
 
 _FUNCTIONS = (  # that the templates in `html/templates/report/` call
@@ -20,7 +24,7 @@ _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_description),
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
     *(published.published_rate, published.published_coverage, published.published_rows),
-    published.leading_models,
+    *(published.leading_models, fragments.rate_figure_html, fragments.table_html),
 )
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
@@ -79,6 +83,7 @@ def write_report(
         and any(published.published_tasks(row.level).get(row.task) for row in results.rows),
         published_model=" ".join(published.BESIDE),
         reliability=published.RELIABILITY,
+        by_task=published.BY_TASK,
         results=results,
         means=results.means(),
         colours=text.series_colours(results),
@@ -89,6 +94,11 @@ def write_report(
         clips=clips,
         comparisons=comparisons,
         ablations=ablated_policies(results),
+        rate_figures=rate_figures(results),
+        families=family_table(results, published=with_published),
+        level_figure=level_figure(results, published=with_published),
+        level_drop=level_drop_table(results, published=with_published),
+        published_tasks=published_task_table(results) if with_published else None,
         published_results=published.published_rows(results, published.published_models())
         if with_published
         else [],

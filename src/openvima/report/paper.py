@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
+from openvima.report.families import family_table
+from openvima.report.level_drop import level_drop_table
 from openvima.report.published import (
     is_comparable,
     leading_models,
@@ -11,6 +13,9 @@ from openvima.report.published import (
     published_rows,
     unpublished_settings,
 )
+from openvima.report.published_tasks import published_task_table
+from openvima.report.rate_curves import rate_table
+from openvima.report.rated_ablations import rate_figures
 from openvima.report.text import ablation_name, counted
 from openvima.report.typesetting import Estimate, Line, Table
 
@@ -21,7 +26,7 @@ _NOISE_MARK = "≈"
 def paper_tables(
     results: Results, comparisons: Sequence[Comparison] = (), *, published: bool = True
 ) -> list[Table]:
-    """Choose what a paper would print: level means, tasks by level of each policy, ablations, differences.
+    """Choose what a paper would print: means by level, family and task, ablations, differences.
 
     Args:
         results: The evaluation.
@@ -29,14 +34,24 @@ def paper_tables(
         published: Whether to add published level means of the same tasks, unless prompts or tasks differ.
     """
     means = results.means()
+    published = published and is_comparable(results)
     by_policy = [_task_table(results, means, policy) for policy in results.policy_names()]
     with_ablations = [
         _ablation_table(results, means, policy)
         for policy in results.policy_names()
         if any(row.policy == policy and row.ablation for row in results.rows)
     ]
-    first = _mean_table(results, means, published=published)
-    return [first, *by_policy, *with_ablations, *map(_difference_table, comparisons)]
+    chosen = [
+        _mean_table(results, means, published=published),
+        level_drop_table(results, published=published),
+        family_table(results, published=published),
+        *by_policy,
+        published_task_table(results) if published else None,
+        *with_ablations,
+        *map(rate_table, rate_figures(results)),
+        *map(_difference_table, comparisons),
+    ]
+    return [table for table in chosen if table and table.lines]
 
 
 def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
@@ -53,8 +68,7 @@ def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
         f"Success rates (%), means over the tasks of each level ({sizes}), with 95 % intervals. "
         f"{_made_of(results)}"
     )
-    comparable = published and is_comparable(results)
-    elsewhere = published_rows(results, leading_models(), keep_marks=False) if comparable else []
+    elsewhere = published_rows(results, leading_models(), keep_marks=False) if published else []
     if elsewhere:
         for number, (name, cells) in enumerate(elsewhere):
             lines.append(Line(f"{name} (published)", cells, starts_group=number == 0))

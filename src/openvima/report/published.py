@@ -12,13 +12,19 @@ from openvima.tasks.prompts import MULTIMODAL
 # The only model whose success by task was published for all levels.
 BESIDE = ("VIMA", "200M")
 RELIABILITY = (
-    "Published numbers, not measured here. Level means are read off figures of the VIMA and MIDAS papers, to "
-    "about 0.2 points; those with ~ to about 0.5. Those with * were printed by the authors. Rates by task of "
-    "VIMA 200M were printed, too, and are taken from public re-implementations that quote them. Each model "
-    "was evaluated on 200 episodes per task; that alone gives an uncertainty of 1.6 points on the means of "
-    "L1 to L3 and 3.5 on L4. Simulator, assets and demonstrations differ, and some results use detected "
-    "boxes: differences of a few points are not meaningful."
+    "Published numbers, not measured here. Reliability A (*): printed by the authors. B (†): quoted by "
+    "public re-implementations. C (no mark): read off figures of the VIMA and MIDAS papers, to about 0.2 "
+    "points, those with ~ to about 0.5. Each model was evaluated on 200 episodes per task; that alone gives "
+    "an uncertainty of 1.6 points on the means of L1 to L3 and 3.5 on L4. Simulator, assets and "
+    "demonstrations differ, and some results use detected boxes: differences of a few points are not "
+    "meaningful."
 )
+BY_TASK = (
+    "Rates by task of VIMA 200M were printed by the authors and are taken from re-implementations that quote "
+    "them (reliability A by way of B); those of MIDAS are the authors’ ablations (A), with ~ rounded to whole "
+    "points (C). Other models have no published rates by task."
+)
+_MARKS = {"A": "*", "B": "†", "C": ""}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,22 +36,24 @@ class PublishedModel:
         size: Parameters of its controller, such as "200M".
         data_fraction: Fraction of the demonstrations that it was trained on.
         levels: Success rate at each level (%).
-        printed: Whether the authors printed the numbers; else they are read off figures.
         rough: Levels whose number is read off to half a point only.
+        grade: Reliability of the numbers: "A", "B" or "C", see `RELIABILITY`.
+        aside: Whether it is a variant or another kind of model, outside curves and leading models.
     """
 
     model: str
     size: str
     levels: Mapping[str, float]
     data_fraction: float = 1.0
-    printed: bool = False
     rough: tuple[str, ...] = field(default=())
+    grade: str = "C"
+    aside: bool = False
 
     @property
     def name(self) -> str:
         """Name with size, and the fraction of the data if it is not all."""
         fraction = "" if self.data_fraction == 1 else f", {100 * self.data_fraction:g} % of the data"
-        return f"{self.model} {self.size}{fraction}"
+        return f"{self.model} {self.size}".rstrip() + fraction
 
     @property
     def num_parameters(self) -> float:
@@ -54,14 +62,14 @@ class PublishedModel:
 
     def mark(self, level: str) -> str:
         """Mark of a level's number, as `RELIABILITY` explains it."""
-        return "*" if self.printed else "~" if level in self.rough else ""
+        return "~" if level in self.rough else _MARKS[self.grade]
 
     def written(self, level: str, rate: float, keep_marks: bool = True) -> str:
         """Write a rate (%), with the marks that `RELIABILITY` explains if it is that of the level."""
         if rate != self.levels.get(level):
             return f"{rate:.1f}"
-        mark = "~" if level in self.rough else ""
-        return f"{mark}{rate:.1f}{'*' if self.printed and keep_marks else ''}"
+        mark = self.mark(level)
+        return f"~{rate:.1f}" if mark == "~" else f"{rate:.1f}{mark if keep_marks else ''}"
 
 
 @cache
@@ -72,16 +80,31 @@ def published_models() -> tuple[PublishedModel, ...]:
 
 def leading_models() -> list[PublishedModel]:
     """The largest of each kind, trained on all data."""
-    largest = {row.model: row for row in published_models() if row.data_fraction == 1}  # sizes ascend
-    return list(largest.values())
+    whole = [row for row in published_models() if row.data_fraction == 1 and not row.aside]
+    return list({row.model: row for row in whole}.values())  # sizes ascend
 
 
-def published_tasks(level: str) -> Mapping[str, float]:
-    """Success rates by task (%) of VIMA 200M at a level, for all tasks of that level."""
-    for record in _content()["tasks"]:
-        if (record["model"], record["size"], record["level"]) == (*BESIDE, level):
-            return record["tasks"]
-    return {}
+def published_tasks(level: str, model: tuple[str, str] = BESIDE) -> Mapping[str, float]:
+    """Success rates by task (%) of a model at a level: of VIMA 200M for all tasks, of others for a few."""
+    return next(
+        (r["tasks"] for r in _by_task() if (r["model"], r["size"], r["level"]) == (*model, level)), {}
+    )
+
+
+def models_by_task() -> list[tuple[str, str]]:
+    """Name and size of the models with published rates by task."""
+    return list(dict.fromkeys((record["model"], record["size"]) for record in _by_task()))
+
+
+def task_rate(model: tuple[str, str], level: str, task: str) -> str:
+    """Write the published rate of a model on a task; "–" where there is none."""
+    rate = published_tasks(level, model).get(task)
+    rough = any(
+        task in r.get("rough", ())
+        for r in _by_task()
+        if (r["model"], r["size"], r["level"]) == (*model, level)
+    )
+    return "–" if rate is None else f"{'~' if rough else ''}{rate:.1f}"
 
 
 def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | None = None) -> float | None:
@@ -90,11 +113,11 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
     Over all tasks it is the published mean of the level.
     """
     model = model or next(m for m in published_models() if (m.model, m.size, m.data_fraction) == (*BESIDE, 1))
-    rates = published_tasks(level)
-    if rates and rates.keys() == set(tasks):
+    whole = published_tasks(level)
+    if whole and whole.keys() == set(tasks):
         return model.levels.get(level)
-    by_task = (model.model, model.size, model.data_fraction) == (*BESIDE, 1)
-    known = by_task and tasks and rates.keys() >= set(tasks)
+    rates = published_tasks(level, (model.model, model.size)) if model.data_fraction == 1 else {}
+    known = tasks and rates.keys() >= set(tasks)
     return sum(rates[task] for task in tasks) / len(tasks) if known else None
 
 
@@ -143,9 +166,13 @@ def published_coverage(results: Results) -> str:
     if not partial:
         return "Published means are over the same tasks."
     return (
-        f"Published means are over the same tasks: {', '.join(partial)}. There, only the rates of "
-        f"{' '.join(BESIDE)} were published by task."
+        f"Published means are over the same tasks: {', '.join(partial)}. There, only "
+        f"{' '.join(BESIDE)} has published rates for every task."
     )
+
+
+def _by_task() -> list[dict]:
+    return _content()["tasks"]
 
 
 @cache

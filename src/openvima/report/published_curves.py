@@ -11,7 +11,7 @@ def model_size_curves(level: str) -> list[RateCurve]:
 
     The quantity is the size of the controller, without the text encoder.
     """
-    models = [model for model in published_models() if model.data_fraction == 1]
+    models = [model for model in published_models() if model.data_fraction == 1 and not model.aside]
     return _curves(models, level, name=lambda m: m.model, x=lambda m: m.num_parameters)
 
 

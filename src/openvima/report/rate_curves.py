@@ -31,7 +31,7 @@ class RateCurve:
     """Success rates of one policy or model.
 
     Args:
-        name: Its name; equal names of several panels share a colour.
+        name: Its name; equal names share a colour.
         points: In ascending order of the quantity.
         published: Whether the numbers are from a paper, not measured here.
     """
@@ -43,7 +43,12 @@ class RateCurve:
 
 @dataclass(frozen=True, slots=True)
 class RatePanel:
-    """Curves that share one pair of axes, such as those of a level."""
+    """Curves that share one pair of axes, such as those of a level.
+
+    Args:
+        title: Its title.
+        curves: Those of one name have one colour, and one row in the table.
+    """
 
     title: str
     curves: tuple[RateCurve, ...]
@@ -87,11 +92,15 @@ def rate_table(figure: RateFigure) -> Table:
     values = sorted({p.x for panel in figure.panels for curve in panel.curves for p in curve.points})
     lines = []
     for panel in figure.panels:
-        for index, curve in enumerate(panel.curves):
-            points = {point.x: point for point in curve.points}
+        for index, (name, published) in enumerate(
+            {curve.name: curve.published for curve in panel.curves}.items()
+        ):
+            points = {
+                point.x: point for curve in panel.curves if curve.name == name for point in curve.points
+            }
             cells = [_cell(points[x]) if x in points else "–" for x in values]
-            name = f"{curve.name} (published)" if curve.published else curve.name
-            lines.append(Line(name, (panel.title, *cells), starts_group=index == 0 and bool(lines)))
+            shown = f"{name} (published)" if published else name
+            lines.append(Line(shown, (panel.title, *cells), starts_group=index == 0 and bool(lines)))
     columns = ("policy", "level", *map(figure.tick, values))
     caption = f"{figure.caption} Columns: {figure.quantity}. Rates in %, with 95 % intervals."
     return Table(figure.label, caption, columns, tuple(lines))
