@@ -31,9 +31,12 @@ def cells_of(text: str, name: str) -> list[list[str]]:
 def test_tables_are_those_a_paper_prints(tables):
     assert [table.label for table in tables] == [
         "levels",
+        "level-drop",
+        "families",
         "tasks-mine",
         "tasks-oracle",
         "tasks-random",
+        "published-tasks",
         "input-ablations-mine",
         "difference-mine-random",
         "difference-mine-no_prompt-mine",

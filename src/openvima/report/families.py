@@ -33,7 +33,7 @@ def family_table(results: Results, *, published: bool = True) -> Table:
             cells = [_mean(results, policy, level, tasks) for policy in policies]
             rate = published_rate(level, tasks) if published else None
             elsewhere = ["–" if rate is None else f"{rate:.1f}"] if published else []
-            name = f"{family.replace('_', ' ')} ({len(tasks)})"
+            name = f"{family_name(family)} ({len(tasks)})"
             lines.append(Line(name, (level, *cells, *elsewhere), starts_group=index == 0 and bool(lines)))
     caption = (
         "Success rates (%) by task family, means over the tasks of each family (their number in brackets), "
@@ -54,7 +54,7 @@ def _tasks(results: Results, level: str) -> dict[str, list[str]]:
 
 def _families(task: str) -> tuple[str, ...]:
     try:
-        return (task_spec(task).family,)
+        return task_spec(task).families
     except UnknownTaskError:
         return ()
 
@@ -66,3 +66,8 @@ def _mean(results: Results, policy: str, level: str, tasks: list[str]) -> Estima
     mean, interval = mean_of_rates([(row.successes, row.episodes) for row in rows])
     fewer = f"{len(rows)} of {len(tasks)} tasks" if len(rows) < len(tasks) else ""
     return Estimate(mean, interval, mark=fewer)
+
+
+def family_name(family: str) -> str:
+    """Name of a family as words."""
+    return family.replace("_", " ").replace("one shot", "one-shot")

@@ -21,7 +21,7 @@ RELIABILITY = (
 )
 BY_TASK = (
     "Rates by task of VIMA 200M were printed by the authors and are taken from re-implementations that quote "
-    "them (reliability A by way of B); those of MIDAS are the authors’ ablations (A), with ~ rounded to whole "
+    "them (A by way of B); those of MIDAS are the authors’ ablations (A), those with ~ rounded to whole "
     "points (C). Other models have no published rates by task."
 )
 _MARKS = {"A": "*", "B": "†", "C": ""}

@@ -39,7 +39,8 @@ def ablation_name(ablation: str) -> str:
         >>> ablation_name("masked_words:0.2+noisy_boxes:3")
         'masked words 0.2 + noisy boxes 3'
     """
-    return ablation.replace("_", " ").replace(":", " ").replace("+", " + ")
+    words = ablation.replace("num_", "number_of_").replace("_", " ")
+    return words.replace(":", " ").replace("+", " + ")
 
 
 def ablation_description(ablation: str) -> str:

@@ -1,0 +1,131 @@
+"""Families, the drop over levels, rated ablations, and published rates by task."""
+
+from dataclasses import replace
+
+import pytest
+
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.statistics import mean_of_rates
+from openvima.report import write_report
+from openvima.report.families import FAMILIES, family_table
+from openvima.report.level_drop import level_drop_table, level_figure
+from openvima.report.published import models_by_task, published_tasks
+from openvima.report.published_tasks import published_task_table
+from openvima.report.rated_ablations import rate_figures, rated
+from openvima.report.typesetting import Estimate, Table
+from openvima.tasks import list_tasks, task_spec
+
+
+def row(policy: str, task: str, level: str, solved: int, ablation: str = "") -> Row:
+    outcomes = tuple(EpisodeOutcome(i, i < solved, 2, "" if i < solved else "lost") for i in range(20))
+    return Row(policy, task, level, 1, outcomes, ablation)
+
+
+def cells(table: Table | None) -> dict[str, list[str]]:
+    assert table
+    return {
+        line.name + (f" {line.cells[0]}" if isinstance(line.cells[0], str) else ""): [
+            cell.written if isinstance(cell, Estimate) else cell for cell in line.cells
+        ]
+        for line in table.lines
+    }
+
+
+def test_families_are_those_of_the_registered_tasks():
+    assert {family for task in list_tasks() for family in task_spec(task).families} == set(FAMILIES)
+
+
+def test_family_means_weight_tasks_alike_and_leave_unknown_tasks_out():
+    solved = {"visual_manipulation": 20, "rotate": 10, "twist": 4, "stack<b>": 20}
+    results = Results(tuple(row("mine", task, "L1", number) for task, number in solved.items()))
+    table = family_table(results)
+    assert cells(table)["simple object manipulation (2) L1"] == ["L1", "75.0", "99.8"]
+    assert not any("stack" in name for name in cells(table))
+    first = table.lines[0].cells[1]
+    assert isinstance(first, Estimate) and first.interval == mean_of_rates([(20, 20), (10, 20)])[1]
+    assert family_table(results, published=False).columns == ("family", "level", "mine")
+
+
+def whole(policy: str, **solved: int) -> tuple[Row, ...]:
+    return tuple(row(policy, task, level, n) for level, n in solved.items() for task in published_tasks(level))
+
+
+def test_the_drop_is_absolute_and_relative_with_intervals_and_published_ones_beside():
+    results = Results((*whole("mine", L1=16, L2=15, L4=4), *whole("bad", L1=0, L4=0)))
+    table = level_drop_table(results)
+    assert table and table.columns == ("policy", "L1", "L4", "change (points)", "relative change (%)")
+    drops = cells(table)
+    assert drops["mine"] == ["80.0", "20.0", "−60.0", "−75.0"]
+    assert drops["bad"] == ["0.0", "0.0", "+0.0", "–"]
+    assert drops["MIDAS 92M (published) 97.8"] == ["97.8", "59.1", "−38.7", "−39.6"]
+    change = table.lines[0].cells[2]
+    assert isinstance(change, Estimate) and -0.7 < change.interval[0] < -0.6 < change.interval[1] < -0.5
+    assert [line.name for line in level_drop_table(results, published=False).lines] == ["mine", "bad"]
+    figure = level_figure(results)
+    assert figure and [p.x for p in figure.curves["mine"].points] == [0, 1, 2]
+    assert [figure.tick(x) for x in (0.0, 1.0, 2.0)] == ["L1", "L2", "L4"]
+
+
+def test_one_level_has_no_drop():
+    results = Results(whole("mine", L1=16))
+    assert level_drop_table(results) is None and level_figure(results) is None
+
+
+@pytest.fixture
+def ablated() -> Results:
+    plain = [row("mine", task, "L1", n) for task, n in (("rotate", 20), ("twist", 10))]
+    masked = [row("mine", task, "L1", n, "masked_words:0.5") for task, n in (("rotate", 8), ("twist", 4))]
+    more = [row("mine", task, "L1", 0, "masked_words:1") for task in ("rotate", "twist")]
+    # a task without the option, or whose tables are too small for so many, leaves the whole panel
+    crowded = [row("mine", task, "L1", 12, "num_distractors:2") for task in ("rotate", "twist")]
+    full = [row("mine", "rotate", "L1", 6, "num_distractors:6")]
+    other = [row("mine", "rotate", "L1", 1, name) for name in ("no_prompt", "masked_words:1+noisy_boxes:3")]
+    return Results((*plain, *masked, *more, *crowded, *full, *other))
+
+
+def test_rates_become_curves_with_the_plain_score_at_zero(ablated):
+    masked, crowded = rate_figures(ablated)
+    assert masked.quantity == "masked words" and [panel.title for panel in masked.panels] == ["L1 (2 tasks)"]
+    (curve,) = masked.panels[0].curves
+    assert [(point.x, point.rate) for point in curve.points] == [(0, 0.75), (0.5, 0.3), (1, 0)]
+    assert curve.points[0].interval == mean_of_rates([(20, 20), (10, 20)])[1]
+
+    assert crowded.quantity == "number of distractors"
+    default, curve = crowded.panels[0].curves
+    assert crowded.panels[0].title == "L1 (1 task)"
+    assert [(crowded.tick(point.x), point.rate) for point in default.points] == [("default", 1)]
+    assert [(point.x, point.rate) for point in curve.points] == [(2, 0.6), (6, 0.3)]
+
+
+def test_only_a_number_after_a_name_is_a_rate():
+    assert [rated(name) for name in ("", "no_prompt", "a:0.5", "a:b", "a:1+b:2", "a:1+b")] == [
+        ("", None),
+        ("no_prompt", None),
+        ("a", 0.5),
+        ("a:b", None),
+        ("a:1+b:2", None),
+        ("a:1+b", None),
+    ]
+
+
+def test_all_published_rates_by_task_stand_beside_measured_ones():
+    table = published_task_table(Results((row("mine", "rotate", "L1", 10), row("mine", "twist", "L3", 5))))
+    found = cells(table)
+    assert table and len(table.columns) == 3 + len(models_by_task())
+    assert found["rotate L1"][:3] == ["L1", "50.0", "99.5"]
+    assert found["twist L1"] == ["L1", "–", "18.0", "100.0", "20.5", "–"]
+    assert found["rearrange_then_restore L1"] == ["L1", "–", "56.5", "94.0", "~88.0", "~65.0"]
+    assert found["manipulate_old_neighbor L3"][2:4] == ["46.0", "47.0"]
+    assert "A by way of B" in table.caption
+    assert published_task_table(Results((row("mine", "rotate", "train", 1),))) is None
+
+
+def test_the_page_shows_all_of_them(ablated, tmp_path):
+    more = replace(ablated, rows=(*ablated.rows, row("mine", "rotate", "L3", 3)))
+    text = write_report(more, tmp_path / "report.html").read_text("utf-8")
+    assert all(f'<section id="{name}">' in text for name in ("families", "drop", "rates", "ablations"))
+    assert "All published rates by task" in text and "reliability" in text.lower()
+    assert "masked words 1 + noisy boxes 3" in text
+    plain = replace(ablated, rows=ablated.rows[:2], config={"prompts": "text"})
+    text = write_report(plain, tmp_path / "plain.html").read_text("utf-8")
+    assert not any(f'<section id="{name}">' in text for name in ("drop", "rates", "published"))
