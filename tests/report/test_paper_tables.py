@@ -63,8 +63,8 @@ def test_markdown_has_equally_many_cells_in_all_rows_of_a_table(tables):
 
 def test_differences_show_counts_and_mark_noise(tables):
     text = markdown(tables)
-    rotate = cells_of(text, "rotate")
-    assert [rotate[3][0], rotate[3][2]] == ["L1", "9 : 0"]
+    rotate = next(cells for cells in cells_of(text, "rotate") if "9 : 0" in cells)
+    assert [rotate[0], rotate[2]] == ["L1", "9 : 0"]
     assert any("≈" in cell for cells in cells_of(text, "stack\\<b>") for cell in cells)
 
 

@@ -17,8 +17,9 @@ def model_size_curves(level: str) -> list[RateCurve]:
 
 def data_fraction_curves(level: str) -> list[RateCurve]:
     """Published success rates of a level over the fraction of the demonstrations used for training."""
-    fewer = {(m.model, m.size) for m in published_models() if m.data_fraction < 1}
-    models = [model for model in published_models() if (model.model, model.size) in fewer]
+    published = [model for model in published_models() if not model.aside]
+    fewer = {(model.model, model.size) for model in published if model.data_fraction < 1}
+    models = [model for model in published if (model.model, model.size) in fewer]
     return _curves(models, level, name=lambda m: f"{m.model} {m.size}", x=lambda m: m.data_fraction)
 
 

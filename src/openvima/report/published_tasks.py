@@ -10,7 +10,8 @@ def published_task_table(results: Results) -> Table | None:
     models, policies = models_by_task(), results.policy_names()
     lines = []
     for level in results.levels():
-        for index, task in enumerate(published_tasks(level)):
+        of_level = published_tasks(level)
+        for index, task in enumerate(of_level if of_level.keys() & set(results.tasks(level)) else ()):
             rows = [results.row(policy, task, level) for policy in policies]
             own = [Estimate(row.rate, row.interval) if row else "–" for row in rows]
             elsewhere = [task_rate(model, level, task) for model in models]
