@@ -1,9 +1,12 @@
 """Families, the drop over levels, rated ablations, and published rates by task."""
 
+from dataclasses import replace
+
 import pytest
 
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
+from openvima.report import write_report
 from openvima.report.families import FAMILIES, family_table
 from openvima.report.level_drop import level_drop_table, level_figure
 from openvima.report.published import models_by_task, published_tasks
@@ -59,7 +62,8 @@ def test_the_drop_is_absolute_and_relative_with_intervals_and_published_ones_bes
     assert drops["MIDAS 92M (published) 97.8"] == ["97.8", "59.1", "−38.7", "−39.6"]
     change = table.lines[0].cells[2]
     assert isinstance(change, Estimate) and -0.7 < change.interval[0] < -0.6 < change.interval[1] < -0.4
-    assert [line.name for line in level_drop_table(results, published=False).lines] == ["mine", "bad"]
+    bare = level_drop_table(results, published=False)
+    assert bare and [line.name for line in bare.lines] == ["mine", "bad"]
     figure = level_figure(results)
     assert figure and [p.x for p in figure.curves["mine"].points] == [0, 1, 2]
     assert [figure.tick(x) for x in (0.0, 1.0, 2.0)] == ["L1", "L2", "L4"]
@@ -117,3 +121,14 @@ def test_all_published_rates_by_task_stand_beside_measured_ones():
     assert found["manipulate_old_neighbor L3"][2:4] == ["46.0", "47.0"]
     assert "A by way of B" in table.caption
     assert published_task_table(Results((row("mine", "rotate", "train", 1),))) is None
+
+
+def test_the_page_shows_all_of_them(ablated, tmp_path):
+    more = replace(ablated, rows=(*ablated.rows, row("mine", "rotate", "L3", 3)))
+    text = write_report(more, tmp_path / "report.html").read_text("utf-8")
+    assert all(f'<section id="{name}">' in text for name in ("families", "drop", "rates", "ablations"))
+    assert "All published rates by task" in text and "reliability" in text.lower()
+    assert "masked words 1 + noisy boxes 3" in text
+    plain = replace(ablated, rows=ablated.rows[:2], config={"prompts": "text"})
+    text = write_report(plain, tmp_path / "plain.html").read_text("utf-8")
+    assert not any(f'<section id="{name}">' in text for name in ("drop", "rates", "published"))

@@ -21,7 +21,7 @@ from openvima.video.clips import Clip
 
 _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(text.percent, text.exact, text.points, text.points_span, text.probability, text.span, text.counted),
-    *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_description),
+    *(text.listed, text.role, text.finding, text.ablation_name, text.ablation_descriptions),
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
     *(published.published_rate, published.published_coverage, published.published_rows),
     *(published.leading_models, fragments.rate_figure_html, fragments.table_html),

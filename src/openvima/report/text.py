@@ -1,5 +1,7 @@
 """Sentences and numbers of the report: what levels and policies are, how rates are written."""
 
+from collections.abc import Iterable
+
 from openvima.evaluation.ablations import INPUT_ABLATIONS
 from openvima.evaluation.comparison import Comparison, Difference
 from openvima.evaluation.results import Results
@@ -43,12 +45,15 @@ def ablation_name(ablation: str) -> str:
     return words.replace(":", " ").replace("+", " + ")
 
 
-def ablation_description(ablation: str) -> str:
-    """One sentence on an input ablation, or on each of several."""
-    known = (INPUT_ABLATIONS.get(part.partition(":")[0]) for part in ablation.split("+"))
-    return (
-        " ".join(found.description for found in known if found) or "See the documentation of the evaluation."
-    )
+def ablation_descriptions(ablations: Iterable[str]) -> dict[str, str]:
+    """One sentence on each input ablation by its name as words, without rates and each of several apart."""
+    names = dict.fromkeys(part.partition(":")[0] for ablation in ablations for part in ablation.split("+"))
+    return {
+        ablation_name(name): INPUT_ABLATIONS[name].description
+        if name in INPUT_ABLATIONS
+        else "See the documentation of the evaluation."
+        for name in names
+    }
 
 
 def role(results: Results, policy: str) -> str:
