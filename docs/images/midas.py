@@ -1,4 +1,4 @@
-"""Draw midas.png: the token sequence of a step, and a demonstration relabelled for inverse dynamics.
+"""Draw midas.png: the tokens of a step, a demonstration relabelled for inverse dynamics, in-context prompts.
 
 Words, crops and bins are the network's inputs.
 """
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from openvima.data.records import Demonstration, rollout_oracle
 from openvima.env import TabletopEnv
+from openvima.evaluation.in_context import in_context_prompt
 from openvima.policies import preset
 from openvima.policies.nn.actions import ACTION_PARTS, to_unit_range
 from openvima.policies.nn.bins import encode_bins
@@ -41,7 +42,8 @@ from policy import (
 
 SEED = 21  # a scene whose objects differ in colour; any other will do
 MOTION_SEED = 1
-WIDTH, HEIGHT = 13.6, 6.6  # inches, as all coordinates below, from the upper left corner
+IN_CONTEXT_SEEDS = {"twist": 4, "follow_order": 6}
+WIDTH, HEIGHT = 13.6, 8.6  # inches, as all coordinates below, from the upper left corner
 LEFT, SIZE = 0.25, 0.34  # left margin; side of a crop
 NAMES = ("x", "y", "qx", "qy", "qz", "qw")
 RESIDUAL = "#b3541e"
@@ -133,6 +135,27 @@ def draw_motion(axes: Any, demo: Demonstration) -> None:
     assert end < WIDTH  # the whole prompt fits
 
 
+def draw_in_context(axes: Any) -> None:
+    """Draw two prompts of in-context evaluation, each with the start of its episode."""
+    axes.plot((0.2, WIDTH - 0.25), (6.5, 6.5), color=FAINT, linewidth=0.8)
+    title = "In-context evaluation: prompts of untrained tasks are edited to contain an example"
+    draw_text(axes, 0.2, 6.72, title, fontsize=11, fontweight="bold")
+    size, x = (1.5, 0.75), LEFT
+    for task, seed in IN_CONTEXT_SEEDS.items():
+        env = TabletopEnv(task, level="L1", domain="eval")
+        observation = env.reset(seed=seed)[0]
+        prompt = in_context_prompt(env.prompt, task)
+        draw_text(axes, x, 7.05, task, fontweight="bold")
+        draw_text(axes, x, 7.28, f"“{prompt.text}”", family="DejaVu Sans Mono", fontsize=7)
+        shown = [(name, image.rgb, VIEWS[1][1]) for name, image in prompt.images.items()]
+        for name, rgb, colour in (*shown, ("first observation", observation["rgb"], FAINT)):
+            draw_picture(axes, picture(rgb["top"]), x, 7.45, size)
+            draw_frame(axes, x, 7.45, size, edgecolor=colour)
+            draw_text(axes, x, 8.32, name, fontsize=8, color=colour)
+            x += size[0] + 0.15
+        x += 1.2
+
+
 def _unnamed(token: Token) -> Token:
     return Token(token.content, token.colour)
 
@@ -144,6 +167,7 @@ def draw() -> Figure:
         axes = figure.add_axes((0, 0, 1, 1))
         draw_step(axes, demonstration("visual_manipulation", SEED))
         draw_motion(axes, demonstration("manipulate_old_neighbor", MOTION_SEED))
+        draw_in_context(axes)
         axes.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0))
         axes.axis("off")
     return figure
