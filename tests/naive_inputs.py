@@ -83,14 +83,14 @@ class NaiveProcessor:
     Args:
         layout: What a token shows: an object in both views, an object in one view, or part of a whole frame.
         image_size: Height and width of a crop or frame.
-        tokens_per_frame_pair: With frames, how many tokens a pair of them becomes.
+        tokens_per_image: How many tokens both views of an image become; 0 if that depends on its objects.
         tokenizer: Splits text into word ids.
         extractor: Finds the objects in images.
     """
 
     layout: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
-    tokens_per_frame_pair: int = 0
+    tokens_per_image: int = 0
     tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor = GROUND_TRUTH
 
@@ -104,7 +104,7 @@ class NaiveProcessor:
         tokenizer = tokenizer or WordTokenizer()
         order = PUBLISHED_ORDER if inputs.tokens == "views" else GROUND_TRUTH
         return NaiveProcessor(
-            inputs.tokens, inputs.image_size, inputs.tokens_per_frame_pair, tokenizer, extractor or order
+            inputs.tokens, inputs.image_size, inputs.tokens_per_image, tokenizer, extractor or order
         )
 
     def encode_prompt(self, prompt: RenderedPrompt) -> PromptInput:
@@ -175,10 +175,10 @@ class NaiveProcessor:
         With a token for each view, every image takes as many slots as the prompt's fullest one, as in the
         published evaluation: T5 counts them, and so tells how far words and images are apart.
         """
+        if self.tokens_per_image:
+            return [(0, part, True) for part in range(self.tokens_per_image if len(objects) else 0)]
         if self.layout == "objects":
             return [(k, 0, bool(visible)) for k, visible in enumerate(objects.visible())]
-        if self.layout == "frames":
-            return [(0, part, True) for part in range(self.tokens_per_frame_pair)]
         return [(k, v, bool(objects.masks[v, k])) for v, count in enumerate(slots) for k in range(count)]
 
 

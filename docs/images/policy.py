@@ -102,7 +102,7 @@ def step_tokens(processor: Processor, observation: Mapping[str, Any]) -> list[To
     batch, stack = processor.encode_observations([[observation]])
     crops = stack.images()[batch.crop_index_BTVN[0, 0]]
     if processor.layout == "frames":
-        return [image_token(processor, crops, 0, part) for part in range(processor.tokens_per_frame_pair)]
+        return [image_token(processor, crops, 0, part) for part in range(processor.tokens_per_image)]
     slots = [(k, view) for view in range(len(VIEWS)) for k in range(crops.shape[1])]
     return [replace(image_token(processor, crops, k, view), name=str(k + 1)) for k, view in slots]
 
@@ -112,7 +112,7 @@ def image_token(processor: Processor, crops: np.ndarray, entry: int, part: int) 
     if processor.layout == "views":
         name, colour = VIEWS[part]
         return Token(picture(crops[part, entry]), colour, f"{chr(ord('A') + entry)} {name}")
-    if processor.tokens_per_frame_pair < 2 * PATCHES:
+    if processor.tokens_per_image < 2 * PATCHES:
         return Token("", SUMMARY)
     view, place = divmod(part, PATCHES)
     row, column = (PATCH * index for index in divmod(place, PATCHES_IN_ROW))

@@ -317,7 +317,7 @@ def _places(
     """Slot, part and validity of the tokens of one image."""
     processor = NaiveProcessor.of(network.config.inputs)
     if processor.layout == "frames":
-        return [(0, part, True) for part in range(processor.tokens_per_frame_pair)]
+        return [(0, part, True) for part in range(processor.tokens_per_image)]
     return [
         (k, view, bool(objects.masks[view, k])) for view, count in enumerate(counts) for k in range(count)
     ]

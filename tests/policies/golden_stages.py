@@ -132,7 +132,7 @@ def _prompt_image_stages(network: PolicyNetwork, recorded: Arrays, calls: Calls)
     for name, view in zip(VIEWS, images, strict=True):
         result[f"prompt.vit.{name}"] = network.encode_images(torch.from_numpy(view)).numpy()
     entries = len(images[0])
-    num_parts = NaiveProcessor.of(network.config.inputs).tokens_per_frame_pair if frames else len(VIEWS)
+    num_parts = NaiveProcessor.of(network.config.inputs).tokens_per_image if frames else len(VIEWS)
     counts = [1] * num_parts if frames else [view.shape[1] for view in images]
 
     def by_image(tokens_ID: torch.Tensor) -> np.ndarray:

@@ -205,7 +205,7 @@ def test_weights_of_another_architecture_are_refused(tmp_path) -> None:
     for name in ("vima", "gato"):
         save_checkpoint(build_network(preset(f"{name}-nano"), seed=0), tmp_path / name)
     (tmp_path / "gato" / CONFIG_FILE).replace(tmp_path / "vima" / CONFIG_FILE)
-    with pytest.raises(CheckpointError, match=r"missing: frame_encoder.*unexpected: decoder\.cross_blocks"):
+    with pytest.raises(CheckpointError, match=r"missing: images.*unexpected: decoder\.cross_blocks"):
         load_checkpoint(tmp_path / "vima")
 
 

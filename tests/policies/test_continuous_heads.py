@@ -125,7 +125,7 @@ def test_every_network_takes_continuous_heads(architecture, head, starts) -> Non
         (lambda: MixtureConfig(min_std=0.0), "min_std 0.0"),
         (lambda: RegressionConfig(huber_delta=2.0), "huber_delta is 2.0"),
         (lambda: with_head(preset("vima-nano"), "gaussian"), "gaussian"),
-        (lambda: with_head(preset("nano"), "mixture"), "pointer models choose among candidates"),
+        (lambda: with_head(preset("nano"), "mixture"), "pointer models have pointers to candidates alone"),
     ],
 )
 def test_what_cannot_be_says_why(config, words) -> None:

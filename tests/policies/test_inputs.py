@@ -17,7 +17,7 @@ from openvima.policies.processor import Processor  # noqa: E402
 from openvima.scene import RenderedPrompt  # noqa: E402
 
 VIEWS = ("front", "top")
-FRAMES = {"layout": "frames", "image_size": (64, 128), "tokens_per_frame_pair": 16}
+FRAMES = {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 16}
 
 
 class Scripted:

@@ -120,7 +120,7 @@ def test_names_go_to_published_ones_and_back(network) -> None:
             "obj_encoder.cropped_img_encoder.vit.blocks.1.ln_2.weight",
             "images.crop_encoder.blocks.1.norm_mlp.weight",
         ),
-        ("gpt", "obj_encoder.cropped_img_encoder.vit.ln_pre.bias", "frame_encoder.norm_before.bias"),
+        ("gpt", "obj_encoder.cropped_img_encoder.vit.ln_pre.bias", "images.norm_before.bias"),
         (
             "flamingo",
             "obj_encoder.peceiver.model.encoder.self_attends.3.attention.self.value.bias",
@@ -176,7 +176,7 @@ def test_matrices_of_the_decoder_are_published_transposed(network, architecture)
     ):
         assert torch.equal(published[f"{prefix}.h.1.{name}.weight"], ours.weight.T)
     assert torch.equal(published[f"{prefix}.h.1.mlp.gated_layer.weight"], block.gate.weight)
-    vit = network.images.crop_encoder if architecture == "vima" else network.frame_encoder
+    vit = network.images.crop_encoder if architecture == "vima" else network.images
     name = "obj_encoder.cropped_img_encoder.vit.projection"
     assert torch.equal(published[name], vit.projection.weight.T)
 

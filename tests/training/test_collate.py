@@ -20,7 +20,7 @@ from training_examples import collate_examples, examples_of  # noqa: E402
 SETTINGS = {
     "objects": {"layout": "objects"},
     "views": {"layout": "views"},
-    "frames": {"layout": "frames", "image_size": (64, 128), "tokens_per_frame_pair": 3},
+    "frames": {"layout": "frames", "image_size": (64, 128), "tokens_per_image": 3},
 }
 OBJECTS = Processor("objects")
 

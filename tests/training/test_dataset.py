@@ -269,7 +269,7 @@ def test_without_false_positives_views_are_unchanged(views):
 
 
 def test_whole_frames_get_no_false_positives_and_stay_uint8(demonstrations_of_several_steps):
-    processor = Processor("frames", (64, 128), tokens_per_frame_pair=1)
+    processor = Processor("frames", (64, 128), tokens_per_image=1)
     examples, images = examples_of(demonstrations_of_several_steps, processor)
     assert images.dtype == torch.uint8
     assert images.shape[1:] == (3, 64, 128)

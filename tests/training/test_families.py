@@ -81,7 +81,7 @@ def test_without_an_appearance_embedding_there_is_no_pretraining_and_the_image_e
     assert {"accuracy", "component_accuracy", "pose1_rotation_accuracy"} <= metrics
     fresh = build_network(presets.preset("gpt-nano"), seed=step_seed(0, "weights", 0)).state_dict()
     trained = load_file(tmp_path / f"checkpoints/2-cloning-{STEPS:06d}/model.safetensors")
-    images = [name for name in fresh if name.startswith("frame_encoder.")]
+    images = [name for name in fresh if name.startswith("images.")]
     assert all(not torch.equal(fresh[name], trained[name]) for name in images)
 
 

@@ -11,6 +11,7 @@ from openvima.policies.flamingo.config import FlamingoConfig
 from openvima.policies.gato.config import GatoConfig
 from openvima.policies.gpt.config import GptConfig
 from openvima.policies.midas.config import MidasConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.pointer.config import PointerConfig
 from openvima.policies.vima.config import VimaConfig
 
@@ -40,5 +41,5 @@ def config_from_dict(values: Mapping[str, Any]) -> PolicyConfig:  # Any: whateve
 
 def appearance_width(config: PolicyConfig) -> int:
     """Length of the appearance embedding; 0 for networks without one."""
-    has_objects = isinstance(config, VimaConfig | MidasConfig | PointerConfig)
-    return config.images.appearance_width if has_objects else 0
+    images = config.images
+    return images.appearance_width if isinstance(images, ObjectEncoderConfig) else 0

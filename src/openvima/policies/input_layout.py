@@ -13,9 +13,10 @@ class InputLayout:
     Args:
         tokens: What a token encodes: an object in both views, an object in one view, or part of a frame.
         image_size: Height and width of a crop or frame.
-        tokens_per_frame_pair: With frames, the number of tokens of a pair of them.
+        tokens_per_image: Number of tokens of both views of a prompt image or observation; 0 if it depends on
+            their objects.
     """
 
     tokens: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
-    tokens_per_frame_pair: int = 0
+    tokens_per_image: int = 0

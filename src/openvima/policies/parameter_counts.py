@@ -13,7 +13,6 @@ PARTS = {
     "prompt": ("prompt.", "coreference."),
     "images": (
         "images.",
-        "frame_encoder.",
         "resampler.",
         "end_effectors.",
         "observation_out.",

@@ -63,14 +63,14 @@ class Processor:
         layout: What a token encodes: "objects", an object in both views; "views", an object in one view (the
             published VIMA); "frames", part of a whole frame.
         image_size: Height and width of a crop or frame.
-        tokens_per_frame_pair: With frames, number of tokens of the two frames of a step.
+        tokens_per_image: Number of tokens of both views of an image; 0 if it depends on its objects.
         tokenizer: Tokenizer of prompt text; by default that of the benchmark's vocabulary.
         extractor: Object extractor for inference; None uses the segmentation.
     """
 
     layout: Literal["objects", "views", "frames"]
     image_size: tuple[int, int] = (CROP_SIZE, CROP_SIZE)
-    tokens_per_frame_pair: int = 0
+    tokens_per_image: int = 0
     tokenizer: Tokenizer = field(default_factory=WordTokenizer)
     extractor: ObjectExtractor | None = None
     _layouts: "dict[_LayoutKey, _Layout]" = field(default_factory=dict, init=False, repr=False)
@@ -85,7 +85,7 @@ class Processor:
         return Processor(
             inputs.tokens,
             inputs.image_size,
-            inputs.tokens_per_frame_pair,
+            inputs.tokens_per_image,
             tokenizer or WordTokenizer(),
             extractor,
         )
@@ -372,7 +372,7 @@ class Processor:
             objects, slots = _compact(ordered, image, len(rows))
             layout = self._layout_of(text, counts.tobytes(), slots)
             _, entries, parts = layout.tokens.T
-            mask = entries == WORD
+            mask = (entries == WORD) | bool(self.tokens_per_image)
             mask[~mask] = objects.masks[entries[~mask], parts[~mask]]
             layouts.append(layout)
             tables.append(objects)
@@ -402,10 +402,11 @@ class Processor:
                 continue
             order += range(starts[piece], starts[piece + 1])
             sizes.append({"views": max(slots, default=0), "frames": 1, "objects": counts[piece]}[self.layout])
-            if self.layout == "views":
+            if self.tokens_per_image:
+                parts = self.tokens_per_image if sizes[-1] else 0  # of the first object
+                tokens += [(PADDING_ID, count, part) for part in range(parts)]
+            elif self.layout == "views":
                 tokens += [(PADDING_ID, count + k, v) for v, size in enumerate(slots) for k in range(size)]
-            elif self.layout == "frames":
-                tokens += [(PADDING_ID, count, part) for part in range(self.tokens_per_frame_pair)]
             else:
                 tokens += [(PADDING_ID, count + k, 0) for k in range(counts[piece])]
             count += sizes[-1]

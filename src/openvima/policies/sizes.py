@@ -1,16 +1,22 @@
 """The seven published model sizes, and one that trains on a CPU."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from openvima.errors import UnknownPolicyError, unknown_name
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.resampler import ResamplerConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.nn.vit import VitConfig
 
 T5_VOCABULARY_SIZE = 32128
 VOCABULARY_SIZE = 768  # padding, end, 361 numbers, the 160 words of the benchmark, and a reserve
-T5_BASE = TextEncoderConfig(width=768, num_layers=12, num_heads=12, head_width=64, hidden_width=3072)
+# Encoders of T5 1.0, by the names of their files.
+T5_SIZES = {
+    "t5-small": TextEncoderConfig(width=512, num_layers=6, num_heads=8, head_width=64, hidden_width=2048),
+    "t5-base": TextEncoderConfig(width=768, num_layers=12, num_heads=12, head_width=64, hidden_width=3072),
+    "t5-large": TextEncoderConfig(width=1024, num_layers=24, num_heads=16, head_width=64, hidden_width=4096),
+}
 TUNED_T5_LAYERS = 2  # as in the paper
 
 
@@ -26,7 +32,7 @@ class Size:
         image_width: Width of the image encoder.
         image_layers: Layers of the image encoder.
         image_heads: Heads of the image encoder.
-        resampler_layers: Self-attention layers of VIMA-Flamingo's resampler, and the number of passes.
+        resampler_layers: Self-attention layers of the resampler, and the number of passes.
         hidden_width: Hidden width of the action heads.
         action_width: Width of the features of each part of a past action.
         dropout: Dropout probability.
@@ -66,10 +72,8 @@ class Size:
 
     def frame_encoder(self, *, class_token: bool) -> VitConfig:
         """Return the encoder of whole frames: eight 32 × 32 patches of 64 × 128 pixels."""
-        return VitConfig(
-            self.image_width,
-            self.image_layers,
-            self.image_heads,
+        return replace(
+            self.crop_encoder(),
             output_width=self.width,
             patch_size=32,
             image_height=64,
@@ -77,17 +81,38 @@ class Size:
             class_token=class_token,
         )
 
+    def resampler(self) -> ResamplerConfig:
+        """Return the resampler: four latents."""
+        layers = self.resampler_layers
+        return ResamplerConfig(
+            num_blocks=layers, num_layers=layers, dropout=self.dropout, initial_std=self.initial_std
+        )
 
-def _published(width: int, num_layers: int) -> Size:
-    prompt = PromptEncoderConfig(
-        text=T5_BASE,
-        image_width=768,
+
+def t5_prompt_encoder(name: str) -> PromptEncoderConfig:
+    """Return the prompt encoder with one of `T5_SIZES`; as in the paper, its last two layers are trained."""
+    text = T5_SIZES[name]
+    return PromptEncoderConfig(
+        text,
+        image_width=text.width,
         vocabulary_size=T5_VOCABULARY_SIZE,
         tokenizer="t5",
         train_words=False,
         trained_layers=TUNED_T5_LAYERS,
     )
-    return Size(width, num_layers, num_heads=width // 32, prompt=prompt)
+
+
+def t5_name(text: TextEncoderConfig) -> str:
+    """Return which T5 1.0 a text encoder is, for messages, with its sizes."""
+    name = next((name for name, of in T5_SIZES.items() if of == text), "a T5 1.0")
+    return (
+        f"{name} ({text.width} wide, {text.num_layers} layers, {text.num_heads} heads of {text.head_width}, "
+        f"{text.hidden_width} hidden)"
+    )
+
+
+def _published(width: int, num_layers: int) -> Size:
+    return Size(width, num_layers, num_heads=width // 32, prompt=t5_prompt_encoder("t5-base"))
 
 
 def _nano() -> Size:

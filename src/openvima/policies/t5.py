@@ -26,6 +26,7 @@ from openvima.policies.hub import fetch_from_hub
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
+from openvima.policies.sizes import T5_SIZES, t5_name
 from openvima.policies.tensor_files import check_finite, read_archive, read_safetensors
 from openvima.policies.tokenizer import END_ID, PADDING_ID, UNKNOWN, Tokenizer, Vocabulary, WordTokenizer
 
@@ -148,7 +149,7 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     """Copy the word embedding and the encoder of T5 into a network's prompt encoder.
 
     Args:
-        network: Its text encoder must match the file in size; the published presets use t5-base.
+        network: Its text encoder must match the file in size; that of the published presets is t5-base.
         path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (loaded with
             `weights_only`), or an id on the Hugging Face Hub such as "t5-base".
 
@@ -156,6 +157,10 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
         CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.
         MissingExtraError: An id is given and huggingface_hub is not installed.
     """
+    text = network.config.prompt.text
+    named = str(path_or_hub_id).rpartition("/")[2]
+    if named in T5_SIZES and T5_SIZES[named] != text and not Path(path_or_hub_id).exists():
+        raise CheckpointError(f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give that.")
     file = _weights_file(path_or_hub_id)
     tensors = _read_encoder(file)
     expected = _expected(network)
@@ -163,8 +168,8 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     if problems:
         more = f"; and {len(problems) - _MAX_LISTED} more" if len(problems) > _MAX_LISTED else ""
         raise CheckpointError(
-            f"{file} does not fit the text encoder: {'; '.join(problems[:_MAX_LISTED])}{more}. "
-            "The published presets use t5-base; others need a T5 1.0 of their size."
+            f"{file} does not fit the text encoder, {t5_name(text)}: "
+            f"{'; '.join(problems[:_MAX_LISTED])}{more}."
         )
     for name, tensor in expected.items():
         tensor.copy_(tensors[name])

@@ -6,12 +6,20 @@ from typing import Any
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.config import PolicyConfig
+from openvima.policies.limits import check_limits
+from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.heads import HEADS
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.vit import VitConfig
 from openvima.policies.pointer.config import PointerConfig
+from openvima.policies.sizes import T5_SIZES, size, t5_prompt_encoder
+from openvima.policies.vima.config import VimaConfig
 
 CONDITIONINGS = ("cross-attention", "prefix")
+TEXT_ENCODERS = ("small", *T5_SIZES)
+IMAGE_TOKENS = ("objects", "object-perceiver", "image-perceiver", "patches", "image")
 
 
 def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyConfig:  # Any: of several kinds
@@ -30,7 +38,98 @@ def with_variant(config: PolicyConfig, switches: Mapping[str, Any]) -> PolicyCon
     for name, switch in SWITCHES.items():
         if switches.get(name) is not None:
             config = switch(config, switches[name])
+    check_limits(config, "model")
     return config
+
+
+def with_text_encoder(config: PolicyConfig, name: str) -> PolicyConfig:
+    """Return the same network with another text encoder and its tokenizer.
+
+    Args:
+        config: The network.
+        name: "small", that of the preset if it is no T5, else that of nano; or one of `T5_SIZES`, of which
+            the last two layers are trained.
+
+    Raises:
+        ConfigError: There is no such text encoder, or the network is a pointer model.
+    """
+    if name != "small" and name not in T5_SIZES:
+        raise ConfigError(unknown_name("text_encoder", name, TEXT_ENCODERS))
+    old = config.prompt
+    if name == "small":
+        new = size("nano").prompt if old.tokenizer == "t5" else old
+    elif isinstance(config, PointerConfig):
+        raise _not_of_pointers(f"text_encoder is {name!r}", "a vocabulary of words alone")
+    else:
+        new = old if old.text == T5_SIZES[name] else t5_prompt_encoder(name)
+    return replace(config, prompt=replace(new, visual_residual=old.visual_residual))
+
+
+def with_tuned_layers(config: PolicyConfig, count: int) -> PolicyConfig:
+    """Return the same network with so many layers of its text encoder trained, the last ones.
+
+    Raises:
+        ConfigError: The text encoder has fewer layers.
+    """
+    num_layers = config.prompt.text.num_layers
+    if not 0 <= count <= num_layers:
+        raise ConfigError(
+            f"tuned_layers is {count}, but the text encoder has {num_layers} layers; give 0 to {num_layers}."
+        )
+    return replace(config, prompt=replace(config.prompt, trained_layers=count))
+
+
+def image_tokens(config: PolicyConfig) -> str:
+    """Return which of `IMAGE_TOKENS` a network has."""
+    resampler = None if isinstance(config, PointerConfig) else config.resampler
+    if isinstance(config.images, ObjectEncoderConfig):
+        return "object-perceiver" if resampler else "objects"
+    return "image" if config.images.class_token else "image-perceiver" if resampler else "patches"
+
+
+def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
+    """Return VIMA or MIDAS with other image tokens, in an image encoder of the same width and depth.
+
+    Args:
+        config: The network.
+        name: One of `IMAGE_TOKENS`. "objects" and "object-perceiver", four latents of the objects of both
+            views, take crops; "image-perceiver", four latents, "patches" and "image", one token, are the
+            tokens of VIMA-Flamingo, VIMA-Gato and VIMA-GPT of whole frames.
+
+    Raises:
+        ConfigError: There are no such image tokens, or the network cannot have them.
+
+    Source: VIMA (Jiang et al. 2023), ablation of visual tokenizers.
+    """
+    own = image_tokens(config)
+    if name not in IMAGE_TOKENS:
+        raise ConfigError(unknown_name("image_tokens", name, IMAGE_TOKENS))
+    if name == own:
+        return config
+    if isinstance(config, PointerConfig):
+        raise _not_of_pointers(f"image_tokens is {name!r}", "objects alone")
+    images = config.images
+    if not isinstance(config, VimaConfig | MidasConfig) or not isinstance(images, ObjectEncoderConfig):
+        raise ConfigError(
+            f"image_tokens is {name!r}, but this network has {own!r} alone; take a preset vima-… or midas-…."
+        )
+    crop, decoder = images.crop, config.decoder
+    nano = size("nano")
+    layers = crop.num_layers if isinstance(crop, VitConfig) else nano.resampler_layers
+    of = replace(
+        nano,
+        width=decoder.width,
+        resampler_layers=layers,
+        dropout=decoder.dropout,
+        initial_std=decoder.initial_std,
+    )
+    if isinstance(crop, VitConfig):
+        of = replace(of, image_width=crop.width, image_layers=layers, image_heads=crop.num_heads)
+    return replace(
+        config,
+        images=images if name.startswith("object") else of.frame_encoder(class_token=name == "image"),
+        resampler=of.resampler() if name.endswith("perceiver") else None,
+    )
 
 
 def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
@@ -46,9 +145,7 @@ def with_head(config: PolicyConfig, name: str) -> PolicyConfig:
     if name not in HEADS:
         raise ConfigError(unknown_name("head", name, HEADS))
     if isinstance(config, PointerConfig):
-        raise ConfigError(
-            f"head is {name!r}, but pointer models choose among candidates; take nano-bins or another preset."
-        )
+        raise _not_of_pointers(f"head is {name!r}", "pointers to candidates alone")
     kind, head = HEADS[name], config.head
     if isinstance(head, kind):
         return config
@@ -83,10 +180,7 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
     if is_prefix == (name == "prefix"):
         return config
     if isinstance(config, PointerConfig):
-        raise ConfigError(
-            "conditioning is 'prefix', but pointer models have cross-attention alone; take nano-bins or "
-            "another preset."
-        )
+        raise _not_of_pointers("conditioning is 'prefix'", "cross-attention alone")
     old = config.decoder
     rest = {"dropout": old.dropout, "initial_std": old.initial_std}
     if is_prefix:
@@ -97,9 +191,34 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
     return replace(config, decoder=new)
 
 
+def with_width(config: PolicyConfig, width: int) -> PolicyConfig:
+    """Return the same network with a decoder, and image tokens, of another width.
+
+    Raises:
+        ConfigError: The width is no multiple of the heads of the decoder, or of the resampler.
+    """
+    images, decoder = config.images, replace(config.decoder, width=width)
+    changed = {"output_width": width} if isinstance(images, VitConfig) else {"width": width}
+    return replace(config, images=replace(images, **changed), decoder=decoder)
+
+
+def with_num_layers(config: PolicyConfig, count: int) -> PolicyConfig:
+    """Return the same network with a decoder of another depth, see `with_conditioning`."""
+    return replace(config, decoder=replace(config.decoder, num_layers=count))
+
+
+def _not_of_pointers(given: str, have: str) -> ConfigError:
+    return ConfigError(f"{given}, but pointer models have {have}; take nano-bins or another preset.")
+
+
 # In the order in which they are made: later ones see the parts of earlier ones.
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
+    "text_encoder": with_text_encoder,
+    "tuned_layers": with_tuned_layers,
+    "image_tokens": with_image_tokens,
     "conditioning": with_conditioning,
+    "width": with_width,
+    "num_layers": with_num_layers,
     "head": with_head,
     "visual_residual": with_visual_residual,
 }

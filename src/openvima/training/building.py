@@ -13,10 +13,11 @@ from openvima.policies.config import PolicyConfig, appearance_width, config_to_d
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.presets import preset
 from openvima.policies.processor import Processor
+from openvima.policies.sizes import t5_name
 from openvima.policies.sources import find_checkpoint
 from openvima.policies.t5 import load_t5, tokenizer_for
 from openvima.policies.tokenizer import Tokenizer, Vocabulary, WordTokenizer
-from openvima.policies.variants import with_variant
+from openvima.policies.variants import image_tokens, with_variant
 from openvima.training.augmentation.demonstrations import demonstration_augmentation
 from openvima.training.config import DETECTED_PROB, PRETRAINING_STEPS, TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner, make_learner
@@ -54,22 +55,27 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     needs_t5 = sizes.prompt.tokenizer == "t5"
     if needs_t5 and config.t5 is None and config.init_from is None:
         raise ConfigError(
-            f"preset {config.preset!r} encodes prompts with T5; set t5 to the folder that holds it, or to "
-            "'t5-base' to fetch that from the Hugging Face Hub, or take nano or another preset of that size."
+            f"preset {config.preset!r} encodes prompts with {t5_name(sizes.prompt.text)}; set t5 to the "
+            "folder that holds it, or to its name to fetch it from the Hugging Face Hub, or set "
+            "model.text_encoder to 'small', which needs no files."
         )
     if config.t5 is not None and not needs_t5:
-        raise ConfigError(f"preset {config.preset!r} has its own vocabulary and no T5; leave t5 out.")
+        raise ConfigError(
+            f"preset {config.preset!r} has its own vocabulary and no T5; leave t5 out, or set "
+            "model.text_encoder to a T5."
+        )
     for name in _FOR_OBJECTS:
         if getattr(augmentation, name) and sizes.inputs.tokens == "frames":
             raise ConfigError(
                 f"augmentation.{name} is {getattr(augmentation, name):g}, but preset {config.preset!r} takes "
-                "whole frames; it needs one that takes objects."
+                f"whole frames, as {image_tokens(sizes)!r}; it needs one that takes objects."
             )
     has_appearance = appearance_width(sizes) > 0
     if config.pretraining.steps and not has_appearance:
         raise ConfigError(
-            f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} has no "
-            "appearance embedding to pretrain; leave it out, or set it to 0."
+            f"pretraining.steps is {config.pretraining.steps}, but preset {config.preset!r} with image "
+            f"tokens {image_tokens(sizes)!r} has no appearance embedding to pretrain; leave it out, or set "
+            "it to 0."
         )
     if config.pretraining.steps is None:
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0

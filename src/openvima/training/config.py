@@ -62,14 +62,27 @@ class ModelConfig:
     Args:
         head: Action head: "bins", independent ones; "autoregressive" bins; "mixture", a mixture density over
             positions and rotation; or "regression". Pointer models (nano, small) have their own.
-        visual_residual: Add object tokens to the encoded prompt (MIDAS).
+        visual_residual: Add image tokens to the encoded prompt (MIDAS).
+        text_encoder: "small", with its own vocabulary; or "t5-small", "t5-base" or "t5-large", whose files
+            `t5` names.
+        tuned_layers: Trained layers of the text encoder, the last ones; 0 freezes it.
+        image_tokens: Of VIMA and MIDAS: "objects"; four latents of the objects, "object-perceiver"; or whole
+            frames as four latents, "image-perceiver", as "patches" or as one "image" token.
         conditioning: The decoder attends to the prompt by "cross-attention"; or the prompt is the "prefix" of
             the history, with twice as many layers of half the size.
+        width: Width of the decoder and of image tokens, a multiple of the heads.
+        num_layers: Layers of the decoder: pairs of a cross block and a self block, or with a prefix self
+            blocks.
     """
 
     head: Literal["bins", "autoregressive", "mixture", "regression"] | None = None
     visual_residual: bool | None = None
+    text_encoder: Literal["small", "t5-small", "t5-base", "t5-large"] | None = None
+    tuned_layers: Steps | None = None
+    image_tokens: Literal["objects", "object-perceiver", "image-perceiver", "patches", "image"] | None = None
     conditioning: Literal["cross-attention", "prefix"] | None = None
+    width: Count | None = None
+    num_layers: Count | None = None
 
 
 @dataclass(frozen=True, slots=True)

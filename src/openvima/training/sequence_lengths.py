@@ -80,8 +80,8 @@ def _upper_bounds(
 
 def _tokens_of(num_objects: np.ndarray, processor: Processor) -> np.ndarray:
     """Return the tokens of an image with so many objects."""
-    if processor.layout == "frames":
-        return np.full_like(num_objects, processor.tokens_per_frame_pair)
+    if processor.tokens_per_image:
+        return np.full_like(num_objects, processor.tokens_per_image)
     return num_objects * (len(VIEWS) if processor.layout == "views" else 1)
 
 

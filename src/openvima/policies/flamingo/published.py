@@ -32,7 +32,7 @@ _RESAMPLER_RULES = (
 )
 ADAPTER = PublishedAdapter(
     "flamingo",
-    (*SHARED_RULES, *vit_rules("frame_encoder"), *_RESAMPLER_RULES, *CROSS_ATTENTION_RULES),
+    (*SHARED_RULES, *vit_rules("images"), *_RESAMPLER_RULES, *CROSS_ATTENTION_RULES),
     cfg_names=("embed_dim", "dt_n_layers", "dt_n_heads", "xattn_n_heads"),
     decoder="xattn_gpt",
     build=flamingo,

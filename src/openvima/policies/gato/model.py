@@ -1,26 +1,9 @@
-"""VIMA-Gato: every patch of a frame is a token, and the prompt is the prefix of the sequence.
+"""VIMA-Gato: every patch of a frame is a token, and the prompt is the prefix of the sequence."""
 
-Shape suffixes as in `nn/policy_network.py`; V views, P patches of a frame, N frame pairs.
-"""
-
-import torch
-from torch import nn
-
-from openvima.policies.batch import HistoryBatch, PromptBatch
-from openvima.policies.gato.config import GatoConfig
-from openvima.policies.nn.decoder import build_decoder
-from openvima.policies.nn.heads import build_action_tokens, build_head
-from openvima.policies.nn.history import ObservationTokens
-from openvima.policies.nn.policy_network import (
-    NUM_END_EFFECTORS,
-    EncodedPrompt,
-    PolicyNetwork,
-)
-from openvima.policies.nn.prompt_encoder import PromptEncoder
-from openvima.policies.nn.vit import VisionTransformer, encode_frames
+from openvima.policies.nn.token_policy import TokenPolicy
 
 
-class Gato(PolicyNetwork):
+class Gato(TokenPolicy):
     """Patches of both views in one causal sequence.
 
         [put, the, 16 patches, into, the, 16 patches, ., end, separator, 16 patches, action, 16 patches, …]
@@ -29,33 +12,3 @@ class Gato(PolicyNetwork):
 
     Source: VIMA (Jiang et al. 2023), baselines; after Gato (Reed et al. 2022).
     """
-
-    def __init__(self, config: GatoConfig) -> None:
-        super().__init__()
-        width = config.decoder.width
-        self.config = config
-        self.frame_encoder = VisionTransformer(config.frame)
-        self.prompt = PromptEncoder(config.prompt, image_token_width=width, width=width)
-        self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
-        self.observation_out = nn.Linear(width + NUM_END_EFFECTORS, width)
-        actions = build_action_tokens(config.head, width)
-        self.decoder = build_decoder(config.decoder)
-        self.head = build_head(config.head, width, actions)
-
-    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode frames (..., 3, 64, 128), uint8, to features of patches (..., P, F)."""
-        return encode_frames(self.frame_encoder, images)
-
-    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> EncodedPrompt:
-        """Encode words and patches through the text encoder."""
-        tokens_IE = _patches(features_KF[prompts.crop_index_VS])
-        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL)
-
-    def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
-        """Make the tokens of all patches of both views."""
-        return self.all_frames(_patches(features_KF[history.crop_index_BTVN]), history)
-
-
-def _patches(features_VNPF: torch.Tensor) -> torch.Tensor:
-    """Flatten (..., V, N, P, F) to (..., V · P · N, F): the first patch of all pairs first."""
-    return features_VNPF.movedim(-4, -3).flatten(-3, -2).transpose(-3, -2).flatten(-3, -2)

@@ -5,7 +5,7 @@ from openvima.policies.published.rules import PREFIX_RULES, SHARED_RULES, Publis
 
 ADAPTER = PublishedAdapter(
     "gato",
-    (*SHARED_RULES, *vit_rules("frame_encoder"), *PREFIX_RULES),
+    (*SHARED_RULES, *vit_rules("images"), *PREFIX_RULES),
     cfg_names=("embed_dim", "n_layer", "n_head"),
     decoder="transformer.lm",
     build=gato,

@@ -3,40 +3,16 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.bins import BinsConfig
-from openvima.policies.nn.decoder import AnyDecoderConfig
-from openvima.policies.nn.heads import HeadConfig
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
-from openvima.policies.nn.vit import VitConfig, check_frame_encoder
+from openvima.policies.nn.token_policy import TokenPolicyConfig
 from openvima.policies.sizes import Size
 
 
 @dataclass(frozen=True, slots=True)
-class GptConfig:
-    """Sizes of VIMA-GPT.
-
-    Args:
-        frame: The encoder of whole frames; its features are as wide as the decoder.
-        prompt: The prompt encoder.
-        decoder: The decoder.
-        head: The action head.
-    """
+class GptConfig(TokenPolicyConfig):
+    """Sizes of VIMA-GPT: one token per pair of frames, and the prompt as prefix."""
 
     architecture: ClassVar[str] = "gpt"
-    frame: VitConfig
-    prompt: PromptEncoderConfig
-    decoder: AnyDecoderConfig
-    head: HeadConfig
-
-    def __post_init__(self) -> None:
-        check_frame_encoder(self.frame, self.decoder.width, class_token=True)
-
-    @property
-    def inputs(self) -> InputLayout:
-        """Input format: how images are tokenized."""
-        size = (self.frame.image_height, self.frame.image_width)
-        return InputLayout("frames", size, tokens_per_frame_pair=1)
 
 
 def gpt(of: Size) -> GptConfig:

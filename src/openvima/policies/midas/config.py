@@ -3,39 +3,17 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
-from openvima.policies.nn.decoder import AnyDecoderConfig
-from openvima.policies.nn.heads import HeadConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.token_policy import TokenPolicyConfig
 from openvima.policies.sizes import Size
 
 
 @dataclass(frozen=True, slots=True)
-class MidasConfig:
-    """Sizes of MIDAS.
-
-    Args:
-        images: The object encoder, with a token for each view.
-        prompt: The prompt encoder.
-        decoder: The decoder.
-        head: The action head.
-    """
+class MidasConfig(TokenPolicyConfig):
+    """Sizes of MIDAS: objects with a token for each view, and the prompt as prefix."""
 
     architecture: ClassVar[str] = "midas"
-    images: ObjectEncoderConfig
-    prompt: PromptEncoderConfig
-    decoder: AnyDecoderConfig
-    head: HeadConfig
-
-    def __post_init__(self) -> None:
-        check_widths(self.images.width, self.decoder.width)
-
-    @property
-    def inputs(self) -> InputLayout:
-        """Input format: how images are tokenized."""
-        return InputLayout("views")
 
 
 def midas(of: Size) -> MidasConfig:

@@ -63,7 +63,8 @@ class PolicyNetwork(nn.Module):
     @property
     def object_encoder(self) -> ObjectEncoder | None:
         """The encoder of object crops; None for models of whole frames."""
-        return getattr(self, "images", None)
+        images = getattr(self, "images", None)
+        return images if isinstance(images, ObjectEncoder) else None
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops or frames of shape (..., 3, height, width), uint8, once each; features (..., F)."""
@@ -174,10 +175,3 @@ class PolicyNetwork(nn.Module):
         effector_BT1E = self.end_effectors(end_effector_BT)[:, :, None]
         effector_BTQE = effector_BT1E.expand(*tokens_BTQE.shape[:3], NUM_END_EFFECTORS)
         return self.observation_out(torch.cat([tokens_BTQE, effector_BTQE], dim=-1))
-
-    def all_frames(self, tokens_BTQE: torch.Tensor, history: HistoryBatch) -> ObservationTokens:
-        """Make the observation tokens of whole frames, all of which exist; the last one is the query."""
-        tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
-        mask_BTQ = history.steps_BT[..., None].expand(tokens_BTQD.shape[:3])
-        query_BT = torch.full_like(history.num_slots_BT, tokens_BTQD.shape[2] - 1)
-        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, history.steps_BT)

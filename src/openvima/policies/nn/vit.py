@@ -134,13 +134,3 @@ class VitBlock(nn.Module):
 def encode_frames(encoder: VisionTransformer, frames: torch.Tensor) -> torch.Tensor:
     """Encode frames (..., 3, height, width), uint8, to (..., F), or (..., P, F) without class token."""
     return encoder(frames.flatten(0, -4)).unflatten(0, frames.shape[:-3])
-
-
-def check_frame_encoder(config: VitConfig, width: int, *, class_token: bool) -> None:
-    """Raise a ConfigError unless features are as wide as the decoder and there is a class token if needed."""
-    if config.output_width != width:
-        raise ConfigError(
-            f"image tokens are {config.output_width} wide, the decoder {width}; make them equal."
-        )
-    if config.class_token != class_token:
-        raise ConfigError(f"policy: class_token of the frame encoder must be {class_token}.")

@@ -3,43 +3,19 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.bins import BinsConfig
 from openvima.policies.nn.conv_encoder import ConvConfig
-from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
-from openvima.policies.nn.heads import HeadConfig
-from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
-from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
+from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.object_encoder import ObjectEncoderConfig
+from openvima.policies.nn.token_policy import TokenPolicyConfig
 from openvima.policies.sizes import Size, size
 
 
 @dataclass(frozen=True, slots=True)
-class VimaConfig:
-    """Sizes of VIMA.
-
-    Args:
-        images: The object encoder.
-        prompt: The prompt encoder.
-        decoder: The decoder.
-        head: The action head.
-        query_token: Append a learned token to each step's objects and decode the action from there, instead
-            of from the last object token.
-    """
+class VimaConfig(TokenPolicyConfig):
+    """Sizes of VIMA: objects, and cross-attention to the prompt."""
 
     architecture: ClassVar[str] = "vima"
-    images: ObjectEncoderConfig
-    prompt: PromptEncoderConfig
-    decoder: AnyDecoderConfig
-    head: HeadConfig
-    query_token: bool = False
-
-    def __post_init__(self) -> None:
-        check_widths(self.images.width, self.decoder.width)
-
-    @property
-    def inputs(self) -> InputLayout:
-        """Input format: how images are tokenized."""
-        return InputLayout("objects" if self.images.fuse_views else "views")
 
 
 def vima(of: Size) -> VimaConfig:

@@ -91,7 +91,7 @@ def crop_parameters(network: PolicyNetwork) -> list[torch.nn.Parameter]:
     """Return what pretraining trains, and behaviour cloning keeps frozen."""
     encoder = network.object_encoder
     if encoder is None:
-        return list(network.get_submodule("frame_encoder").parameters())
+        return list(network.get_submodule("images").parameters())
     appearance = list(encoder.appearance.parameters()) if encoder.config.appearance_width else []
     rotation = list(encoder.rotation.parameters()) if encoder.config.rotation_bins else []
     return [*encoder.crop_encoder.parameters(), *appearance, *rotation]

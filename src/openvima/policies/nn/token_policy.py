@@ -1,0 +1,175 @@
+"""What VIMA, its baselines and MIDAS share: image tokens, a prompt encoder, a decoder, an action head.
+
+They differ in their configs alone, so that ablations exchange one part at a time.
+
+Shape suffixes as in `nn/policy_network.py`; V views, N objects (1 with frames), P patches of a frame, S
+objects and J images in all prompts, I image tokens of all prompts, M latents.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import nn
+
+from openvima.errors import ConfigError
+from openvima.policies.batch import HistoryBatch, PromptBatch
+from openvima.policies.input_layout import InputLayout
+from openvima.policies.nn.autoregressive import AutoregressiveHead
+from openvima.policies.nn.bins import BinsHead
+from openvima.policies.nn.decoder import AnyDecoderConfig, Decoder, build_decoder
+from openvima.policies.nn.heads import HeadConfig, build_action_tokens, build_head
+from openvima.policies.nn.history import ObservationTokens
+from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoder, ObjectEncoderConfig, check_widths
+from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, EncodedPrompt, PolicyNetwork
+from openvima.policies.nn.prompt_encoder import PromptEncoder, PromptEncoderConfig
+from openvima.policies.nn.resampler import Resampler, ResamplerConfig
+from openvima.policies.nn.vit import VisionTransformer, VitConfig, encode_frames
+
+
+@dataclass(frozen=True, slots=True)
+class TokenPolicyConfig:
+    """Sizes of a policy.
+
+    Args:
+        images: Image tokens: those of an object encoder; or of a transformer over whole frames, one per
+            patch, or with a class token one per pair of frames.
+        prompt: The prompt encoder.
+        decoder: The decoder, with cross-attention to the prompt or with the prompt as prefix.
+        head: The action head.
+        resampler: Reduces the objects, or the patches, of both views to a fixed number of tokens; None for
+            none.
+        query_token: Append a learned token to each observation and decode the action from there, instead of
+            from its last image token.
+    """
+
+    architecture: ClassVar[str]
+    images: ObjectEncoderConfig | VitConfig
+    prompt: PromptEncoderConfig
+    decoder: AnyDecoderConfig
+    head: HeadConfig
+    resampler: ResamplerConfig | None = None
+    query_token: bool = False
+
+    def __post_init__(self) -> None:
+        images, width = self.images, self.decoder.width
+        check_widths(images.output_width if isinstance(images, VitConfig) else images.width, width)
+        if self.resampler is None:
+            return
+        if isinstance(images, VitConfig) and images.class_token:
+            raise ConfigError("policy: a resampler needs patches; images.class_token must be False.")
+        if width % self.resampler.num_heads:
+            raise ConfigError(
+                f"resampler: width {width} must be a multiple of its {self.resampler.num_heads} heads."
+            )
+
+    @property
+    def inputs(self) -> InputLayout:
+        """Input format: how images are tokenized."""
+        images, tokens = self.images, self.resampler.num_latents if self.resampler else 0
+        if isinstance(images, ObjectEncoderConfig):
+            return InputLayout("objects" if images.fuse_views else "views", tokens_per_image=tokens)
+        tokens = tokens or (1 if images.class_token else NUM_VIEWS * images.num_patches)
+        return InputLayout("frames", (images.image_height, images.image_width), tokens)
+
+
+class TokenPolicy(PolicyNetwork):
+    """Image tokens in prompt and history, and one of two decoders; the architectures draw theirs."""
+
+    def __init__(self, config: TokenPolicyConfig) -> None:
+        super().__init__()
+        images, width = config.images, config.decoder.width
+        has_objects = isinstance(images, ObjectEncoderConfig)
+        self.config = config
+        self.images = ObjectEncoder(images) if has_objects else VisionTransformer(images)
+        self.resampler = Resampler(config.resampler, width) if config.resampler else None
+        token_width = width if has_objects or not images.class_token else NUM_VIEWS * width
+        self.prompt = PromptEncoder(config.prompt, image_token_width=token_width, width=width)
+        self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
+        self.observation_out = nn.Linear(token_width + NUM_END_EFFECTORS, width)
+        actions = build_action_tokens(config.head, width)
+        self.decoder = build_decoder(config.decoder)
+        self.query = nn.Parameter(torch.randn(width) * 0.02) if config.query_token else None
+        self.head = build_head(config.head, width, actions)
+        # Other heads have no bins, and the other decoder no attention to the prompt alone.
+        has_bins = isinstance(self.head, BinsHead | AutoregressiveHead)
+        self.explains = has_bins and isinstance(self.decoder, Decoder)
+
+    def encode_images(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode crops or frames (..., 3, height, width), uint8, to features (..., F), or (..., P, F)."""
+        if isinstance(self.images, ObjectEncoder):
+            return self.images.encode_images(images)
+        return encode_frames(self.images, images)
+
+    def encode_prompt(self, prompts: PromptBatch, features_KF: torch.Tensor) -> EncodedPrompt:
+        """Encode words and image tokens through the text encoder."""
+        features_VSF = features_KF[prompts.crop_index_VS]
+        if isinstance(self.images, ObjectEncoder):
+            tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
+            if self.resampler is not None and len(tokens_IE):
+                tokens_IE = self._resample_images(self.resampler, prompts, tokens_IE)
+        else:
+            tokens_IE = self._frame_tokens(features_VSF)
+        return EncodedPrompt(self.prompt(prompts, tokens_IE), prompts.mask_BL)
+
+    def observe(self, history: HistoryBatch, features_KF: torch.Tensor) -> ObservationTokens:
+        """Make the image tokens of each step, and the query behind them if there is one."""
+        features_BTVNF = features_KF[history.crop_index_BTVN]
+        steps_BT, mask_BTQ = history.steps_BT, None
+        if isinstance(self.images, ObjectEncoder):
+            tokens_BTQE = self.images(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
+            fused = self.images.config.fuse_views
+            mask_BTQ = history.masks_BTVN.any(dim=2) if fused else history.masks_BTVN.flatten(2)
+            if self.resampler is not None:
+                tokens_BTQE, mask_BTQ = self.resampler(tokens_BTQE, mask_BTQ), None
+        else:
+            tokens_BTQE = self._frame_tokens(features_BTVNF)
+        tokens_BTQD = self.add_end_effector(tokens_BTQE, history.end_effector_BT)
+        query_BT = torch.full_like(history.num_slots_BT, tokens_BTQD.shape[2] - 1)
+        if mask_BTQ is not None:
+            # The last slot of the episode itself, be it padding or not; beyond it lies padding of the batch.
+            query_BT = query_BT - history.masks_BTVN.shape[-1] + history.num_slots_BT.clamp(min=1)
+        else:
+            mask_BTQ = steps_BT[..., None].expand(tokens_BTQD.shape[:3])
+        if self.query is not None:
+            query_BT = torch.full_like(query_BT, tokens_BTQD.shape[2])
+            query_BT1D = self.query.expand(*tokens_BTQD.shape[:2], 1, -1)
+            tokens_BTQD = torch.cat([tokens_BTQD, query_BT1D], dim=2)
+            mask_BTQ = torch.cat([mask_BTQ, steps_BT[..., None]], dim=2)
+        return ObservationTokens(tokens_BTQD, mask_BTQ, query_BT, steps_BT)
+
+    def _frame_tokens(self, features: torch.Tensor) -> torch.Tensor:
+        """Make tokens of pairs of frames, (..., tokens · N, E): the first token of all pairs first.
+
+        Args:
+            features: Of class tokens, (..., V, N, F), or of patches, (..., V, N, P, F).
+        """
+        if self.config.images.class_token:
+            return features.transpose(-3, -2).flatten(-2)
+        patches = features.movedim(-4, -3).flatten(-3, -2)  # (..., N, V · P, F)
+        tokens = patches if self.resampler is None else self.resampler(patches)
+        return tokens.transpose(-3, -2).flatten(-3, -2)
+
+    def _resample_images(
+        self, resampler: Resampler, prompts: PromptBatch, tokens_IE: torch.Tensor
+    ) -> torch.Tensor:
+        """Resample the objects of each image in the prompts, (latents · S, E): the first latent of all first.
+
+        The image tokens are numbered by the first object of their image; those of its others are copies.
+        """
+        count = prompts.masks_VS.shape[1]
+        index_BL = prompts.object_index_BL
+        is_first_S = torch.zeros(count, dtype=torch.bool, device=tokens_IE.device)
+        is_first_S[index_BL[index_BL >= 0] % count] = True
+        image_S, first_J = is_first_S.cumsum(dim=0) - 1, is_first_S.nonzero().squeeze(1)
+        slot_S = torch.arange(count, device=tokens_IE.device) - first_J[image_S]
+        mask_QS = prompts.masks_VS
+        if len(tokens_IE) == count:  # fused views
+            mask_QS = mask_QS.any(dim=0, keepdim=True)
+        tokens_QSE = tokens_IE.unflatten(0, mask_QS.shape)
+        shape = (len(first_J), int(slot_S.max()) + 1, len(mask_QS))
+        tokens_JNQE = tokens_IE.new_zeros(*shape, tokens_IE.shape[-1])
+        tokens_JNQE = tokens_JNQE.index_put((image_S, slot_S), tokens_QSE.transpose(0, 1))
+        mask_JNQ = mask_QS.new_zeros(shape).index_put((image_S, slot_S), mask_QS.T)
+        latents_JME = resampler(tokens_JNQE.flatten(1, 2), mask_JNQ.flatten(1))
+        return latents_JME[image_S].transpose(0, 1).flatten(0, 1)
