@@ -103,12 +103,12 @@ def t5_prompt_encoder(name: str) -> PromptEncoderConfig:
 
 
 def t5_name(text: TextEncoderConfig) -> str:
-    """Return which T5 1.0 a text encoder is, for messages, with its sizes."""
-    name = next((name for name, of in T5_SIZES.items() if of == text), "a T5 1.0")
-    return (
-        f"{name} ({text.width} wide, {text.num_layers} layers, {text.num_heads} heads of {text.head_width}, "
-        f"{text.hidden_width} hidden)"
+    """Return name and sizes of a T5 1.0, for messages."""
+    sizes = (
+        f"{text.width} wide, {text.num_layers} layers, {text.num_heads} heads of {text.head_width}, "
+        f"{text.hidden_width} hidden"
     )
+    return next((f"{name} ({sizes})" for name, of in T5_SIZES.items() if of == text), sizes)
 
 
 def _published(width: int, num_layers: int) -> Size:

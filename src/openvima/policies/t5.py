@@ -160,7 +160,9 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     text = network.config.prompt.text
     named = str(path_or_hub_id).rpartition("/")[2]
     if named in T5_SIZES and T5_SIZES[named] != text and not Path(path_or_hub_id).exists():
-        raise CheckpointError(f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give that.")
+        raise CheckpointError(
+            f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give a T5 1.0 of that size."
+        )
     file = _weights_file(path_or_hub_id)
     tensors = _read_encoder(file)
     expected = _expected(network)
@@ -168,8 +170,8 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     if problems:
         more = f"; and {len(problems) - _MAX_LISTED} more" if len(problems) > _MAX_LISTED else ""
         raise CheckpointError(
-            f"{file} does not fit the text encoder, {t5_name(text)}: "
-            f"{'; '.join(problems[:_MAX_LISTED])}{more}."
+            f"{file} does not fit the text encoder: {'; '.join(problems[:_MAX_LISTED])}{more}. "
+            f"It needs a T5 1.0: {t5_name(text)}."
         )
     for name, tensor in expected.items():
         tensor.copy_(tensors[name])

@@ -55,8 +55,8 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
     needs_t5 = sizes.prompt.tokenizer == "t5"
     if needs_t5 and config.t5 is None and config.init_from is None:
         raise ConfigError(
-            f"preset {config.preset!r} encodes prompts with {t5_name(sizes.prompt.text)}; set t5 to the "
-            "folder that holds it, or to its name to fetch it from the Hugging Face Hub, or set "
+            f"preset {config.preset!r} encodes prompts with T5; set t5 to the folder that holds "
+            f"{t5_name(sizes.prompt.text)}, or to its name to fetch it from the Hugging Face Hub, or set "
             "model.text_encoder to 'small', which needs no files."
         )
     if config.t5 is not None and not needs_t5:
