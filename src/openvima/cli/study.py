@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +18,7 @@ def main(
     out: Path,
     scale: Literal["nano", "2m", "4m", "9m", "20m", "43m", "92m", "200m"] = "nano",
     seeds: int = 1,
+    episodes: int | None = None,
     policy: str = "",
     t5: str | None = None,
     assets: str = "procedural",
@@ -33,15 +35,19 @@ def main(
     Example: openvima study data-scaling --scale nano --seeds 3 --workers 2 --out data_scaling
 
     Args:
-        name: data-scaling; or FILE.py:FUNCTION for a study of your own.
+        name: model-scaling, data-scaling, image-tokens, conditioning, text-encoder, distractors,
+            corrupted-prompts, level-drop, midas, in-context or published; or FILE.py:FUNCTION for a study of
+            your own.
         out: Folder of the study.
         scale: Sizes of networks, data and evaluation. nano takes minutes to an hour on two cores; the others
             follow the papers.
         seeds: Training seeds; 3 show the variation between trainings. More can be added later.
-        policy: Policies to evaluate, comma-separated, for studies that train none.
-        t5: T5 weights and tokenizer, for networks that use them: a folder, or an id such as t5-base.
+        episodes: Episodes of each task, level and training seed; by default 50 at nano, else 200.
+        policy: Policies to evaluate, comma-separated, for the studies distractors and corrupted-prompts; by
+            default openvima-small.
+        t5: T5 weights and tokenizer, for scales above nano: a folder, or an id such as t5-base.
         assets: procedural, original, a checkout of the original benchmark, or FILE.py:FUNCTION.
-        checkpoint: A published checkpoint, for studies of one.
+        checkpoint: For the study published: a public checkpoint as `openvima policies convert` writes it.
         workers: Trainings at a time, and processes of generating and evaluating; by default one, or all CPUs
             of the Ray cluster at --address.
         engine: processes of this machine, or ray.
@@ -52,11 +58,20 @@ def main(
     Returns:
         Exit status.
     """
-    from openvima.studies import Execution, StudyInputs, make_study, run_study, scale_named
+    from openvima.studies import Execution, StudyInputs, check_options, make_study, run_study, scale_named
 
-    inputs = StudyInputs(scale_named(scale), parse_list(policy), t5, assets, checkpoint)
+    sizes = scale_named(scale)
+    if episodes is not None:
+        sizes = replace(sizes, episodes=episodes)
+    inputs = StudyInputs(sizes, parse_list(policy), t5, assets, checkpoint)
     study = make_study(name, inputs)
-    options = {"policy": policy, "t5": t5, "assets": assets if assets != "procedural" else None}
+    check_options(name, inputs)
+    options = {
+        "episodes": str(episodes or ""),
+        "policy": policy,
+        "t5": t5,
+        "assets": assets if assets != "procedural" else None,
+    }
     options |= {"checkpoint": checkpoint, "device": device}
     words = [f"--{option} {shlex.quote(value)}" for option, value in options.items() if value]
     start = f"openvima study {shlex.quote(name)} --scale {scale} --seeds {seeds}"

@@ -23,6 +23,7 @@ __all__ = [
     "Scale",
     "Study",
     "StudyInputs",
+    "check_options",
     "make_study",
     "published_points",
     "run_study",
@@ -30,5 +31,12 @@ __all__ = [
 ]
 
 __getattr__, __dir__ = lazy_names(
-    __name__, {"Execution": "runner", "run_study": "runner", "STUDIES": "registry", "make_study": "registry"}
+    __name__,
+    {
+        "Execution": "runner",
+        "run_study": "runner",
+        "STUDIES": "registry",
+        "check_options": "registry",
+        "make_study": "registry",
+    },
 )

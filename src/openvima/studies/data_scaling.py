@@ -4,14 +4,7 @@ Every fraction is trained for the same number of steps, and each training seed d
 """
 
 from openvima.report.published_curves import data_fraction_curves
-from openvima.studies.study import (
-    Demonstrations,
-    EvaluationSettings,
-    Run,
-    Study,
-    StudyInputs,
-    published_points,
-)
+from openvima.studies.study import Run, Study, StudyInputs, published_points
 
 FRACTIONS = (0.001, 0.01, 0.1, 1.0)
 
@@ -19,15 +12,16 @@ FRACTIONS = (0.001, 0.01, 0.1, 1.0)
 def data_scaling(inputs: StudyInputs) -> Study:
     """Fractions of the demonstrations, as published for VIMA 92M and MIDAS 92M."""
     scale = inputs.scale
+    network = {"preset": "nano"} if scale.is_nano else inputs.network("vima")
     return Study(
         name="data-scaling",
         question="How does success depend on the number of demonstrations?",
         quantity="fraction of the demonstrations",
-        data=Demonstrations(scale.tasks, scale.demonstrations),
+        data=inputs.demonstrations(),
         # Too few demonstrations are held out of a small fraction to choose a checkpoint: the last one counts.
-        settings={"preset": scale.preset, "loader.validation_fraction": 0.0},
+        settings={**network, "loader.validation_fraction": 0.0},
         runs=tuple(Run(_percent(f), x=f, data_fraction=f) for f in FRACTIONS),
-        evaluation=EvaluationSettings((*scale.tasks, *scale.new_tasks), scale.levels, scale.episodes),
+        evaluation=inputs.evaluation(),
         logarithmic=True,
         ticks={fraction: _percent(fraction) for fraction in FRACTIONS},
         published=published_points(scale.levels, data_fraction_curves),

@@ -40,7 +40,7 @@ def study_page(
         levels=levels,
         figure=rate_figure_html(study_figure(study, points)),
         rows=_rows(points),
-        tasks={level: next(p.tasks for p in points if p.level == level) for level in levels},
+        tasks={level: max((p.tasks for p in points if p.level == level), key=len) for level in levels},
         points=points,
         costs={label: _mean_costs(of_run) for label, of_run in costs.items()},
         reliability=RELIABILITY if study.published else "",

@@ -12,8 +12,32 @@ from openvima.user_code import is_code, load_function
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "data-scaling": "success by the fraction of the demonstrations",
+        "conditioning": "cross-attention to the prompt, or the prompt as a prefix",
+        "distractors": "success of policies by the number of distractors",
+        "corrupted-prompts": "success of policies with masked, swapped or replaced words",
+        "level-drop": "from L1 to L4, by architecture",
+        "midas": "autoregressive actions, visual residual, pretraining",
+        "in-context": "examples in prompts of tasks left out of the training",
+        "published": "a public checkpoint with the original assets, beside its published numbers",
     }
 )
+
+# Options that not every study takes.
+_TAKERS = {"policy": ("distractors", "corrupted-prompts"), "checkpoint": ("published",)}
+
+
+def check_options(name: str, inputs: StudyInputs) -> None:
+    """Check that a study takes the options; those of users take all.
+
+    Raises:
+        ConfigError: An option has no effect on the study.
+    """
+    given = {"policy": inputs.policies, "checkpoint": inputs.checkpoint}
+    for option, takers in _TAKERS.items():
+        if given[option] and name in STUDIES and name not in takers:
+            raise ConfigError(f"study {name!r} takes no --{option}; {' and '.join(takers)} do.")
+    if inputs.t5 is not None and inputs.scale.is_nano and name in STUDIES:
+        raise ConfigError("scale nano has its own vocabulary and no T5; leave --t5 out.")
 
 
 def make_study(name: str, inputs: StudyInputs) -> Study:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from openvima.evaluation.ablations import scenes_of
 from openvima.evaluation.results import Results
 from openvima.evaluation.statistics import (
     Interval,
@@ -62,52 +63,58 @@ def study_points(study: Study, plan: Plan) -> list[Point]:
                 reference = (
                     (results, "") if ablation and settings.plain else (found[study.runs[0].label], ablation)
                 )
-                points.append(_point(study, run, results, ablation, level, reference))
+                if point := _point(study, run, (results, ablation), reference, level):
+                    points.append(point)
     return points
 
 
-def _point(
-    study: Study,
-    run: Run,
-    results: Sequence[Results],
-    ablation: str,
-    level: str,
-    reference: tuple[Sequence[Results], str],
-) -> Point:
-    outcomes = [_outcomes(of_seed, level, ablation) for of_seed in results]
-    tasks = tuple(outcomes[0])
+_Scores = tuple[Sequence[Results], str]  # of each seed, and the ablation
+_Outcomes = Mapping[str, Mapping[int, bool]]  # success by task and seed of the episode
+
+
+def _point(study: Study, run: Run, scores: _Scores, reference: _Scores, level: str) -> Point | None:
+    """Return a mean; None if the level holds none of the tasks that the ablation applies to."""
+    outcomes, ablation = _outcomes(scores, level), scores[1]
+    if not outcomes[0]:
+        return None
     counts = [[(sum(o.values()), len(o)) for o in of_seed.values()] for of_seed in outcomes]
-    others = [_outcomes(of_seed, level, reference[1]) for of_seed in reference[0]]
-    x = {"run": run.x or run.label, "level": level, "ablation": ablation_name(ablation) or "as it is"}[
-        study.x_axis
-    ]
     series = run.series or (run.label if study.x_axis != "run" else "")
     if ablation and study.x_axis == "run":
         series = " · ".join(filter(None, (series, ablation_name(ablation))))
-    difference = None if others == outcomes else _difference(outcomes, others)
+    is_paired = scores != reference and scenes_of(ablation) == scenes_of(reference[1])
+    difference = _difference(outcomes, _outcomes(reference, level)) if is_paired else None
     return Point(
         run.label,
         series,
-        x,
+        _position(study, run, level, ablation),
         level,
         ablation,
-        tasks,
+        tuple(outcomes[0]),
         counts[0][0][1],
         mean_over_seeds(counts),
         *(difference or (None, None)),
     )
 
 
-def _difference(
-    outcomes: Sequence[Mapping[str, Mapping[int, bool]]], others: Sequence[Mapping[str, Mapping[int, bool]]]
-) -> tuple[float, Interval] | None:
-    """Difference on the same episodes; None if they are not the same."""
-    keys = [[(task, tuple(o)) for task, o in of_seed.items()] for of_seed in outcomes]
-    if keys != [[(task, tuple(o)) for task, o in of_seed.items()] for of_seed in others]:
+def _position(study: Study, run: Run, level: str, ablation: str) -> float | str:
+    if study.x_axis == "level":
+        return level
+    if study.x_axis == "ablation":
+        return ablation_name(ablation) or "as it is"
+    if study.x_axis == "rate":
+        return float(ablation.partition(":")[2] or 0)
+    return run.label if run.x == "" else run.x
+
+
+def _difference(outcomes: Sequence[_Outcomes], others: Sequence[_Outcomes]) -> tuple[float, Interval] | None:
+    """Difference over the tasks of both, on the same episodes; None if there are none."""
+    if len(outcomes) != len(others):
         return None
-    return difference_over_seeds(
-        [[_pair_counts(a[task], b[task]) for task in a] for a, b in zip(outcomes, others, strict=True)]
-    )
+    tasks = [t for t, played in outcomes[0].items() if played.keys() == others[0].get(t, {}).keys()]
+    if not tasks:
+        return None
+    pairs = zip(outcomes, others, strict=True)
+    return difference_over_seeds([[_pair_counts(a[task], b[task]) for task in tasks] for a, b in pairs])
 
 
 def _pair_counts(a: Mapping[int, bool], b: Mapping[int, bool]) -> PairCounts:
@@ -117,13 +124,17 @@ def _pair_counts(a: Mapping[int, bool], b: Mapping[int, bool]) -> PairCounts:
     )
 
 
-def _outcomes(results: Results, level: str, ablation: str) -> dict[str, dict[int, bool]]:
-    """Success by task and seed of the episode."""
-    return {
-        row.task: {outcome.seed: outcome.success for outcome in row.outcomes}
-        for row in results.rows
-        if (row.level, row.ablation) == (level, ablation)
-    }
+def _outcomes(scores: _Scores, level: str) -> list[dict[str, dict[int, bool]]]:
+    """Success by task and seed of the episode, for each training seed."""
+    results, ablation = scores
+    return [
+        {
+            row.task: {outcome.seed: outcome.success for outcome in row.outcomes}
+            for row in of_seed.rows
+            if (row.level, row.ablation) == (level, ablation)
+        }
+        for of_seed in results
+    ]
 
 
 def _ablations(results: Sequence[Results]) -> list[str]:

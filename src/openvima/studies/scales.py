@@ -33,7 +33,6 @@ class Scale:
 
     Args:
         name: A size of the presets: "nano", "2m" to "200m".
-        preset: Network of studies of a single one.
         recipe: Training settings; `settings` take precedence.
         settings: Training settings by dotted name.
         tasks: Tasks to train on.
@@ -44,7 +43,6 @@ class Scale:
     """
 
     name: str
-    preset: str
     recipe: str
     settings: Mapping[str, Any]  # Any: values of any setting
     tasks: tuple[str, ...]
@@ -53,15 +51,15 @@ class Scale:
     levels: tuple[str, ...] = ("L1", "L2", "L3", "L4")
     episodes: int = 200
 
-    def sized(self, architecture: str) -> str:
-        """Return the preset of an architecture of the papers, such as "gato-nano"."""
-        return f"{architecture}-{self.name}"
+    @property
+    def is_nano(self) -> bool:
+        """Whether it is the scale of two cores, with networks that have their own vocabulary."""
+        return self.name == NANO
 
 
 # Two cores: one training takes minutes.
 _NANO = Scale(
     name=NANO,
-    preset="nano",
     recipe="nano",
     settings=MappingProxyType({"schedule.steps": 400, "loader.batch_size": 64, "runtime.tensorboard": False}),
     tasks=("visual_manipulation", "scene_understanding", "rotate", "novel_noun"),
@@ -75,7 +73,6 @@ def _published(size: str) -> Scale:
     """Everything as in the papers, save the size of the network."""
     return Scale(
         name=size,
-        preset=f"vima-{size}",
         recipe="paper",
         settings=MappingProxyType({"schedule.steps": 47_000}),  # 10 epochs of 600,000, in batches of 128
         tasks=TRAINING_TASKS,

@@ -13,25 +13,6 @@ Settings = Mapping[str, Any]  # of `TrainingConfig`, by dotted name. Any: values
 
 
 @dataclass(frozen=True, slots=True)
-class StudyInputs:
-    """What a study is made from: the scale, and options of the command.
-
-    Args:
-        scale: Sizes.
-        policies: Policies to evaluate, for studies that train none.
-        t5: Source of the T5 weights and tokenizer.
-        assets: Asset pack.
-        checkpoint: A published checkpoint.
-    """
-
-    scale: Scale
-    policies: tuple[str, ...] = ()
-    t5: str | None = None
-    assets: str = "procedural"
-    checkpoint: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Demonstrations:
     """Demonstrations to generate; runs with equal ones share them.
 
@@ -65,6 +46,62 @@ class EvaluationSettings:
     ablations: tuple[str, ...] = ()
     env_config: EnvConfig = DEFAULT_ENV_CONFIG
     plain: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class StudyInputs:
+    """What a study is made from: the scale, and options of the command.
+
+    Args:
+        scale: Sizes.
+        policies: Policies to evaluate, for studies that train none.
+        t5: Source of the T5 weights and tokenizer.
+        assets: Asset pack.
+        checkpoint: A published checkpoint.
+    """
+
+    scale: Scale
+    policies: tuple[str, ...] = ()
+    t5: str | None = None
+    assets: str = "procedural"
+    checkpoint: str | None = None
+
+    def network(self, architecture: str) -> Settings:
+        """Return the training settings of an architecture of the papers, such as "vima", at this scale.
+
+        Raises:
+            ConfigError: It needs T5, which is not given.
+        """
+        preset = f"{architecture}-{self.scale.name}"
+        return {"preset": preset} if self.scale.is_nano else {"preset": preset, "t5": self.needed_t5()}
+
+    def needed_t5(self) -> str:
+        """Return the source of T5.
+
+        Raises:
+            ConfigError: It is not given.
+        """
+        if self.t5 is None:
+            raise ConfigError(
+                f"scale {self.scale.name} encodes prompts with T5; give --t5 the folder that holds it, or "
+                "'t5-base' to fetch it from the Hugging Face Hub."
+            )
+        return self.t5
+
+    def demonstrations(self, tasks: tuple[str, ...] = ()) -> Demonstrations:
+        """Return the demonstrations of the scale; of its tasks if none are named."""
+        scale = self.scale
+        return Demonstrations(tasks or scale.tasks, scale.demonstrations, EnvConfig(self.assets))
+
+    def evaluation(
+        self, tasks: tuple[str, ...] = (), levels: tuple[str, ...] = (), **values: Any
+    ) -> EvaluationSettings:  # Any: further fields
+        """Return the evaluation of the scale; on its tasks and new ones if none are named."""
+        scale = self.scale
+        tasks, levels = tasks or (*scale.tasks, *scale.new_tasks), levels or scale.levels
+        return EvaluationSettings(
+            tasks, levels, scale.episodes, **{"env_config": EnvConfig(self.assets), **values}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +180,8 @@ class Study:
         evaluation: How they are evaluated.
         data: Demonstrations of the runs that train.
         settings: Training settings of all runs, over those of the scale.
-        x_axis: What is on the axis: "run", the quantity of the runs; "level"; or "ablation".
+        x_axis: What is on the axis: "run", the quantity of the runs; "level"; "ablation"; or "rate", the
+            number in the names of ablations.
         logarithmic: Whether the x axis is.
         ticks: Names of values of the quantity, where they are not plain numbers.
         published: Published numbers to show beside.
@@ -160,7 +198,7 @@ class Study:
     evaluation: EvaluationSettings
     data: Demonstrations | None = None
     settings: Settings = field(default_factory=dict)
-    x_axis: Literal["run", "level", "ablation"] = "run"
+    x_axis: Literal["run", "level", "ablation", "rate"] = "run"
     logarithmic: bool = False
     ticks: Mapping[float, str] = field(default_factory=dict)
     published: tuple[PublishedPoint, ...] = ()

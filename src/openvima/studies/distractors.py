@@ -1,0 +1,33 @@
+"""How does success fall with the number of distractors on the table?"""
+
+from openvima.policies.bundled import SMALL
+from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
+from openvima.studies.study import Run, Study, StudyInputs
+
+COUNTS = (0, 1, 2, 4, 6)
+WITHOUT_OPTION = "pick_in_order_then_restore"
+
+
+def distractors(inputs: StudyInputs) -> Study:
+    """Existing policies on all tasks that take distractors."""
+    tasks = tuple(task for task in (*TRAINING_TASKS, *L4_TASKS) if task != WITHOUT_OPTION)
+    return Study(
+        name="distractors",
+        question="How does success fall with the number of distractors?",
+        quantity="distractors on the table",
+        runs=tuple(Run(run_label(policy), policy=policy) for policy in inputs.policies or (SMALL,)),
+        evaluation=inputs.evaluation(
+            tasks, plain=False, ablations=tuple(f"num_distractors:{count}" for count in COUNTS)
+        ),
+        x_axis="rate",
+        notes=(
+            "Episodes with other numbers of distractors are other scenes; they are not paired.",
+            f"All tasks but {WITHOUT_OPTION}, which has no distractors.",
+        ),
+    )
+
+
+def run_label(policy: str) -> str:
+    """Name of a policy given as NAME=SOURCE or SOURCE."""
+    name, equals, _ = policy.partition("=")
+    return name if equals else policy.rstrip("/").rpartition("/")[2]
