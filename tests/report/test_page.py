@@ -15,6 +15,7 @@ from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
 from openvima.report.page import default_command
 from openvima.report.published import published_tasks
+from openvima.report.text import role
 from openvima.video.clips import load_clips, save_clips
 
 
@@ -396,3 +397,8 @@ def test_a_single_episode_is_counted_in_the_singular(results, tmp_path):
     row = replace(results.rows[0], outcomes=results.rows[0].outcomes[:1])
     path = write_report(replace(results, rows=(row,)), tmp_path / "report.html")
     assert "1 level, 1 episode each; 1 episode in all" in path.read_text(encoding="utf-8")
+
+
+def test_a_policy_is_described_with_the_tasks_that_its_training_left_out(results) -> None:
+    policies = {**results.policies, "mine": {"kind": "run", "excluded_tasks": ["follow_order", "twist"]}}
+    assert role(replace(results, policies=policies), "mine").endswith(" Trained without follow_order, twist.")

@@ -57,8 +57,11 @@ def ablation_descriptions(ablations: Iterable[str]) -> dict[str, str]:
 
 
 def role(results: Results, policy: str) -> str:
-    """One or two sentences on what a policy is."""
-    return _ROLES.get(results.policies.get(policy, {}).get("kind", "run"), _ROLES["run"])
+    """One or two sentences on what a policy is, and the tasks that its training left out."""
+    record = results.policies.get(policy, {})
+    excluded = record.get("excluded_tasks")
+    left_out = f" Trained without {', '.join(map(str, excluded))}." if isinstance(excluded, list) else ""
+    return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + left_out
 
 
 def series_colours(results: Results) -> dict[str, str]:
