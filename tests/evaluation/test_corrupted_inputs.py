@@ -157,7 +157,7 @@ def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_
         ("masked_words:1.5", "must be a number above 0 to 1"),
         ("masked_words:nan", "must be a number"),
         ("noisy_boxes:2.5", "must be an integer from 1 to 32"),
-        ("num_distractors:99", "must be an integer from 0 to 20"),
+        ("num_distractors:99", "must be an integer from 0 to 6"),
         ("gibberish_words:0.2", "gibberish_words takes no rate"),
         ("no_prompt+random", "random stands alone"),
         ("text_prompts+paraphrased_prompts", "exclude each other"),
@@ -183,16 +183,18 @@ def test_environments_change_for_the_tasks_that_have_the_form_or_the_option():
     assert crowded.task_options == "num_distractors=6,rotate.difficulty=medium"
     assert ablated_environment("masked_words:0.2", plain) == plain
     assert applies_to("num_distractors:6", "rotate", crowded)
-    config = EvaluationConfig(("untrained",), ("rotate", "rearrange", "same_shape"), ("L1",), 1)
+    config = EvaluationConfig(
+        ("untrained",), ("rotate", "rearrange", "pick_in_order_then_restore"), ("L1",), 1
+    )
     tasks = {
         ablation: [task for task, _ in cells(config, ablation)]
         for ablation in ("", "text_prompts", "num_distractors:2", "num_distractors:6+masked_words:0.1")
     }
     assert list(tasks.values()) == [
-        ["rotate", "rearrange", "same_shape"],
-        ["rotate", "same_shape"],
-        ["rotate", "same_shape"],
-        ["rotate"],
+        ["rotate", "rearrange", "pick_in_order_then_restore"],
+        ["rotate", "pick_in_order_then_restore"],
+        ["rotate", "rearrange"],
+        ["rotate", "rearrange"],
     ]
     asked = EvaluationConfig(("untrained",), ("rotate", "rearrange"), ("L1",), 1, ablations=("text_prompts",))
     assert [(b.ablation, b.task, b.env_config.prompts) for b in plan(asked)] == [
@@ -205,8 +207,8 @@ def test_environments_change_for_the_tasks_that_have_the_form_or_the_option():
 def test_an_environment_that_is_so_already_or_fits_no_task_is_an_error():
     with pytest.raises(ConfigError, match="text_prompts changes nothing"):
         ablated_environment("text_prompts", EnvConfig(prompts="text"))
-    with pytest.raises(ConfigError, match="num_distractors:6 applies to none of the tasks rearrange"):
-        cells(EvaluationConfig(("untrained",), ("rearrange",)), "num_distractors:6")
+    with pytest.raises(ConfigError, match="text_prompts applies to none of the tasks rearrange"):
+        cells(EvaluationConfig(("untrained",), ("rearrange",)), "text_prompts")
 
 
 def test_every_ablation_says_what_it_does_in_one_sentence():

@@ -54,12 +54,13 @@ def test_a_task_that_is_not_there_is_named():
 
 
 def test_harder_episodes_leave_out_other_tasks_and_moved_boxes_need_a_network():
-    cells = {"tasks": ("rotate", "rearrange"), "levels": ("L1",), "episodes": 1}
+    cells = {"tasks": ("rotate", "pick_in_order_then_restore"), "levels": ("L1",), "episodes": 1}
     rows = score({"idle": Idle()}, **cells, ablations=("text_prompts", "num_distractors:6")).rows
     assert [(row.ablation, row.task) for row in rows] == [
         ("", "rotate"),
-        ("", "rearrange"),
+        ("", "pick_in_order_then_restore"),
         ("text_prompts", "rotate"),
+        ("text_prompts", "pick_in_order_then_restore"),
         ("num_distractors:6", "rotate"),
     ]
     with pytest.raises(ConfigError, match="policy idle extracts objects by code of its own"):

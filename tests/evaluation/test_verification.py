@@ -140,11 +140,11 @@ def test_an_episode_that_an_invalid_action_ends_is_replayed_up_to_it():
 def test_harder_episodes_are_replayed_with_their_own_environment(tmp_path):
     ablations, policy = ("num_distractors:6", "paraphrased_prompts"), "mine=openvima.policies:RandomPolicy"
     config = EvaluationConfig(
-        (policy,), ("rotate", "rearrange"), ("L1",), 1, out=tmp_path, ablations=ablations
+        (policy,), ("rotate", "pick_in_order_then_restore"), ("L1",), 1, out=tmp_path, ablations=ablations
     )
     path = evaluate(config)
     found = verify_results(tmp_path)
-    assert (found.problems, found.episodes) == ((), 2 + 1 + 1)  # `rearrange` has neither
+    assert (found.problems, found.episodes) == ((), 2 + 1 + 2)  # of two tasks one has the option
     results = Results.read(path)
     rows = tuple(replace(row, ablation=row.ablation.replace("6", "2")) for row in results.rows)
     settings = {**results.config, "ablations": ["num_distractors:2", "paraphrased_prompts"]}

@@ -41,7 +41,7 @@ def with_num_distractors(env_config: EnvConfig, count: float) -> EnvConfig:
 
 
 def allows_num_distractors(task: str, env_config: EnvConfig) -> bool:
-    """Whether a task has the option and takes as many; most take three at most."""
+    """Whether a task has the option and takes as many."""
     entries = TaskOptions.parse(env_config.task_options).entries
     (own,) = (entry for entry in entries if entry[1] == _NUM_DISTRACTORS)
     try:

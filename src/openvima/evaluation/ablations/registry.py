@@ -24,6 +24,7 @@ from openvima.evaluation.ablations.words import gibberish, masked, scrambled, sw
 from openvima.evaluation.in_context import in_context_prompt
 from openvima.evaluation.oracle_demonstration import demonstrated
 from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.tasks.options import MAX_DISTRACTORS
 from openvima.tasks.seeding import make_rng
 
 DETECTED_BOXES, NOISY_BOXES = "detected_boxes", "noisy_boxes"
@@ -134,7 +135,7 @@ INPUT_ABLATIONS = {
             "So many distractors lie on the table, in scenes of their own.",
             environment=with_num_distractors,
             takes=allows_num_distractors,
-            rate=Rate(0, 20, 6),
+            rate=Rate(0, MAX_DISTRACTORS, 6),
             changes_scenes=True,
         ),
         InputAblation(
