@@ -112,7 +112,7 @@ def _span(content: bytearray, rng: np.random.Generator) -> tuple[int, int]:
 def content_of(path: Path) -> list[bytes]:
     """Return all that a file of the object cache holds: what it is of, and its episodes."""
     file = CacheFile(path)
-    about = (file.kind, file.source, file.boxes, len(file), sorted(file.texts()))
+    about = (file.kind, file.source, file.variant, len(file), sorted(file.texts()))
     return [pickle.dumps(about), *(pickle.dumps(file[row]) for row in range(len(file)))]
 
 
@@ -120,7 +120,9 @@ def outcome_of(path: Path, whole: list[bytes]) -> str:
     """Read a damaged file; return "found", "harmless", "wrong", or the name of an unexpected error."""
     try:
         about = CacheFile(path)
-        if pickle.dumps((about.kind, about.source, about.boxes)) != pickle.dumps(pickle.loads(whole[0])[:3]):
+        if pickle.dumps((about.kind, about.source, about.variant)) != pickle.dumps(
+            pickle.loads(whole[0])[:3]
+        ):
             return "found"  # it counts as one of other content, and is made anew
         return "harmless" if content_of(path) == whole else "wrong"
     except ShardError:

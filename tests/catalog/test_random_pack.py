@@ -6,10 +6,20 @@ import pytest
 from openvima.catalog import outlines
 from openvima.catalog.packs import load_assets
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading, is_random, random_name
-from openvima.catalog.random_shapes import has_heading, random_container, random_outline
+from openvima.catalog.random_shapes import (
+    has_heading,
+    random_container,
+    random_eared_container,
+    random_grating,
+    random_outline,
+    random_round_container,
+    random_square_container,
+)
 from openvima.catalog.random_textures import darkened_texture, random_texture
 from openvima.catalog.triangulation import signed_area
 from openvima.errors import UnknownTextureError
+from openvima.render.rasteriser import Rasteriser
+from openvima.scene import Placement, Pose, Scene
 
 SIZE = (0.0, 0.0, 0.0)
 
@@ -54,11 +64,41 @@ def test_random_outlines_are_whole_and_of_the_size_of_kit_objects(looks):
         np.testing.assert_allclose(triangles.sum(), area, rtol=1e-6)
 
 
-def test_random_vessels_stand_on_the_table():
+@pytest.mark.parametrize(
+    "draw",
+    [
+        random_container,
+        random_grating,
+        random_eared_container,
+        random_square_container,
+        random_round_container,
+    ],
+)
+def test_random_vessels_stand_on_the_table(draw):
     for seed in range(40):
-        container = random_container(np.random.default_rng(seed))
+        container = draw(np.random.default_rng(seed))
         assert abs(container.visual.vertices[..., 2].min() + container.rest_z_m) < 0.0025
         assert 0.08 < np.ptp(container.visual.vertices[..., :2].reshape(-1, 2), axis=0).max() < 0.3
+
+
+def test_the_gaps_of_gratings_are_real_and_ears_make_a_container_longer(looks):
+    rasteriser = Rasteriser(looks)
+
+    def fill_of(name: str, yaw_rad: float) -> float:
+        """Fraction of the box that an object's pixels fill, seen from above."""
+        pose = Pose.planar(0.5, 0.0, yaw_rad, z=looks.geometry(name, SIZE).rest_z_m)
+        scene = Scene((Placement(5, name, "red", SIZE, pose),))
+        rows, columns = np.nonzero(rasteriser.scene(scene)["top"].segm == 5)
+        return len(rows) / (np.ptp(rows) + 1) / (np.ptp(columns) + 1)
+
+    for seed in range(5):
+        assert fill_of(f"random grating {seed}", 0.0) < 0.97
+    assert np.mean([fill_of(f"random grating {seed}", 0.0) for seed in range(20)]) < 0.85
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        plain, eared = random_container(rng), random_eared_container(np.random.default_rng(seed))
+        longer = np.ptp(eared.visual.vertices, axis=(0, 1)) - np.ptp(plain.visual.vertices, axis=(0, 1))
+        assert longer.min() >= 0.0 and 0.003 < longer[:2].max() < 0.06
 
 
 def test_stretched_random_shapes_are_as_much_higher(looks):
@@ -95,7 +135,7 @@ def test_random_looks_never_ask_for_outlines_or_textures_of_the_catalogue(monkey
     monkeypatch.setattr(outlines, "_OUTLINES", {})
     looks = RandomAppearanceAssets(Empty())
     rng = np.random.default_rng(0)
-    for kind in ("shape", "container", "texture"):
+    for kind in ("shape", "container", "grating", "eared container", "texture"):
         for _ in range(20):
             name = random_name(kind, rng)
             assert is_random(name)

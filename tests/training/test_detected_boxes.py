@@ -29,7 +29,7 @@ from openvima.training.augmentation.demonstrations import DemonstrationAugmentat
 from openvima.training.augmentation.inverse_dynamics import motion_prompt  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
-from openvima.training.source import ExampleSource, Parts, split_examples, with_boxes_of  # noqa: E402
+from openvima.training.source import ExampleSource, Parts, alternative_source, split_examples  # noqa: E402
 from training_examples import train_until  # noqa: E402
 
 
@@ -144,7 +144,8 @@ def sources(data: Path) -> tuple[ExampleSource, ExampleSource]:
     """Demonstrations with true boxes, and with those of the noisy extractor."""
     dataset = Dataset(data)
     true, _ = split_examples(open_object_cache(dataset), validation_fraction=0.2, validation_episodes=9)
-    return true, with_boxes_of(detected_object_cache(dataset, plugged_boxes(HOOK)), true)
+    first_image = int(true.cache.image_counts().sum())
+    return true, alternative_source(detected_object_cache(dataset, plugged_boxes(HOOK)), true, first_image)
 
 
 def detected_rows(sources, share: float, number: int, rows: slice = slice(None)) -> tuple[list, list]:
@@ -160,7 +161,7 @@ def detected_rows(sources, share: float, number: int, rows: slice = slice(None))
                 found.append(example.row)
 
     examples = [true[index] for index in range(len(true))][rows]
-    Parts(collate, 3, 5, detected=detected, detected_prob=share)(examples, number)
+    Parts(collate, 3, 5, alternatives=((detected, share),))(examples, number)
     return sorted(found), sorted(draws)
 
 
@@ -179,6 +180,24 @@ def test_boxes_are_drawn_per_demonstration(sources) -> None:
     )
     assert part == [row for row in whole if row in rows[3:9]]  # whoever shares the batch
     assert set(part_draws) <= set(draws)
+
+
+def test_each_cache_is_drawn_with_its_probability(sources) -> None:
+    true, detected = sources
+    first_images = [0, int(true.cache.image_counts().sum())]
+    first_images.append(first_images[1] + int(detected.cache.image_counts().sum()))
+    cache = open_object_cache(true.cache.dataset, appearance=0)
+    alternatives = ((detected, 0.5), (alternative_source(cache, true, first_images[2]), 0.3))
+    counts = np.zeros(3)
+
+    def collate(part, rngs):
+        for example in part:
+            counts[np.searchsorted(first_images, example.base, side="right") - 1] += 1
+
+    examples = [true[index] for index in range(len(true))]
+    for number in range(40):
+        Parts(collate, 3, 5, alternatives=alternatives)(examples, number)
+    np.testing.assert_allclose(counts / counts.sum(), [0.2, 0.5, 0.3], atol=0.08)
 
 
 def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
@@ -212,6 +231,7 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
         {},  # images encoded once
         {"pretraining.finetune_crop_encoder": True, "loader.num_workers": 2},
         {"augmentation.inverse_dynamics_prob": 0.5, "optimizer.grad_accum_steps": 2},
+        {"loader.detected_prob": 0.4, "loader.rerendered_prob": 0.4, "loader.rerendered_variants": 2},
     ],
 )
 @pytest.mark.slow
@@ -284,6 +304,7 @@ def test_another_detector_is_another_run(settings, tmp_path) -> None:
     [
         ({"loader.detected_prob": 0.5}, "loader.detected_prob is 0.5, but no detector is given"),
         ({"loader.boxes": HOOK, "loader.detected_prob": 1.5}, "between 0 and 1"),
+        ({"loader.boxes": HOOK, "loader.rerendered_prob": 0.6}, "rerendered_prob are 1.1 together"),
         (
             {"loader.boxes": HOOK, "preset": "gato-nano"},
             "preset 'gato-nano' takes whole frames; leave it out",

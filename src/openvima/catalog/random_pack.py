@@ -8,10 +8,27 @@ import numpy as np
 from openvima.catalog.geometry import Assets, Geometry, Vector3, protect
 from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
-from openvima.catalog.random_shapes import has_heading, random_container, random_outline, random_shape
+from openvima.catalog.random_shapes import (
+    has_heading,
+    random_container,
+    random_eared_container,
+    random_grating,
+    random_outline,
+    random_round_container,
+    random_shape,
+    random_square_container,
+)
 from openvima.catalog.random_textures import darkened_texture, random_texture
 
-_NAME = re.compile(r"(dark )?random (texture|shape|container) (\d+)")
+_SHAPES = {
+    "shape": random_shape,
+    "container": random_container,
+    "grating": random_grating,
+    "eared container": random_eared_container,
+    "square container": random_square_container,
+    "round container": random_round_container,
+}
+_NAME = re.compile(rf"(dark )?random (texture|{'|'.join(_SHAPES)}) (\d+)")
 _NUM_SEEDS = 1 << 31
 _KEPT = 64  # cached shapes and textures: those of a few scenes
 
@@ -23,12 +40,14 @@ class RandomAppearanceAssets:
 
     Args:
         base: Pack of the catalogue's shapes and textures.
+        num_kept: Random shapes and textures to cache, of each kind; 30 and 50 kB each.
     """
 
-    def __init__(self, base: Assets) -> None:
+    def __init__(self, base: Assets, num_kept: int = _KEPT) -> None:
         self.base = base
-        self._shape = lru_cache(_KEPT)(_drawn_shape)
-        self._texture = lru_cache(_KEPT)(_drawn_texture)
+        self._plain_shape = lru_cache(num_kept)(_drawn_shape)
+        self._shape = lru_cache(_KEPT)(self._stretched)
+        self._texture = lru_cache(num_kept)(_drawn_texture)
 
     @property
     def name(self) -> str:
@@ -45,10 +64,19 @@ class RandomAppearanceAssets:
         """Return a texture's image; see `Assets.texture`."""
         return self._texture(texture_name) if is_random(texture_name) else self.base.texture(texture_name)
 
+    def _stretched(self, name: str, scale: Vector3) -> Geometry:
+        return protect(scaled_geometry(self._plain_shape(name), scale))
 
-def random_name(kind: str, rng: np.random.Generator) -> str:
-    """Draw the name of a "texture", "shape" or "container"."""
-    return f"random {kind} {int(rng.integers(_NUM_SEEDS))}"
+
+def random_name(kind: str, rng: np.random.Generator, pool: range = range(_NUM_SEEDS)) -> str:
+    """Draw the name of a "texture", or of a kind of shape, such as "shape", "container" or "grating".
+
+    Args:
+        kind: The kind.
+        rng: Generator of the draw.
+        pool: Seeds to draw from; a few of them can be cached.
+    """
+    return f"random {kind} {int(rng.integers(pool.start, pool.stop))}"
 
 
 def is_random(name: str) -> bool:
@@ -56,7 +84,7 @@ def is_random(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
-@lru_cache(1024)
+@lru_cache(4096)
 def has_visible_heading(object_name: str) -> bool:
     """Whether the yaw of a shape is visible: it has no rotational symmetry."""
     if not is_random(object_name):
@@ -71,10 +99,9 @@ def _read(name: str) -> tuple[str, np.random.Generator]:
     return match[2], np.random.default_rng(int(match[3]))
 
 
-def _drawn_shape(name: str, scale: Vector3) -> Geometry:
+def _drawn_shape(name: str) -> Geometry:
     kind, rng = _read(name)
-    drawn = random_shape(rng) if kind == "shape" else random_container(rng)
-    return protect(scaled_geometry(drawn, scale))
+    return protect(_SHAPES[kind](rng))
 
 
 def _drawn_texture(name: str) -> np.ndarray:

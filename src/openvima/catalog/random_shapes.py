@@ -6,7 +6,7 @@ import numpy as np
 
 from openvima.catalog import boxes
 from openvima.catalog.geometry import Geometry
-from openvima.catalog.meshes import draped, prism, revolved
+from openvima.catalog.meshes import combined, draped, prism, revolved
 from openvima.catalog.outlines import rectangle
 from openvima.catalog.triangulation import signed_area
 
@@ -28,6 +28,61 @@ def random_shape(rng: np.random.Generator) -> Geometry:
 def random_container(rng: np.random.Generator) -> Geometry:
     """Sample an open box, a tray, a bowl, a frame or a flat square, without collision."""
     return _CONTAINERS[int(rng.integers(len(_CONTAINERS)))](rng)
+
+
+def random_grating(rng: np.random.Generator) -> Geometry:
+    """Sample a container of slats, origin at its bottom, without collision.
+
+    The gaps are real: they turn with the container, and seen obliquely they close.
+    """
+    length, width = (float(extent) for extent in rng.uniform(0.12, 0.2, 2))
+    beam, slat = (float(height) for height in rng.uniform(0.003, 0.02, 2))
+    num_slats, num_beams = int(rng.integers(3, 9)), int(rng.integers(2, 5))
+    slat_width, beam_width = width / num_slats * rng.uniform(0.35, 0.75), rng.uniform(0.008, 0.02)
+    parts = [
+        *(
+            boxes.Box((beam_width, width, beam), (x, 0.0, beam / 2))
+            for x in _spread(length, beam_width, num_beams)
+        ),
+        *(
+            boxes.Box((length, slat_width, slat), (0.0, y, beam + slat / 2))
+            for y in _spread(width, slat_width, num_slats)
+        ),
+    ]
+    if rng.random() < 0.3:  # slats upright around it
+        height = float(rng.uniform(0.02, 0.05))
+        parts += [
+            boxes.Box((beam_width, boxes.WALL_M, height), (x, y, height / 2))
+            for x in _spread(length, beam_width, num_slats)
+            for y in (-width / 2, width / 2)
+        ]
+    return Geometry(draped(boxes.box_mesh(parts)), (), 0.0)
+
+
+def random_eared_container(rng: np.random.Generator) -> Geometry:
+    """Sample a container with two opposite ears at its rim, without collision."""
+    body = random_container(rng)
+    points = body.visual.vertices.reshape(-1, 3)
+    axis, top = int(rng.integers(2)), float(points[:, 2].max())
+    length, width, height = rng.uniform(0.01, 0.03), rng.uniform(0.02, 0.06), rng.uniform(0.003, 0.012)
+    half = np.array([length / 2 + 0.004, width / 2])[[axis, 1 - axis]]  # 8 mm of it inside the rim
+    ears = []
+    for rim, sign in ((points[:, axis].min(), -1), (points[:, axis].max(), 1)):
+        centre = np.zeros(2)
+        centre[axis] = rim + sign * (length / 2 - 0.004)
+        outline = np.array(rectangle((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))))
+        ears.append(prism([outline], top - min(height, np.ptp(points[:, 2])), top, texture_per_m=2.9))
+    return Geometry(combined([body.visual, *ears]), (), body.rest_z_m)
+
+
+def random_square_container(rng: np.random.Generator) -> Geometry:
+    """Sample a container whose outline is a rectangle, without collision."""
+    return (_open_box, _flat_square, random_grating)[int(rng.integers(3))](rng)
+
+
+def random_round_container(rng: np.random.Generator) -> Geometry:
+    """Sample a bowl whose outline is a circle, without collision."""
+    return _bowl(rng, sides=26)
 
 
 def random_outline(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
@@ -208,6 +263,11 @@ def _open_box(rng: np.random.Generator) -> Geometry:
     return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
 
 
+def _spread(length: float, part: float, count: int) -> list[float]:
+    """Return the middles of equal parts, the first and last of which end at the borders."""
+    return np.linspace((part - length) / 2, (length - part) / 2, count).tolist()
+
+
 def _flat_square(rng: np.random.Generator) -> Geometry:
     geometry = boxes.square((float(rng.uniform(0.12, 0.2)), float(rng.uniform(0.015, 0.05)), 0.001))
     return Geometry(draped(geometry.visual), (), geometry.rest_z_m)
@@ -224,7 +284,7 @@ def _frame(rng: np.random.Generator) -> Geometry:
     return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(0.0015, 0.03), texture_per_m=2.9), (), 0.0)
 
 
-def _bowl(rng: np.random.Generator) -> Geometry:
+def _bowl(rng: np.random.Generator, sides: int | None = None) -> Geometry:
     foot, rim = rng.uniform(0.04, 0.075), rng.uniform(0.075, 0.105)
     height, wall = rng.uniform(0.02, 0.075), rng.uniform(0.003, 0.02)
     belly = (foot + rim) / 2 + rng.uniform(-0.01, 0.015)
@@ -238,7 +298,7 @@ def _bowl(rng: np.random.Generator) -> Geometry:
         (foot - wall, 0.008),
         (0.0, 0.008),
     ]
-    sides = int(rng.choice((4, 6, 8, 26)))
+    sides = sides or int(rng.choice((4, 6, 8, 26)))
     radii = [2.5 * (r + (height - z if number < 4 else 0.0)) for number, (r, z) in enumerate(profile)]
     return Geometry(revolved(profile, sides, texture_radii=radii), (), 0.0)
 

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.catalog.user_assets import recorded_assets
 from openvima.data.encoding import ShardInfo
@@ -23,7 +24,7 @@ from openvima.errors import (
     UnknownTextureError,
 )
 from openvima.render.rasteriser import Rasteriser
-from openvima.scene import RenderedPrompt, Scene
+from openvima.scene import Prompt, RenderedPrompt, Scene
 from openvima.tasks import sample_episode
 
 
@@ -69,7 +70,14 @@ def draw_observations(
         View name to images, shape (N, 3, 128, 256), uint8; view name to object ids, shape (N, 128, 256),
         uint8.
     """
-    drawn = [_rasteriser(info.assets).scene(scene) for scene in scenes]
+    return draw_with(_rasteriser(info.assets), scenes)
+
+
+def draw_with(
+    rasteriser: Rasteriser, scenes: Sequence[Scene]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Render the observations of some scenes; see `draw_observations`."""
+    drawn = [rasteriser.scene(scene) for scene in scenes]
     rgb = {view: np.stack([images[view].rgb for images in drawn]) for view in VIEWS}
     segm = {view: np.stack([images[view].segm for images in drawn]) for view in VIEWS}
     return rgb, segm
@@ -83,17 +91,28 @@ def draw_prompt(demo: Demonstration, info: ShardInfo) -> RenderedPrompt:
         info: Of the shard that stores it.
     """
     rasteriser = _rasteriser(info.assets)
+    return rasteriser.prompt(sampled_prompt(demo, info, rasteriser.assets))
+
+
+def sampled_prompt(demo: Demonstration, info: ShardInfo, assets: Assets) -> Prompt:
+    """Sample the episode of a demonstration again, and return its prompt.
+
+    Args:
+        demo: Names the episode; its own prompt is not used.
+        info: Of the shard that stores it.
+        assets: The pack of the shard.
+    """
     episode = sample_episode(
         demo.task,
         level=demo.level,
         seed=demo.seed,
         domain=demo.domain,
-        assets=rasteriser.assets,
+        assets=assets,
         compat=info.compat,
         prompts=info.prompts,
         **info.env_config.options(demo.task),
     )
-    return rasteriser.prompt(episode.problem.prompt)
+    return episode.problem.prompt
 
 
 @lru_cache(maxsize=2)

@@ -34,7 +34,7 @@ class BehaviourCloning:
         training: Demonstrations to train on.
         validation: Held-out demonstrations.
         parallel: The processes of the run.
-        detected: The training demonstrations with detected boxes, if some are used.
+        alternatives: Other caches of the training demonstrations, each with the probability of using it.
     """
 
     name = "2-cloning"
@@ -47,12 +47,12 @@ class BehaviourCloning:
         training: ExampleSource,
         validation: ExampleSource,
         parallel: Parallel,
-        detected: ExampleSource | None = None,
+        alternatives: tuple[tuple[ExampleSource, float], ...] = (),
     ) -> None:
         self.learning_rate = config.optimizer.learning_rate
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
         self._learner, self._module, self._config, self._parallel = learner, module, config, parallel
-        self._training, self._validation, self._detected = training, validation, detected
+        self._training, self._validation, self._alternatives = training, validation, alternatives
         self._validated = module if parallel.is_sharded else learner
         self._order = order_of(
             training,
@@ -120,8 +120,7 @@ class BehaviourCloning:
                 largest=-(-ours // parts),
                 # Sharded weights are gathered at every pass, so all processes make equally many passes.
                 count=min(parts, ours) if self._parallel.is_sharded else None,
-                detected=self._detected,
-                detected_prob=config.loader.detected_prob or 0.0,
+                alternatives=self._alternatives,
                 distractors=self._training if config.augmentation.distractor_prob else None,
                 distractor_prob=config.augmentation.distractor_prob,
             ),

@@ -1,11 +1,12 @@
 """Training a policy: contrastive pretraining, then behaviour cloning."""
 
 import math
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from openvima.catalog.packs import load_assets
 from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
+from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
@@ -23,10 +24,10 @@ from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
     ExampleSource,
+    alternative_source,
     check_words,
     open_demonstrations,
     split_examples,
-    with_boxes_of,
 )
 from openvima.training.vocabulary import training_texts
 
@@ -58,6 +59,8 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     config = resolved(config)
     load_assets(config.assets)  # fails before there is a run folder
     dataset = open_demonstrations(config.data, config.loader.excluded_tasks)
+    if config.loader.rerendered_prob:
+        check_scenes(dataset)
     boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
     runtime = config.runtime
     with (
@@ -128,7 +131,7 @@ class _Stages:
 
     def _behaviour_cloning(self) -> Stage:
         self.trainer.report(f"reading {len(self.dataset)} demonstrations")
-        caches, config, learner = self._caches, self.config, self.learner
+        caches, config, learner = [cache for cache, _ in self._caches], self.config, self.learner
         if isinstance(learner, PolicyLearner):
             prob = config.augmentation.inverse_dynamics_prob
             describes = config.augmentation.text_description_prob > 0
@@ -149,42 +152,57 @@ class _Stages:
             compile_layers(learner)
         module = self.parallel.wrap(learner)
         training, validation = self._examples
-        detected = with_boxes_of(caches[1], training) if len(caches) > 1 else None
-        return BehaviourCloning(learner, module, config, training, validation, self.parallel, detected)
+        alternatives = self._alternatives(training)
+        return BehaviourCloning(learner, module, config, training, validation, self.parallel, alternatives)
+
+    def _alternatives(self, training: ExampleSource) -> tuple[tuple[ExampleSource, float], ...]:
+        """Return the training demonstrations as the other caches have them, with their probabilities."""
+        alternatives, num_images = [], int(self._caches[0][0].image_counts().sum())
+        for cache, prob in self._caches[1:]:
+            alternatives.append((alternative_source(cache, training, num_images), prob))
+            num_images += int(cache.image_counts().sum())
+        return tuple(alternatives)
 
     @cached_property
     def _examples(self) -> tuple[ExampleSource, ExampleSource]:
         """Demonstrations to train on, and held-out ones."""
         loader = self.config.loader
         return split_examples(
-            self._caches[0],
+            self._caches[0][0],
             validation_fraction=loader.validation_fraction,
             validation_episodes=loader.validation_episodes,
         )
 
     @cached_property
-    def _caches(self) -> list[ObjectCache]:
-        """Object caches of true boxes, of detected ones, or both; the first process builds missing ones."""
-        prob, folder = self.config.loader.detected_prob or 0.0, self.config.object_cache
+    def _caches(self) -> list[tuple[ObjectCache, float]]:
+        """Object caches, each with the probability of using it; the first process builds missing ones.
+
+        The first is that of validation: true boxes, if any are used. Those of detected boxes and of random
+        appearance follow.
+        """
+        loader, folder, kind = self.config.loader, self.config.object_cache, self.learner.input_kind
         timeout_s = math.inf  # another training may write the cache now
-        caches = []
+        opened = partial(open_object_cache, self.dataset, kind, folder=folder, timeout_s=timeout_s)
+        detected_prob, caches = loader.detected_prob or 0.0, []
         if not self.parallel.is_first:
             self.parallel.wait()
-        if prob < 1:
-            kind = self.learner.input_kind
-            caches.append(
-                open_object_cache(self.dataset, kind, folder=folder, report=self._say, timeout_s=timeout_s)
-            )
-        if prob > 0:
+        if detected_prob < 1:
+            caches.append((opened(report=self._say), 1 - detected_prob - loader.rerendered_prob))
+        if detected_prob > 0:
             assert self.boxes is not None  # `resolved` has checked it
-            caches.append(
-                detected_object_cache(
-                    self.dataset, self.boxes, folder=folder, report=self._say, timeout_s=timeout_s
-                )
+            detected = detected_object_cache(
+                self.dataset, self.boxes, folder=folder, report=self._say, timeout_s=timeout_s
             )
+            caches.append((detected, detected_prob))
+        for variant in range(loader.rerendered_variants if loader.rerendered_prob else 0):
+            rerendered = opened(appearance=variant, report=self._say_rerendering)
+            caches.append((rerendered, loader.rerendered_prob / loader.rerendered_variants))
         if self.parallel.is_first:
             self.parallel.wait()
         return caches
+
+    def _say_rerendering(self, done: int, total: int, note: str) -> None:
+        self._say(done, total, note or "rendering with random appearance")
 
     def _say(self, done: int, total: int, note: str) -> None:
         self.trainer.report(f"{note or 'extracting objects'}, {done} of {total}")

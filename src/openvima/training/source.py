@@ -63,8 +63,8 @@ class Parts:
         seed: Of the run; every example of every batch has its own generator.
         largest: Maximum size of a part.
         count: Number of parts, whatever the lengths; None is as many as needed.
-        detected: The same demonstrations with detected boxes; see `with_boxes_of`.
-        detected_prob: Probability of using these instead.
+        alternatives: Other caches of the same demonstrations, each with the probability of using it instead;
+            see `alternative_source`.
         distractors: Demonstrations from which distractors are inserted; see `with_distractors`.
         distractor_prob: Probability of that, for demonstrations that allow it.
     """
@@ -73,8 +73,7 @@ class Parts:
     seed: int
     largest: int
     count: int | None = None
-    detected: ExampleSource | None = None
-    detected_prob: float = 0.0
+    alternatives: tuple[tuple[ExampleSource, float], ...] = ()
     distractors: ExampleSource | None = None
     distractor_prob: float = 0.0
 
@@ -88,9 +87,12 @@ class Parts:
         return parts
 
     def _drawn(self, example: Example, rng: np.random.Generator) -> Example:
-        """Draw the boxes of an example, and the source of its distractors."""
-        if self.detected is not None and rng.random() < self.detected_prob:
-            example = self.detected.example(example.row)
+        """Draw which cache an example is from, and the source of its distractors."""
+        if self.alternatives:
+            drawn, sources = rng.random(), [source for source, _ in self.alternatives]
+            ends = np.cumsum([prob for _, prob in self.alternatives])
+            if drawn < ends[-1]:
+                example = sources[int(np.searchsorted(ends, drawn, side="right"))].example(example.row)
         source = self.distractors
         if (
             source is None
@@ -175,16 +177,17 @@ def split_examples(
     return first, second
 
 
-def with_boxes_of(detected: ObjectCache, source: ExampleSource) -> ExampleSource:
-    """Return the demonstrations of a source with detected boxes.
+def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: int) -> ExampleSource:
+    """Return the demonstrations of a source as another cache has them.
 
     Args:
-        detected: Cache of the detections; its images are numbered after those of the source's cache.
+        cache: Of detected boxes, or of random appearance.
         source: The demonstrations.
+        first_image: Number of its first image: its images follow those of other caches.
     """
-    counts = detected.image_counts()
-    bases = np.cumsum(counts) - counts + source.cache.image_counts().sum()
-    return ExampleSource(detected, source.rows, bases, detected.lengths()[source.rows])
+    counts = cache.image_counts()
+    bases = np.cumsum(counts) - counts + first_image
+    return ExampleSource(cache, source.rows, bases, cache.lengths()[source.rows])
 
 
 def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = False) -> None:

@@ -88,7 +88,7 @@ def test_every_detector_has_a_folder_of_its_own_which_is_made_once(copy: Path) -
     again = pickle.loads(pickle.dumps(caches[2]))
     assert rows_of(again[3].objects).tolist() == rows_of(caches[2][3].objects).tolist()
     with pytest.raises(DatasetError, match=r"lacks 6 shards.*--boxes DETECTOR"):
-        ObjectCache(dataset, boxes="clumsy-3")
+        ObjectCache(dataset, variant="clumsy-3")
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> 
     whole = path.read_bytes()
     write_cache_file(path, cache[:2], "objects", CacheFile(path).source, "clumsy-2")
     with pytest.raises(DatasetError, match="lacks 1 shards"):
-        ObjectCache(dataset, boxes="clumsy-1")
+        ObjectCache(dataset, variant="clumsy-1")
     open_object_cache(dataset, boxes=CLUMSY)
     assert path.read_bytes() == whole
 
@@ -158,6 +158,6 @@ def test_the_verb_makes_what_training_would(copy: Path, capsys: pytest.CaptureFi
     assert main(words) == 0
     (folder,) = (copy / "object_cache").iterdir()
     assert capsys.readouterr().out.strip() == str(folder)
-    assert len(ObjectCache(Dataset(copy), boxes=folder.name.removeprefix("objects-v6-"))) == 10
+    assert len(ObjectCache(Dataset(copy), variant=folder.name.removeprefix("objects-v6-"))) == 10
     assert main([*words, "--kind", "frames"]) == 2
     assert "whole frames have none" in capsys.readouterr().err

@@ -14,6 +14,7 @@ def preprocess(
     *,
     kind: Literal["objects", "frames"] = "objects",
     boxes: str | None = None,
+    rerendered: int | None = None,
     out: Path | None = None,
     workers: int = 1,
 ) -> int:
@@ -31,6 +32,8 @@ def preprocess(
         boxes: Detector that extracts the objects, for `openvima train --boxes`: "detector" for the bundled
             one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which returns an ObjectExtractor. Default: the segmentation.
+        rerendered: Number of a random appearance, from 0, to render the demonstrations again with, for
+            `openvima train --loader.rerendered-prob`. Default: as they are stored.
         out: Folder of the cache; default: "object_cache" in the folder of demonstrations.
         workers: Number of processes.
 
@@ -44,10 +47,14 @@ def preprocess(
 
     if boxes is not None and kind == "frames":
         raise ConfigError(f"boxes is {boxes!r}, but whole frames have none; leave --boxes or --kind out.")
+    if rerendered is not None and (boxes is not None or rerendered < 0):
+        raise ConfigError(f"rerendered is {rerendered}; it must be 0 or more, and without --boxes.")
     dataset = Dataset(folder)
     with progress_bar("object cache") as report:
         if boxes is None:
-            cache = open_object_cache(dataset, kind, folder=out, workers=workers, report=report)
+            cache = open_object_cache(
+                dataset, kind, folder=out, appearance=rerendered, workers=workers, report=report
+            )
         else:
             cache = detected_object_cache(
                 dataset, plugged_boxes(boxes), folder=out, workers=workers, report=report

@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, overload
@@ -21,6 +21,7 @@ from openvima.data.object_cache.cache_file import (
 from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
 from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.object_cache.joined_records import read_records
+from openvima.data.object_cache.random_appearance import RERENDERING_VERSION, with_random_appearance
 from openvima.data.reader import Dataset
 from openvima.data.shard import Shard
 from openvima.errors import DatasetError, ShardError, unknown_name
@@ -45,6 +46,27 @@ class Boxes:
     make: Callable[[], ObjectExtractor] = field(compare=False)
 
 
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """How the episodes of a cache differ from the demonstrations as stored.
+
+    Args:
+        boxes: Source of the boxes; None for the segmentation.
+        appearance: Number of a random appearance; None for that of the demonstrations.
+    """
+
+    boxes: Boxes | None = None
+    appearance: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Part of the folder's name."""
+        names = [self.boxes.name] if self.boxes else []
+        if self.appearance is not None:
+            names.append(f"rerendered-v{RERENDERING_VERSION}-{self.appearance}")
+        return "-".join(names)
+
+
 class ObjectCache(Sequence[PreprocessedEpisode]):
     """The preprocessed episodes of a data set, in its order, each read on access.
 
@@ -54,7 +76,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         dataset: The demonstrations, perhaps of some tasks only.
         kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
         folder: Folder of the cache; None means `object_cache/` in the folder of the demonstrations.
-        boxes: Name of the extractor, as in `Boxes`; empty for the segmentation.
+        variant: Name of the variant, as in `Variant`; empty for the demonstrations as stored.
 
     Raises:
         DatasetError: There is no such kind, or files are missing or older than the demonstrations;
@@ -67,14 +89,14 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
     """
 
     def __init__(
-        self, dataset: Dataset, kind: InputKind = "objects", folder: Path | None = None, boxes: str = ""
+        self, dataset: Dataset, kind: InputKind = "objects", folder: Path | None = None, variant: str = ""
     ) -> None:
-        self.dataset, self.kind, self.boxes, self._root = dataset, kind, boxes, folder
-        self.folder = _cache_folder(dataset, kind, folder, boxes)
-        found = {source.name: _made(self.folder, source, kind, boxes) for source in sources(dataset)}
+        self.dataset, self.kind, self.variant, self._root = dataset, kind, variant, folder
+        self.folder = _cache_folder(dataset, kind, folder, variant)
+        found = {source.name: _made(self.folder, source, kind, variant) for source in sources(dataset)}
         missing = [name for name, file in found.items() if file is None]
         if missing:
-            option = "--boxes DETECTOR" if boxes else f"--kind {kind}"
+            option = "--boxes DETECTOR" if variant else f"--kind {kind}"
             raise DatasetError(
                 f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; "
                 f"`openvima data preprocess {shlex.quote(str(dataset.path))} {option}` writes them."
@@ -110,7 +132,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         return read_records([(self._files[name], row) for name, row in self.dataset.locations(indices)])
 
     def __reduce__(self) -> tuple[Any, ...]:  # Any: what pickle takes
-        return ObjectCache, (self.dataset, self.kind, self._root, self.boxes)
+        return ObjectCache, (self.dataset, self.kind, self._root, self.variant)
 
     def lengths(self) -> np.ndarray:
         """Return the steps of each episode and the visible objects of all of them, shape (N, 2), int64."""
@@ -164,7 +186,7 @@ class _Work:
     source: Source
     path: Path
     kind: InputKind
-    boxes: Boxes | None
+    variant: Variant
 
 
 def open_object_cache(
@@ -173,6 +195,7 @@ def open_object_cache(
     *,
     folder: Path | None = None,
     boxes: Boxes | None = None,
+    appearance: int | None = None,
     workers: int = 1,
     report: Report | None = None,
     timeout_s: float = 0.0,
@@ -184,6 +207,8 @@ def open_object_cache(
         kind: "objects" for crops of the objects, "frames" for whole frames at half the size.
         folder: Folder of the cache; None means `object_cache/` in the folder of the demonstrations.
         boxes: Extractor of the objects; None takes the segmentation. Each has a folder of its own.
+        appearance: Number of a random appearance with which the demonstrations are rendered again, see
+            `with_random_appearance`; each has a folder of its own. None takes the images as stored.
         workers: Number of processes.
         report: Called with episodes done, episodes in all, and a note.
         timeout_s: How long to wait for another process that writes the cache.
@@ -193,8 +218,11 @@ def open_object_cache(
         FolderLockedError: Another process writes the cache.
         ShardError: A shard is damaged.
     """
-    target = _cache_folder(dataset, kind, folder, boxes.name if boxes else "")
-    if _missing(dataset, kind, target, boxes):
+    if boxes is not None and kind == "frames":
+        raise DatasetError(f"boxes are those of {boxes.name}, but whole frames have none; leave them out.")
+    variant = Variant(boxes, appearance)
+    target = _cache_folder(dataset, kind, folder, variant.name)
+    if _missing(dataset, kind, target, variant):
         try:
             target.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -202,11 +230,11 @@ def open_object_cache(
                 f"cannot write the object cache to {target}: {error.strerror}. Name another folder."
             ) from None
         with folder_lock(target, timeout_s=timeout_s):
-            _write_missing(_missing(dataset, kind, target, boxes), workers, report)
-    return ObjectCache(dataset, kind, folder, boxes.name if boxes else "")
+            _write_missing(_missing(dataset, kind, target, variant), workers, report)
+    return ObjectCache(dataset, kind, folder, variant.name)
 
 
-def _missing(dataset: Dataset, kind: InputKind, target: Path, boxes: Boxes | None) -> list[_Work]:
+def _missing(dataset: Dataset, kind: InputKind, target: Path, variant: Variant) -> list[_Work]:
     return [
         _Work(
             dataset.path / source.name,
@@ -214,10 +242,10 @@ def _missing(dataset: Dataset, kind: InputKind, target: Path, boxes: Boxes | Non
             source,
             target / file_name(source.name),
             kind,
-            boxes,
+            variant,
         )
         for source in sources(dataset)
-        if _made(target, source, kind, boxes.name if boxes else "") is None
+        if _made(target, source, kind, variant.name) is None
     ]
 
 
@@ -251,35 +279,37 @@ def sources(dataset: Dataset) -> list[Source]:
     return found
 
 
-def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, boxes: str) -> Path:
+def _cache_folder(dataset: Dataset, kind: InputKind, folder: Path | None, variant: str) -> Path:
     if kind not in KINDS:
         raise DatasetError(unknown_name("kind of object cache", kind, KINDS))
-    if boxes and kind == "frames":
-        raise DatasetError(f"boxes are those of {boxes}, but whole frames have none; leave them out.")
-    parts = (kind, f"v{CACHE_VERSION}", *((boxes,) if boxes else ()))
+    parts = (kind, f"v{CACHE_VERSION}", *((variant,) if variant else ()))
     return (folder or dataset.path / CACHE_FOLDER) / "-".join(parts)
 
 
-def _made(folder: Path, source: Source, kind: InputKind, boxes: str) -> CacheFile | None:
+def _made(folder: Path, source: Source, kind: InputKind, variant: str) -> CacheFile | None:
     """Open the file of a shard; None if it is missing, damaged, or of another version or content."""
     try:
         file = CacheFile(folder / file_name(source.name))
     except ShardError:
         return None
-    asked = (source.content_hash, kind, boxes)
-    return file if (file.source, file.kind, file.boxes) == asked else None
+    asked = (source.content_hash, kind, variant)
+    return file if (file.source, file.kind, file.variant) == asked else None
 
 
 def _write(work: _Work, count: Callable[[int], None]) -> None:
-    shard, episodes = Shard(work.shard, work.envelope), []
-    extractor = _extractor(work.boxes) if work.boxes else None
+    shard, episodes, variant = Shard(work.shard, work.envelope), [], work.variant
+    extractor = _extractor(variant.boxes) if variant.boxes else None
     for row, span in enumerate(spans_of(work.source.index)):
         shard.check(row, span)
-        episodes.append(preprocess(shard[row], work.kind, extractor))
+        demo = shard[row]
+        if variant.appearance is None:
+            episodes.append(preprocess(demo, work.kind, extractor))
+        else:
+            demo = with_random_appearance(demo, shard.info, variant.appearance)
+            # Random appearances have no names.
+            episodes.append(replace(preprocess(demo, work.kind, extractor), descriptions={}))
         count(row + 1)
-    write_cache_file(
-        work.path, episodes, work.kind, work.source.content_hash, work.boxes.name if work.boxes else ""
-    )
+    write_cache_file(work.path, episodes, work.kind, work.source.content_hash, variant.name)
 
 
 @lru_cache(maxsize=1)

@@ -113,7 +113,7 @@ INDEX = np.dtype([(name, f"<{code}") for name, code in zip(Entry._fields, _CODES
 
 
 def write_cache_file(
-    path: Path, episodes: Sequence[PreprocessedEpisode], kind: InputKind, source: str, boxes: str = ""
+    path: Path, episodes: Sequence[PreprocessedEpisode], kind: InputKind, source: str, variant: str = ""
 ) -> None:
     """Write one file.
 
@@ -122,11 +122,11 @@ def write_cache_file(
         episodes: What to write.
         kind: What their images show.
         source: Content hash of the demonstrations that they were made of.
-        boxes: Name of the extractor of the objects; empty for the segmentation.
+        variant: How the episodes differ from these, as in `Variant`; empty if they do not.
     """
     tasks = sorted({episode.task for episode in episodes})
     descriptions = ["", *sorted({text for episode in episodes for text in episode.descriptions.values()})]
-    about = {"kind": kind, "source": source, "boxes": boxes, "tasks": tasks, "rows": len(episodes)}
+    about = {"kind": kind, "source": source, "variant": variant, "tasks": tasks, "rows": len(episodes)}
     about["descriptions"] = descriptions  # the first is that of images without any
     heading = json.dumps({"version": CACHE_VERSION, **about}).encode()
     texts, places = b"", {}
@@ -196,7 +196,7 @@ class CacheFile:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         self.kind: InputKind = about["kind"]
         self.source: str = about["source"]
-        self.boxes: str = about["boxes"]
+        self.variant: str = about["variant"]
         self.tasks: list[str] = about["tasks"]
         self.descriptions: list[str] = about["descriptions"]
         height, width = IMAGE_SIZES[self.kind]

@@ -89,7 +89,7 @@ def check_cache_file(task: CacheTask, count: Callable[[int], None]) -> list[str]
 
 
 def _differences(cached: CacheFile, shard: Shard, count: Callable[[int], None]) -> Iterator[tuple[int, str]]:
-    names = _WITHOUT_OBJECTS if cached.boxes else [field.name for field in fields(PreprocessedEpisode)]
+    names = _WITHOUT_OBJECTS if cached.variant else [field.name for field in fields(PreprocessedEpisode)]
     for row in range(len(shard)):
         try:
             ours, theirs = cached[row], preprocess(shard[row], cached.kind)
