@@ -115,7 +115,38 @@ def test_equal_causes_of_different_objects_count_as_one(reason, kind):
 
 def test_a_file_that_is_no_text_is_damaged(tmp_path):
     (tmp_path / "results.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DatasetError, match="damaged"):
+    with pytest.raises(DatasetError, match="no UTF-8 text"):
+        Results.read(tmp_path)
+
+
+def test_values_of_other_types_are_refused_and_named(results, tmp_path):
+    path = results.write(tmp_path / "results.json")
+    text = path.read_text()
+    for old, new in (
+        ('"seed": 3', '"seed": "3"'),
+        ('"success": true', '"success": 1'),
+        ('"policy": "mine"', '"policy": ["mine"]'),
+        ('"mujoco": "1.2.3"', '"mujoco": 1'),
+        ('"actions_sha256": ""', '"actions_sha256": null'),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+        with pytest.raises(DatasetError, match=r"is damaged .*stands for a value of type"):
+            Results.read(path)
+    content = json.loads(text)
+    content["rows"][0]["outcomes"] = []
+    path.write_text(json.dumps(content))
+    with pytest.raises(DatasetError, match="a row has no outcomes"):
+        Results.read(path)
+    path.write_text("[" * 100_000)
+    with pytest.raises(DatasetError, match="is damaged"):
+        Results.read(path)
+
+
+def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path):
+    with (tmp_path / "results.json").open("wb") as stream:
+        stream.truncate(2**40)
+    with pytest.raises(DatasetError, match="more than"):
         Results.read(tmp_path)
 
 

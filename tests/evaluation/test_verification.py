@@ -67,7 +67,14 @@ def test_task_options_are_replayed_and_those_of_a_stranger_checked(tmp_path):
 def test_the_mark_belongs_to_the_results_that_were_confirmed(copy):
     verify_results(copy)
     path = copy / "results.json"
-    path.write_text(path.read_text().replace(json.loads(path.read_text())["sha256"], "0" * 64))
+    text = path.read_text()
+    for old, new in ((json.loads(text)["sha256"], "0" * 64), ('"success": true', '"success": false')):
+        path.write_text(text.replace(old, new, 1))
+        assert not is_marked_verified(copy)
+    path.write_text(text)
+    assert is_marked_verified(copy)
+    actions = copy / ACTIONS_NAME
+    actions.write_bytes(actions.read_bytes()[:200])
     assert not is_marked_verified(copy)
 
 

@@ -11,6 +11,7 @@ from openvima.errors import DatasetError
 from openvima.evaluation.comparison import compare
 from openvima.evaluation.results import BAD_ACTION, EpisodeOutcome, Results, Row
 from openvima.report import write_report
+from openvima.report.confirmation import Confirmation
 from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
 from openvima.report.page import default_command
@@ -278,6 +279,22 @@ def test_levels_of_ones_own_have_no_published_section(results, tmp_path):
     rows = tuple(replace(row, level="train") for row in results.rows if row.level == "L3")
     path = write_report(replace(results, rows=rows), tmp_path / "a.html")
     assert not section(path.read_text(encoding="utf-8"), "published")
+
+
+def test_tables_are_marked_if_all_outcomes_were_confirmed_by_replay(results, tmp_path):
+    recorded = replace(results, actions_sha256="ab")
+    confirmed = Confirmation.of(recorded, "my run", confirmed=True)
+    text = write_report(results, tmp_path / "a.html", confirmations=[confirmed]).read_text("utf-8")
+    assert all("confirmed by replay</a>" in section(text, name) for name in ("overview", "results", "drop"))
+    assert not any("confirmed by replay</a>" in section(text, name) for name in ("published", "failures"))
+    said = section(text, "verification")
+    assert "who acted (policies)" in said and "claim until openvima verify-results &#39;my run&#39;" in said
+
+    others = [Confirmation.of(recorded, "b", confirmed=False), Confirmation.of(results, "c", confirmed=False)]
+    text = write_report(results, tmp_path / "b.html", confirmations=[confirmed, *others]).read_text("utf-8")
+    assert "confirmed by replay</a>" not in text
+    assert "Not confirmed by replay. openvima verify-results b plays" in section(text, "verification")
+    assert "the actions were not recorded" in section(text, "verification")
 
 
 def test_notes_stand_at_the_top(results, tmp_path):

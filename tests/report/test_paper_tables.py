@@ -68,6 +68,13 @@ def test_differences_show_counts_and_mark_noise(tables):
     assert any("≈" in cell for cells in cells_of(text, "stack\\<b>") for cell in cells)
 
 
+def test_captions_say_whether_outcomes_were_confirmed_by_replay(results):
+    marked, plain = (paper_tables(results, confirmed=confirmed) for confirmed in (True, False))
+    assert all("confirmed by replaying the recorded actions" in table.caption for table in marked)
+    assert "`openvima verify-results`" in plain[0].caption
+    assert not any("confirmed" in table.caption for table in plain[1:])
+
+
 def test_latex_is_balanced_and_escaped(tables):
     text = latex(tables)
     begun, ended = re.findall(r"\\begin{(\w+)}", text), re.findall(r"\\end{(\w+)}", text)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from openvima.evaluation.comparison import Comparison
     from openvima.evaluation.merging import Merged
     from openvima.evaluation.results import Results
+    from openvima.report.confirmation import Confirmation
     from openvima.video.clips import Clip
 
 _HTML, _MARKDOWN, _LATEX = (".html", ".htm"), (".md", ".markdown"), (".tex",)
@@ -68,7 +69,9 @@ def main(
     pairs = _pairs(compare) if compare is not None else default_pairs(found)
     comparisons = compare_pairs(found, pairs)
     suffix = out.suffix.lower() if out else ""
-    tables = paper_tables(found, comparisons, published=published)
+    confirmations = _confirmations(evaluations)
+    confirmed = all(each.confirmed for each in confirmations)
+    tables = paper_tables(found, comparisons, published=published, confirmed=confirmed)
     if suffix in (*_MARKDOWN, *_LATEX) and out is not None:
         atomic_write_file(out, as_latex(tables) if suffix in _LATEX else as_markdown(tables))
         print(f"Tables: {out}")
@@ -87,7 +90,15 @@ def main(
                 print(finding(comparison, difference), file=said)
     if out is not None or not prints:
         records = [*runs, *([metrics] if metrics else [])]
-        path = _page(evaluations, merged, comparisons, out or _default_out(evaluations), records, published)
+        path = _page(
+            evaluations,
+            merged,
+            comparisons,
+            out or _default_out(evaluations),
+            records,
+            published=published,
+            confirmations=confirmations,
+        )
         print(f"Report: {path}", file=said)
     return 0
 
@@ -118,6 +129,19 @@ def _merged(evaluations: dict[Path, "Results"]) -> "Merged":
     return merge(dict(zip(labels, evaluations.values(), strict=True)))
 
 
+def _confirmations(evaluations: dict[Path, "Results"]) -> list["Confirmation"]:
+    """Say of each evaluation whether its outcomes were confirmed by replay."""
+    from openvima.evaluation.verification import is_marked_verified
+    from openvima.report.confirmation import Confirmation
+    from openvima.report.curves import run_labels
+
+    labels = run_labels([_folder(path) for path in evaluations])
+    return [
+        Confirmation.of(results, label, confirmed=is_marked_verified(_folder(path)))
+        for label, (path, results) in zip(labels, evaluations.items(), strict=True)
+    ]
+
+
 def _pairs(names: str) -> list[tuple[str, str]]:
     """Pair the first name with each of the others."""
     from openvima.errors import ConfigError
@@ -134,7 +158,9 @@ def _page(
     comparisons: "Sequence[Comparison]",
     out: Path,
     records: Sequence[Path],
+    *,
     published: bool,
+    confirmations: "Sequence[Confirmation]",
 ) -> Path:
     from openvima.report import write_report
     from openvima.report.assets import require_extra
@@ -150,6 +176,7 @@ def _page(
         comparisons=comparisons,
         notes=merged.notes,
         with_published=published,
+        confirmations=confirmations,
     )
 
 

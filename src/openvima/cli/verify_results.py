@@ -47,6 +47,7 @@ def main(
             f"{folder}: {found.episodes:,} episodes confirmed by their actions; sha256 {found.sha256[:16]}…"
         )
         print(f"declared, not proven: {found.declared}")
+        print(f"to submit: results.json and actions.arrow, {found.num_bytes / 1e6:.1f} MB")
         return 0
     print(f"{folder}: not confirmed, {len(found.problems)} contradictions")
     for problem in found.problems[:MAX_SHOWN]:

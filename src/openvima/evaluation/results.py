@@ -12,12 +12,14 @@ from typing import Any
 
 from openvima.atomic_io import atomic_write_file
 from openvima.brief import MAX_CHARACTERS, brief_repr, cut
-from openvima.errors import DatasetError
+from openvima.errors import DatasetError, InputFileError, echo
 from openvima.evaluation.statistics import Interval, mean_of_rates, wilson_interval
 from openvima.html import notebook_html
+from openvima.input_files import read_text
 
 SCHEMA = 1
 FILE_NAME = "results.json"
+_MAX_BYTES = 1 << 28  # a million episodes
 BAD_ACTION = "invalid action"  # kind of failure
 # What replaying the actions cannot prove.
 DECLARED = "who acted (policies) and what they observed (ablation, boxes, device, precision, near_ties)"
@@ -262,22 +264,74 @@ class Results:
         Raises:
             DatasetError: The file is missing, damaged or of another schema.
         """
+        return ResultsFile.read(path).results
+
+
+@dataclass(frozen=True, slots=True)
+class ResultsFile:
+    """A `results.json` as it was read.
+
+    Args:
+        results: What its outcomes say.
+        text: Its text.
+        content: Its content, with the counts, means and digest that it states.
+    """
+
+    results: Results
+    text: str
+    content: dict[str, Any]  # plain JSON values
+
+    @staticmethod
+    def read(path: Path) -> "ResultsFile":
+        """Read a `results.json`, or the one of an evaluation's folder.
+
+        Raises:
+            DatasetError: The file is missing, damaged, too large or of another schema.
+        """
         path = path / FILE_NAME if path.is_dir() else path
         if not path.is_file():
             out = shlex.quote(str(path.parent))
             raise DatasetError(f"there is no {path}; `openvima evaluate --out {out}` writes one.")
         try:
-            content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+            text = read_text(path, max_bytes=_MAX_BYTES)
+            content = json.loads(text, parse_constant=_refuse_constant)
             if content.get("schema") != SCHEMA:
                 raise DatasetError(
-                    f"{path} has schema {content.get('schema')!r}; this version reads schema {SCHEMA}. "
-                    "Evaluate again, or read it with the version of openvima that wrote it."
+                    f"{path} has schema {echo(repr(content.get('schema')))}; this version reads schema "
+                    f"{SCHEMA}. Evaluate again, or read it with the version of openvima that wrote it."
                 )
-            rows = tuple(_row_from_record(record) for record in content["rows"])
-            described = (content["config"], content["versions"], content["policies"])
-            return Results(rows, *described, content.get("actions_sha256", ""))
-        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-            raise DatasetError(f"{path} is damaged ({error!r}); evaluate again with --force.") from error
+            return ResultsFile(_from_content(content), text, content)
+        except InputFileError as error:
+            raise DatasetError(str(error)) from None
+        except DatasetError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise DatasetError(
+                f"{path} is damaged ({echo(repr(error))}); evaluate again with --force."
+            ) from error
+
+    @property
+    def sha256(self) -> str:
+        """The digest that it states; empty without one."""
+        stated = self.content.get("sha256", "")
+        return stated if isinstance(stated, str) else ""
+
+
+def _from_content(content: Mapping[str, Any]) -> Results:
+    """Read the content of a file that others may have written.
+
+    Raises:
+        KeyError: Something is missing.
+        TypeError: A value is of another type.
+    """
+    rows = tuple(_row_from_record(record) for record in content["rows"])
+    described = (content["config"], content["versions"], content["policies"])
+    _check_types(described, dict)
+    _check_types(content["versions"].values(), str)
+    _check_types(content["policies"].values(), dict)
+    sha256 = content.get("actions_sha256", "")
+    _check_types([sha256], str)
+    return Results(rows, *described, sha256)
 
 
 def _json_text(content: Mapping[str, object]) -> str:
@@ -326,14 +380,24 @@ def _row_record(row: Row) -> dict[str, object]:
 
 def _row_from_record(record: Mapping[str, Any]) -> Row:
     outcomes = tuple(EpisodeOutcome(**outcome) for outcome in record["outcomes"])
-    return Row(
-        record["policy"],
-        record["task"],
-        record["level"],
-        record["oracle_max_steps"],
-        outcomes,
-        record.get("ablation", ""),
-    )
+    if not outcomes:
+        raise TypeError("a row has no outcomes")
+    for outcome in outcomes:
+        _check_types((outcome.seed, outcome.steps, outcome.resamples, outcome.near_ties), int)
+        _check_types((outcome.success,), bool)
+        _check_types((outcome.reason, outcome.kind), str)
+        _check_types((outcome.oracle_max_steps or 0,), int)
+    names = (record["policy"], record["task"], record["level"], record.get("ablation", ""))
+    _check_types(names, str)
+    _check_types((record["oracle_max_steps"],), int)
+    policy, task, level, ablation = names
+    return Row(policy, task, level, record["oracle_max_steps"], outcomes, ablation)
+
+
+def _check_types(values: Iterable[object], allowed: type) -> None:
+    for value in values:
+        if type(value) is not allowed:  # a bool is no count
+            raise TypeError(f"{value!r} stands for a value of type {allowed.__name__}")
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:

@@ -12,17 +12,16 @@ from openvima.catalog.user_assets import recorded_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, DatasetError, OpenVimaError, echo
 from openvima.evaluation.ablations import ablated_environment
-from openvima.evaluation.actions import ActionReplay, read_actions
+from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import EvaluationConfig, cells
-from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, Row
+from openvima.evaluation.results import DECLARED, FILE_NAME, EpisodeOutcome, Results, ResultsFile, Row
 from openvima.evaluation.rollout import BAD_ACTION, NO_ORACLE_ACTION, play
 from openvima.evaluation.runner import Report
 from openvima.evaluation.versions import versions
-from openvima.input_files import read_text
+from openvima.input_files import read_json
 from openvima.multiprocess import imap_unordered
 
 VERIFICATION_NAME = "verification.json"
-_MAX_BYTES = 1 << 28
 _SIMULATOR = ("environments", "mujoco")  # versions that decide what an action does
 _ENDED_EARLY = (BAD_ACTION, NO_ORACLE_ACTION)  # no action was executed; which one was given is not recorded
 _BATCH = 16  # episodes of one job
@@ -37,6 +36,7 @@ class VerifiedResults:
         episodes: Episodes that were played again.
         problems: What contradicts the file, one sentence each; empty if all is confirmed.
         sha256: Digest that the file names.
+        num_bytes: Size of `results.json` and `actions.arrow`, all that a submission needs.
         declared: What replaying cannot prove.
     """
 
@@ -44,6 +44,7 @@ class VerifiedResults:
     episodes: int
     problems: tuple[str, ...]
     sha256: str
+    num_bytes: int
     declared: str = DECLARED
 
     @property
@@ -87,14 +88,12 @@ def verify_results(
         AssetError: The results name a function as their assets; pass it as `assets`.
     """
     path = folder / FILE_NAME
+    if not path.is_file():
+        raise DatasetError(f"there is no {path}; give the folder of an evaluation.")
+    file = ResultsFile.read(path)
+    results = file.results
     try:
-        text = read_text(path, max_bytes=_MAX_BYTES)
-    except FileNotFoundError:
-        raise DatasetError(f"there is no {path}; give the folder of an evaluation.") from None
-    results = Results.read(path)
-    digest = _digest_in(text)
-    try:
-        problems = [*_text_problems(text, results), *_row_problems(results)]
+        problems = [*_text_problems(file), *_row_problems(results)]
         _check_simulator(path, results.versions)
         env_config = _env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
@@ -107,36 +106,36 @@ def verify_results(
     if not problems:
         problems += _replay_all(results, actions, env_config, workers, report)
     episodes = sum(row.episodes for row in results.rows)
-    found = VerifiedResults(folder, episodes, tuple(problems), digest)
+    num_bytes = sum((folder / name).stat().st_size for name in (FILE_NAME, ACTIONS_NAME))
+    found = VerifiedResults(folder, episodes, tuple(problems), file.sha256, num_bytes)
     if found.is_verified:
-        record = {"sha256": digest, "episodes": episodes, "versions": versions(with_torch=False)}
+        record = {"sha256": file.sha256, "episodes": episodes, "versions": versions(with_torch=False)}
         atomic_write_file(folder / VERIFICATION_NAME, json.dumps(record, indent=1) + "\n")
     return found
 
 
 def is_marked_verified(folder: Path) -> bool:
-    """Whether `verify_results` has confirmed the results that are in a folder now."""
+    """Whether `verify_results` has confirmed the results and actions that are in a folder now.
+
+    The mark of a folder that came from elsewhere is a claim.
+    """
     try:
-        record = json.loads(read_text(folder / VERIFICATION_NAME))
-        text = read_text(folder / FILE_NAME, max_bytes=_MAX_BYTES)
-        return bool(record["sha256"]) and record["sha256"] == _digest_in(text)
-    except (OSError, ValueError, TypeError, LookupError):
+        mark = read_json(folder / VERIFICATION_NAME)["sha256"]
+        file = ResultsFile.read(folder / FILE_NAME)
+        if mark != file.sha256 or next(_text_problems(file), None):
+            return False
+        return read_actions(folder, file.results.rows)[1] == file.results.actions_sha256
+    except (OSError, ValueError, TypeError, LookupError, AttributeError):
         return False
 
 
-def _digest_in(text: str) -> str:
-    """The digest in a `results.json`; empty without one."""
-    found = json.loads(text).get("sha256", "")
-    return found if isinstance(found, str) else ""
-
-
-def _text_problems(text: str, results: Results) -> Iterator[str]:
+def _text_problems(file: ResultsFile) -> Iterator[str]:
     """Compare the file with what its outcomes give: every count, mean, interval, and the digest."""
-    own_text = results.to_json()
-    if text == own_text:
+    own_text = file.results.to_json()
+    if file.text == own_text:
         return
-    given, own = json.loads(text), json.loads(own_text)
-    differing = [key for key in own if given.get(key) != own[key] and key != "sha256"]
+    own = json.loads(own_text)
+    differing = [key for key in own if file.content.get(key) != own[key] and key != "sha256"]
     if differing:
         yield f"{', '.join(differing)} do not follow from the outcomes"
     else:

@@ -12,9 +12,11 @@ from openvima.evaluation.config import Batch, EvaluationConfig, cells
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.runner import Job, evaluate_prepared, prepare
 from openvima.evaluation.sources import ORACLE, TRAINED_KINDS, PolicySource
+from openvima.evaluation.verification import is_marked_verified
 from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.policies.bundled import BUNDLED
+from openvima.report.confirmation import Confirmation
 from openvima.report.curves import METRICS_FILE
 from openvima.report.page import default_command, write_report
 from openvima.video.clips import Clip, load_clips, png, save_clips
@@ -94,6 +96,9 @@ def evaluate_and_report(
             command=default_command(results, config.policies),
             metrics=find_metrics(config.sources),
             clips=_recorded(recording_jobs(config, videos, results), config, note),
+            confirmations=[
+                Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
+            ],
         )
     return path
 

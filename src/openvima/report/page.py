@@ -12,6 +12,7 @@ from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
 from openvima.report import figures, fragments, published, tables, text
 from openvima.report.ablations import ablated_policies
+from openvima.report.confirmation import Confirmation
 from openvima.report.curves import read_run_charts
 from openvima.report.families import family_table
 from openvima.report.level_drop import level_drop_table, level_figure
@@ -49,6 +50,7 @@ def write_report(
     comparisons: Sequence[Comparison] | None = None,
     notes: Sequence[str] = (),
     with_published: bool = True,
+    confirmations: Sequence[Confirmation] = (),
 ) -> Path:
     """Write the report of an evaluation.
 
@@ -62,6 +64,7 @@ def write_report(
         comparisons: Policies to compare; by default those of `comparison.default_pairs`.
         notes: Warnings to put at the top.
         with_published: Whether to show published numbers of the same tasks, unless prompts or tasks differ.
+        confirmations: For each evaluation whether its outcomes were confirmed by replay.
 
     Returns:
         The file.
@@ -93,6 +96,8 @@ def write_report(
         notes=notes,
         clips=clips,
         comparisons=comparisons,
+        confirmations=confirmations,
+        all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),
         ablations=ablated_policies(results),
         rate_figures=rate_figures(results),
         families=family_table(results, published=with_published),

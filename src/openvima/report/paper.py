@@ -1,6 +1,7 @@
 """Tables of an evaluation for papers."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from openvima.evaluation.comparison import ABLATION_SEPARATOR, Comparison, Difference
 from openvima.evaluation.results import LevelMean, Results
@@ -20,11 +21,17 @@ from openvima.report.text import ablation_name, counted
 from openvima.report.typesetting import Estimate, Line, Table
 
 _Means = Mapping[tuple[str, str, str], LevelMean]  # by policy, ablation and level
+_CONFIRMED = "Measured outcomes are confirmed by replaying the recorded actions; who acted is declared."
+_UNCONFIRMED = "Outcomes are not confirmed by replay, as `openvima verify-results` does."
 _NOISE_MARK = "≈"
 
 
 def paper_tables(
-    results: Results, comparisons: Sequence[Comparison] = (), *, published: bool = True
+    results: Results,
+    comparisons: Sequence[Comparison] = (),
+    *,
+    published: bool = True,
+    confirmed: bool = False,
 ) -> list[Table]:
     """Choose what a paper would print: means by level, family and task, ablations, differences.
 
@@ -32,6 +39,7 @@ def paper_tables(
         results: The evaluation.
         comparisons: Policies to compare.
         published: Whether to add published level means of the same tasks, unless prompts or tasks differ.
+        confirmed: Whether all outcomes were confirmed by replay, which captions then say.
     """
     means = results.means()
     published = published and is_comparable(results)
@@ -51,7 +59,10 @@ def paper_tables(
         *map(rate_table, rate_figures(results)),
         *map(_difference_table, comparisons),
     ]
-    return [table for table in chosen if table and table.lines]
+    tables = [table for table in chosen if table and table.lines]
+    if confirmed:
+        return [replace(table, caption=f"{table.caption} {_CONFIRMED}") for table in tables]
+    return [replace(tables[0], caption=f"{tables[0].caption} {_UNCONFIRMED}"), *tables[1:]]
 
 
 def _mean_table(results: Results, means: _Means, *, published: bool) -> Table:
