@@ -4,12 +4,17 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from openvima.cli.lists import parse_list
 from openvima.cli.progress import progress_bar
+from openvima.cli.tables import print_table
+
+if TYPE_CHECKING:
+    from openvima.studies import StudyInputs
+    from openvima.studies.plan import Plan
 
 
 def main(
@@ -27,6 +32,7 @@ def main(
     engine: Literal["processes", "ray"] = "processes",
     address: str | None = None,
     device: str | None = None,
+    dry_run: bool = False,
 ) -> int:
     """Run an experiment of the papers: generate, train, evaluate, and write report.html and study.json.
 
@@ -54,11 +60,13 @@ def main(
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
         device: Where networks are trained and act: cpu or cuda. By default they are trained on a GPU if
             there is one, and act on a CPU.
+        dry_run: Print runs and estimated time, from a measurement of about a minute at nano; write nothing.
 
     Returns:
         Exit status.
     """
     from openvima.studies import Execution, StudyInputs, check_options, make_study, run_study, scale_named
+    from openvima.studies.plan import plan_study
 
     sizes = scale_named(scale)
     if episodes is not None:
@@ -77,6 +85,9 @@ def main(
     start = f"openvima study {shlex.quote(name)} --scale {scale} --seeds {seeds}"
     command = " ".join([start, *words, "--out DIR"])
     execution = Execution(workers, engine, address)
+    if dry_run:
+        _print_estimates(plan_study(study, inputs, out, seeds=seeds, device=device), inputs, workers or 1)
+        return 0
     with progress_bar("stages") as bar:
         page = run_study(
             study, inputs, out, seeds=seeds, device=device, execution=execution, command=command, report=bar
@@ -84,3 +95,25 @@ def main(
     print(f"Report: {page}", file=sys.stderr)
     print(page)
     return 0
+
+
+def _print_estimates(plan: "Plan", inputs: "StudyInputs", workers: int) -> None:
+    """Print what would be done, and how long it would take."""
+    from rich.table import Table
+
+    from openvima.studies.estimate import estimate
+    from openvima.studies.page import duration
+    from openvima.studies.runner import check_plan
+
+    check_plan(plan, inputs)
+    estimates = estimate(plan, lambda text: print(f"measuring: {text}", file=sys.stderr))
+    table = Table("stage", title="estimated time, from a short measurement on this machine")
+    table.add_column("number", justify="right")
+    table.add_column("time", justify="right")
+    for found in estimates:
+        table.add_row(found.what, f"{found.count}", duration(found.seconds))
+    total = sum(found.seconds for found in estimates)
+    table.add_row("all, in one process", "", duration(total), style="bold")
+    if workers > 1:
+        table.add_row(f"with {workers} workers, at best", "", duration(total / workers), style="bold")
+    print_table(table, num_heads=1)

@@ -51,7 +51,7 @@ def study_page(
         span=text.span,
         points_of=text.points,
         points_span=text.points_span,
-        duration=_duration,
+        duration=duration,
     )
 
 
@@ -120,11 +120,11 @@ def _summary(points: Sequence[Point]) -> str:
     return f"Solved episodes on {first}: {', '.join(means)}."
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Write a time with a fitting unit.
 
     Example:
-        >>> _duration(95), _duration(7300)
+        >>> duration(95), duration(7300)
         ('1.6 min', '2.0 h')
     """
     for unit, size in (("d", 86400), ("h", 3600), ("min", 60)):

@@ -11,8 +11,11 @@ from openvima.user_code import is_code, load_function
 # Name → what it asks. Each is a function of the same name in a module of the same name, with underscores.
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
+        "model-scaling": "success by the size of the network, all architectures",
         "data-scaling": "success by the fraction of the demonstrations",
+        "image-tokens": "objects, perceivers, patches or one token",
         "conditioning": "cross-attention to the prompt, or the prompt as a prefix",
+        "text-encoder": "sizes of T5, and how many of its layers are trained",
         "distractors": "success of policies by the number of distractors",
         "corrupted-prompts": "success of policies with masked, swapped or replaced words",
         "level-drop": "from L1 to L4, by architecture",
