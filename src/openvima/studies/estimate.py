@@ -1,8 +1,8 @@
 """Estimated time of a study on this machine, from a short calibration in a temporary folder.
 
 Measured are a few demonstrations, training steps of each kind of network, and episodes of each policy; times
-are scaled to the sizes of the study. Without a GPU they are CPU times, as of an otherwise idle machine. Start of
-processes and object caches are not part of it.
+are scaled to the sizes of the study. Without a GPU they are CPU times, as of an otherwise idle machine. Start
+of processes and object caches are not part of it.
 """
 
 import json
@@ -16,7 +16,7 @@ from openvima.data import Dataset, GenerateConfig, generate
 from openvima.evaluation.config import plan as plan_evaluation
 from openvima.evaluation.runner import evaluate
 from openvima.studies.plan import Evaluation, Plan, Training
-from openvima.studies.study import Demonstrations
+from openvima.studies.study import Demonstrations, EvaluationSettings
 from openvima.training.config import TrainingConfig
 
 _DEMONSTRATIONS, _STEPS, _EPISODES = 4, 6, 2
@@ -82,19 +82,22 @@ class _Calibration:
             trainings.setdefault(training.run, []).append(training)
         runs: dict[str, Path] = {}
         for run, of_run in trainings.items():
-            self.say(f"training {run or 'initial weights'} for {_STEPS} steps")
             seconds = 0.0
             for training in of_run:
                 runs[run], its_seconds = self._training(training.config)
                 seconds += its_seconds
             yield Estimate(f"training {run or 'initial weights'}", len(of_run), seconds)
+        speeds: dict[tuple[Path | None, EvaluationSettings | None], float] = {}
         evaluations: dict[str, list[Evaluation]] = {}
         for evaluation in self.plan.evaluations:
             evaluations.setdefault(evaluation.run.label, []).append(evaluation)
         for run, of_run in evaluations.items():
-            self.say(f"evaluating {run} in {_EPISODES} episodes of each task")
             episodes = sum(batch.episodes for batch in plan_evaluation(of_run[0].config))
-            seconds = episodes * len(of_run) * self._evaluating(of_run[0], runs.get(run))
+            measured, settings = runs.get(run), of_run[0].run.evaluation
+            if measured is None or (measured, settings) not in speeds:  # equal networks are equally fast
+                self.say(f"evaluating {run} in {_EPISODES} episodes of each task")
+                speeds[measured, settings] = self._evaluating(of_run[0], measured)
+            seconds = episodes * len(of_run) * speeds[measured, settings]
             yield Estimate(f"evaluating {run}, {episodes:,} episodes each", len(of_run), seconds)
 
     def _new(self) -> Path:
@@ -121,6 +124,7 @@ class _Calibration:
         settings = {**config.identity(), "seed": 0, "init_from": None, "pretraining": steps > 0}
         key = json.dumps({**settings, "schedule": None}, sort_keys=True)
         if key not in self.speeds:
+            self.say(f"training {config.preset} for {_STEPS} steps")
             self.speeds[key] = self._measured(config)
         run, step, pretraining_step, scene = self.speeds[key]
         count = config.schedule.steps  # studies set steps, not epochs
