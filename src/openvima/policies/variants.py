@@ -170,7 +170,7 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
             of the former is a pair of blocks, so the latter has twice as many layers.
 
     Raises:
-        ConfigError: There is no such conditioning, or the network is a pointer model.
+        ConfigError: There is no such conditioning.
 
     Source: VIMA (Jiang et al. 2023), ablation "gpt-decoder".
     """
@@ -179,8 +179,6 @@ def with_conditioning(config: PolicyConfig, name: str) -> PolicyConfig:
     is_prefix = isinstance(config.decoder, PrefixDecoderConfig)
     if is_prefix == (name == "prefix"):
         return config
-    if isinstance(config, PointerConfig):
-        raise _not_of_pointers("conditioning is 'prefix'", "cross-attention alone")
     old = config.decoder
     rest = {"dropout": old.dropout, "initial_std": old.initial_std}
     if is_prefix:

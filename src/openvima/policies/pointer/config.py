@@ -6,7 +6,7 @@ from typing import ClassVar
 from openvima.errors import ConfigError
 from openvima.policies.input_layout import InputLayout
 from openvima.policies.nn.conv_encoder import ConvConfig
-from openvima.policies.nn.decoder import DecoderConfig
+from openvima.policies.nn.decoder import AnyDecoderConfig, DecoderConfig
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig, check_widths
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
@@ -103,7 +103,7 @@ class PointerConfig:
     architecture: ClassVar[str] = "pointer"
     images: ObjectEncoderConfig
     prompt: PromptEncoderConfig
-    decoder: DecoderConfig
+    decoder: AnyDecoderConfig
     head: ObjectHeadConfig | CandidateHeadConfig
     action_width: int = 64
     correspondence: CorrespondenceConfig | None = None

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from openvima.policies.batch import HistoryBatch, PromptBatch
 from openvima.policies.nn.action_encoder import ActionEncoder
 from openvima.policies.nn.actions import ActionTargets, DecodingStrategy, greedy, to_unit_range
-from openvima.policies.nn.decoder import Decoder, KVCache, TokenSegment
+from openvima.policies.nn.decoder import KVCache, TokenSegment, build_decoder
 from openvima.policies.nn.history import ObservationTokens, action_segment, decode_observations, shift_actions
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
@@ -82,7 +82,7 @@ class Pointer(PolicyNetwork):
         self.end_effectors = nn.Embedding(NUM_END_EFFECTORS, NUM_END_EFFECTORS)
         self.observation_out = nn.Linear(images.width + NUM_END_EFFECTORS, width)
         self.actions = ActionEncoder(config.action_width, width)
-        self.decoder = Decoder(config.decoder)
+        self.decoder = build_decoder(config.decoder)
         self.query = nn.Parameter(torch.randn(width) * 0.02)
         self.text_appearance: nn.Linear | None = None
         if isinstance(config.head, CandidateHeadConfig):
