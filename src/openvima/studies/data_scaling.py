@@ -4,6 +4,7 @@ Every fraction is trained for the same number of steps, and each training seed d
 """
 
 from openvima.report.published_curves import data_fraction_curves
+from openvima.studies.scales import NANO_POINTER
 from openvima.studies.study import Run, Study, StudyInputs, published_points
 
 FRACTIONS = (0.001, 0.01, 0.1, 1.0)
@@ -12,7 +13,7 @@ FRACTIONS = (0.001, 0.01, 0.1, 1.0)
 def data_scaling(inputs: StudyInputs) -> Study:
     """Fractions of the demonstrations, as published for VIMA 92M and MIDAS 92M."""
     scale = inputs.scale
-    network = {"preset": "nano"} if scale.is_nano else inputs.network("vima")
+    network = NANO_POINTER if scale.is_nano else inputs.network("vima")
     return Study(
         name="data-scaling",
         question="How does success depend on the number of demonstrations?",

@@ -1,23 +1,18 @@
 """Can a policy solve a task that it was not trained on, from an example in the prompt?"""
 
 from openvima.evaluation.in_context import HELD_OUT_TASKS
+from openvima.studies.scales import NANO_PRETRAINING
 from openvima.studies.study import Run, Settings, Study, StudyInputs
 
 # At nano: equal total steps, and tasks of several steps, whose motions are worth following.
-NANO_TASKS = (
-    "visual_manipulation",
-    "rotate",
-    "rearrange",
-    "rearrange_then_restore",
-    "manipulate_old_neighbor",
-    "pick_in_order_then_restore",
-)
+NANO_TASKS = ("visual_manipulation", "rotate", "rearrange", "rearrange_then_restore")
 NANO_SETTINGS: Settings = {
     "preset": "nano-bins",
+    **NANO_PRETRAINING,
     "model.visual_residual": True,
     "model.head": "autoregressive",
     "optimizer.learning_rate": 5e-4,
-    "schedule.steps": 1600,
+    "schedule.steps": 1200,
 }
 PRETRAINING_STEPS = 10_300  # the longest of the paper
 TEXT_DESCRIPTION_PROB = 0.5

@@ -2,12 +2,13 @@
 
 from openvima.policies.presets import PUBLISHED
 from openvima.report.published import leading_models
+from openvima.studies.scales import NANO_POINTER
 from openvima.studies.study import PublishedPoint, Run, Study, StudyInputs
 
 
 def level_drop(inputs: StudyInputs) -> Study:
     """All architectures of the papers at one size; at nano the pointer model as well."""
-    own = (Run("nano", settings={"preset": "nano"}),) if inputs.scale.is_nano else ()
+    own = (Run("nano", settings=NANO_POINTER),) if inputs.scale.is_nano else ()
     return Study(
         name="level-drop",
         question="How much success is lost from L1 to L4?",
