@@ -13,7 +13,7 @@ from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.heads import HEADS
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
 from openvima.policies.nn.vit import VitConfig
-from openvima.policies.pointer.config import PointerConfig
+from openvima.policies.pointer.config import AttributeConfig, CandidateHeadConfig, PointerConfig
 from openvima.policies.sizes import T5_SIZES, size, t5_prompt_encoder
 from openvima.policies.vima.config import VimaConfig
 
@@ -209,6 +209,17 @@ def _not_of_pointers(given: str, have: str) -> ConfigError:
     return ConfigError(f"{given}, but pointer models have {have}; take nano-bins or another preset.")
 
 
+def with_attributes(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
+    """Return the same network with or without comparison by attributes.
+
+    Raises:
+        ConfigError: The network is no pointer model with place candidates.
+    """
+    if not isinstance(config, PointerConfig) or not isinstance(config.head, CandidateHeadConfig):
+        raise ConfigError("attributes need a pointer model with place candidates; take the preset small.")
+    return replace(config, attributes=AttributeConfig() if wanted else None)
+
+
 # In the order in which they are made: later ones see the parts of earlier ones.
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "text_encoder": with_text_encoder,
@@ -219,4 +230,5 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "num_layers": with_num_layers,
     "head": with_head,
     "visual_residual": with_visual_residual,
+    "attributes": with_attributes,
 }

@@ -82,6 +82,11 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
             f"tokens {image_tokens(sizes)!r} has no appearance embedding to pretrain; leave it out, or set "
             "it to 0."
         )
+    if config.pretraining.attribute_loss_weight and not config.model.attributes:
+        raise ConfigError(
+            f"pretraining.attribute_loss_weight is {config.pretraining.attribute_loss_weight:g}, but the "
+            "network compares no attributes; set model.attributes, or leave the weight out."
+        )
     if config.pretraining.steps is None:
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
         return replace(config, pretraining=replace(config.pretraining, steps=steps))
@@ -185,8 +190,9 @@ def _check_sizes(ours: PolicyConfig, theirs: PolicyConfig, source: str) -> None:
 
 def _copy_weights(initial: PolicyNetwork, network: PolicyNetwork) -> None:
     """Copy all weights; embeddings of words behind those of the other network stay fresh."""
-    weights = initial.state_dict()
-    words = network.prompt.words.weight.detach()
-    count = len(weights["prompt.words.weight"])
-    words[:count] = weights["prompt.words.weight"]
-    network.load_state_dict({**weights, "prompt.words.weight": words})
+    weights, fresh = initial.state_dict(), network.state_dict()
+    for name in ("prompt.words.weight", "attributes.words.weight"):
+        if name in weights:
+            fresh[name][: len(weights[name])] = weights[name]
+            weights[name] = fresh[name]
+    network.load_state_dict(weights)

@@ -79,6 +79,8 @@ class ModelConfig:
         width: Width of the decoder and of image tokens, a multiple of the heads.
         num_layers: Layers of the decoder: pairs of a cross block and a self block, or with a prefix self
             blocks.
+        attributes: Compare objects by the attributes that a prompt names, such as "the same texture". For the
+            preset small; `pretraining.attribute_loss_weight` trains them.
     """
 
     head: Literal["bins", "autoregressive", "mixture", "regression"] | None = None
@@ -89,6 +91,7 @@ class ModelConfig:
     conditioning: Literal["cross-attention", "prefix"] | None = None
     width: Count | None = None
     num_layers: Count | None = None
+    attributes: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +168,8 @@ class PretrainingConfig:
         box_jitter_px: Largest random shift of a crop's borders, in pixels of its 32.
         grayscale_prob: Probability for each object of a prompt image in neutral grey, which matches by shape.
         occlusion_prob: Probability for each object that bars of the background are painted over it.
+        attribute_loss_weight: Weight of the loss of attributes ("the same texture") on labelled pairs. Above
+            0 it needs `model.attributes`, and captions of the pairs teach the words.
         finetune_crop_encoder: Also train the crop encoder in behaviour cloning. Slower: each step encodes its
             crops anew.
     """
@@ -179,6 +184,7 @@ class PretrainingConfig:
     box_jitter_px: Annotated[float, Range(0, 8)] = 0.0
     grayscale_prob: Probability = 0.0
     occlusion_prob: Probability = 0.0
+    attribute_loss_weight: Annotated[float, Range(0, 100)] = 0.0
     finetune_crop_encoder: bool = False
 
 

@@ -68,7 +68,9 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         joined(runtime.device, runtime.sharding) as parallel,
         run_lock(config.out, is_first=parallel.is_first),
     ):
-        learner = build_learner(config, training_texts(dataset, config.augmentation))
+        with_captions = config.pretraining.attribute_loss_weight > 0
+        texts = training_texts(dataset, config.augmentation, with_captions=with_captions)
+        learner = build_learner(config, texts)
         if boxes and learner.input_kind == "frames":
             raise ConfigError(
                 f"loader.boxes is {config.loader.boxes!r}, but preset {config.preset!r} takes whole frames; "
@@ -114,6 +116,7 @@ class _Stages:
     def _pretraining(self) -> Stage:
         assert isinstance(self.learner, PolicyLearner)  # `resolved` has checked it
         network, config = self.learner.network, self.config.pretraining
+        with_attributes = config.attribute_loss_weight > 0
         pairs = render_pairs(
             sorted(set(self.dataset.index.column("task").to_pylist())),
             num_scenes=config.num_scenes,
@@ -122,12 +125,16 @@ class _Stages:
             augmentation=SceneAugmentation(
                 config.appearance_randomization_prob,
                 config.hard_negative_prob,
-                second_view=compares_rotations(network) or config.hard_negative_prob > 0,
+                second_view=(compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes),
                 grayscale_prob=config.grayscale_prob,
             ),
+            with_attributes=with_attributes,
             report=self._say,
         )
-        return ContrastivePretraining(network, config, self.config.seed, pairs.to(self.parallel.device))
+        encode = self.learner.processor.tokenizer.encode
+        return ContrastivePretraining(
+            network, config, self.config.seed, pairs.to(self.parallel.device), encode
+        )
 
     def _behaviour_cloning(self) -> Stage:
         self.trainer.report(f"reading {len(self.dataset)} demonstrations")

@@ -14,14 +14,18 @@ from openvima.training.augmentation.describe_objects import text_of
 from openvima.training.augmentation.inverse_dynamics import motion_text
 from openvima.training.augmentation.prompt_images import DEFINITION
 from openvima.training.config import AugmentationConfig
+from openvima.training.pretraining.captions import caption_texts
 
 
-def training_texts(dataset: Dataset, augmentation: AugmentationConfig) -> Iterator[str]:
+def training_texts(
+    dataset: Dataset, augmentation: AugmentationConfig, *, with_captions: bool = False
+) -> Iterator[str]:
     """Read the different texts between the placeholders of the prompts, and those of the augmentation.
 
     Args:
         dataset: The demonstrations; of these only the prompts are read.
         augmentation: Settings; an inverse-dynamics prompt and novel nouns bring words of their own.
+        with_captions: Also yield the words of captions of attributes.
 
     Raises:
         ShardError: A shard is damaged.
@@ -35,6 +39,8 @@ def training_texts(dataset: Dataset, augmentation: AugmentationConfig) -> Iterat
         prompts.update(map(text_of, _descriptions(dataset)))
     if augmentation.rename_objects_prob:
         prompts.update(DEFINITION.format(noun=f"the {noun}", image="") for noun in NOUNS)
+    if with_captions:
+        yield from caption_texts()
     for prompt in prompts:
         yield from (piece for piece in split_prompt(prompt) if isinstance(piece, str))
 

@@ -63,11 +63,13 @@ class CandidatePointerHead(nn.Module):
 
     score = "accuracy"
 
-    def __init__(self, config: CandidateHeadConfig, width: int, rotation_bins: int = 0) -> None:
+    def __init__(
+        self, config: CandidateHeadConfig, width: int, rotation_bins: int = 0, *, has_attributes: bool = False
+    ) -> None:
         super().__init__()
         self.config = config
         self.rotation_copy = RotationCopy(width) if rotation_bins == config.num_yaw_bins else None
-        self.pick = PickPointer(config, width)
+        self.pick = PickPointer(config, width, has_attributes=has_attributes)
         self.place = PlacePointer(config, width)
         self.grid = GridCandidates(width)
         self.values = nn.ModuleList(nn.Linear(width, width) for _ in KINDS)
@@ -185,10 +187,14 @@ class PickPointer(ObjectPointer):
 
     "… then put the object that was previously at its {direction} into the same {container}." And an object
     where a scene of the prompt shows another one has to be cleared away.
+
+    Where the prompt selects attributes, likeness in them takes the place of similar appearance, which then
+    has a learned weight: nothing is more like {base} than itself, but that is not to be put "into it".
     """
 
-    def __init__(self, config: CandidateHeadConfig, width: int) -> None:
+    def __init__(self, config: CandidateHeadConfig, width: int, *, has_attributes: bool = False) -> None:
         super().__init__(width, config.num_prompt_queries)
+        self.appearance_weight = nn.Parameter(torch.zeros(())) if has_attributes else None
         self.grounding = TextGrounding(width)
         self.geometry = mlp((10, config.hidden_width, width))
 
@@ -196,7 +202,18 @@ class PickPointer(ObjectPointer):
         """Similarity to the attended prompt objects, and to what words describe, (B, T, N)."""
         appearance_BTA = self.grounding(inputs.prompt, inputs.query_BTD)
         described_BTN = (inputs.appearance_BTNA @ appearance_BTA[..., None]).squeeze(-1)
-        return super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
+        similarity_BTN = (
+            super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
+        )
+        selected_BP, likeness_BLX = inputs.prompt.selected_BP, inputs.prompt.likeness_BLX
+        if self.appearance_weight is None or selected_BP is None or likeness_BLX is None:
+            return similarity_BTN
+        assert inputs.likeness_BTNX is not None
+        attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ likeness_BLX[:, None]
+        attended_BTX = (scale_BTH[..., None] * attended_BTHX).sum(dim=2)
+        likeness_BTN = (inputs.likeness_BTNX @ attended_BTX[..., None]).squeeze(-1)
+        likeness_BTN = likeness_BTN + self.appearance_weight * similarity_BTN
+        return torch.where(selected_BP.any(dim=1)[:, None, None], likeness_BTN, similarity_BTN)
 
     def prompt_weights(self, inputs: HeadInputs) -> torch.Tensor:
         """Return how much of the appearance that is looked for comes from each prompt position, (B, T, L)."""

@@ -12,6 +12,9 @@ from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.nn.text_encoder import TextEncoderConfig
 from openvima.policies.sizes import VOCABULARY_SIZE, size
 
+ATTRIBUTES = ("texture", "colour", "shape", "profile", "height", "size")
+"""In what two objects may be alike, in the order of the projections."""
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectHeadConfig:
@@ -86,6 +89,26 @@ class CorrespondenceConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class AttributeConfig:
+    """Sizes of the projections in which objects are compared by one attribute.
+
+    Args:
+        hidden_width: Width of the hidden layer.
+        width: Length of a projection.
+    """
+
+    hidden_width: int = 128
+    width: int = 32
+
+    def __post_init__(self) -> None:
+        if self.hidden_width < 1 or self.width < 1:
+            raise ConfigError(
+                f"attributes: hidden_width is {self.hidden_width} and width {self.width}; both must be at "
+                "least 1."
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class PointerConfig:
     """Sizes of a pointer model.
 
@@ -98,6 +121,8 @@ class PointerConfig:
         correspondence: Attention between objects of different images; None for none.
         coreference: Words attend to the images that followed the same word before: "This is a wug {image}.
             Put the wug …"
+        attributes: Comparison by the attributes that a prompt names: "the same texture as {image}".
+            Contrastive pretraining fits them; None for none.
     """
 
     architecture: ClassVar[str] = "pointer"
@@ -108,8 +133,11 @@ class PointerConfig:
     action_width: int = 64
     correspondence: CorrespondenceConfig | None = None
     coreference: bool = False
+    attributes: AttributeConfig | None = None
 
     def __post_init__(self) -> None:
+        if self.attributes and not isinstance(self.head, CandidateHeadConfig):
+            raise ConfigError("pointer: attributes need a head of place candidates.")
         check_widths(self.images.width, self.decoder.width)
         if not self.images.fuse_views or not self.images.appearance_width:
             raise ConfigError("pointer: images needs fuse_views and an appearance_width above 0.")

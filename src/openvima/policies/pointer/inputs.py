@@ -1,7 +1,8 @@
 """What the heads of the pointer models read.
 
 Shape suffixes: B batch, T steps, N objects in view, L positions of the prompt, K objects of a set, D width, A
-width of appearance, C components of an action, R bins of rotations.
+width of appearance, P attributes, X width of all their projections, C components of an action, R bins of
+rotations.
 """
 
 from dataclasses import dataclass
@@ -60,6 +61,9 @@ class PointerPrompt(TensorRecord):
         text_appearance_BLA: Appearance that words describe; zero for other words.
         features: Objects of the images, shapes (B, M, ...).
         objects: The same as place candidates.
+        selected_BP: Which attributes the prompt asks to compare; None without attributes.
+        likeness_BLX: Projections of the objects of images, by which likeness in the selected attributes is a
+            dot product; zero elsewhere.
     """
 
     tokens_BLD: torch.Tensor
@@ -70,6 +74,8 @@ class PointerPrompt(TensorRecord):
     text_appearance_BLA: torch.Tensor
     features: ObjectFeatures
     objects: ObjectSet
+    selected_BP: torch.Tensor | None = None
+    likeness_BLX: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +95,7 @@ class HeadInputs:
         steps_T: Indices of the steps, from 0.
         first_step: Objects in view at the first step of the episode.
         prompt: Encoded prompts.
+        likeness_BTNX: Projections of the objects in view, as `PointerPrompt.likeness_BLX`.
     """
 
     query_BTD: torch.Tensor
@@ -102,6 +109,7 @@ class HeadInputs:
     steps_T: torch.Tensor
     first_step: ObjectSet
     prompt: PointerPrompt
+    likeness_BTNX: torch.Tensor | None = None
 
 
 def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:

@@ -22,6 +22,7 @@ from openvima.policies.nn.policy_network import NUM_END_EFFECTORS, PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoder
 from openvima.policies.nn.step_trace import StepTrace
 from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.pointer.attributes import Attributes, without_crops
 from openvima.policies.pointer.candidate_head import CandidatePointerHead
 from openvima.policies.pointer.config import CandidateHeadConfig, PointerConfig
 from openvima.policies.pointer.coreference import Coreference, coreference
@@ -87,7 +88,8 @@ class Pointer(PolicyNetwork):
         self.text_appearance: nn.Linear | None = None
         if isinstance(config.head, CandidateHeadConfig):
             rotation_bins = images.rotation_bins if config.correspondence else 0
-            self.head = CandidatePointerHead(config.head, width, rotation_bins)
+            has_attributes = config.attributes is not None
+            self.head = CandidatePointerHead(config.head, width, rotation_bins, has_attributes=has_attributes)
             self.text_appearance = nn.Linear(words, images.appearance_width, bias=False)
             nn.init.zeros_(self.text_appearance.weight)
         else:
@@ -97,6 +99,9 @@ class Pointer(PolicyNetwork):
         if config.correspondence:
             self.correspondence = Correspondence(config.correspondence, images)
             self.prompt_correspondence = Correspondence(config.correspondence, images)
+        self.attributes: Attributes | None = None
+        if config.attributes:
+            self.attributes = Attributes(config.attributes, images, config.prompt.vocabulary_size)
 
     def encode_images(self, images: torch.Tensor) -> torch.Tensor:
         """Encode crops (..., 3, 32, 32), uint8, to features (..., F)."""
@@ -111,10 +116,22 @@ class Pointer(PolicyNetwork):
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
+        weights_BLL = coreference(prompts).to(features_VSF.dtype)
+        selected_BP = likeness_BMX = None
+        if self.attributes is not None:
+            # Likeness alone is to decide: neither the name of the attribute nor what else the objects share.
+            selected_BP, names_attribute_BL = self.attributes.selected(prompts)
+            likeness_BMX = self.attributes.likeness(objects, selected_BP) * exists_BM[..., None]
+            word_ids_BL = prompts.word_ids_BL.masked_fill(names_attribute_BL, PADDING_ID)
+            prompts = replace(prompts, word_ids_BL=word_ids_BL)
+            objects = without_crops(objects, selected_BP)
+            is_shown_BM = ~selected_BP.any(dim=1)[:, None].expand_as(row_BM)
+            is_shown_S = torch.ones_like(prompts.in_scene_S)
+            is_shown_S = is_shown_S.index_put((row_BM[exists_BM],), is_shown_BM[exists_BM])
+            features_VSF = features_VSF * is_shown_S[:, None]
         changes_BMD, rotations_BMR = self._changes_in_prompt(objects)
         changes_SD = features_VSF.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
-        weights_BLL = coreference(prompts).to(features_VSF.dtype)
         tokens_BLD = self._encode(prompts, features_VSF, changes_SD, weights_BLL)
         describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
         masked = replace(prompts, word_ids_BL=prompts.word_ids_BL.masked_fill(describes_BL, PADDING_ID))
@@ -126,6 +143,12 @@ class Pointer(PolicyNetwork):
         if self.coreference is not None:
             appearance_BLA = appearance_BLA + weights_BLL @ appearance_BLA
             object_mask_BL = is_image_BL | (weights_BLL > 0).any(dim=-1)
+        likeness_BLX = None
+        if likeness_BMX is not None:
+            likeness_BLX = likeness_BMX.new_zeros(*is_image_BL.shape, likeness_BMX.shape[-1])
+            likeness_BLX = likeness_BLX.scatter(1, order_BM[..., None].expand_as(likeness_BMX), likeness_BMX)
+            if self.coreference is not None:
+                likeness_BLX = likeness_BLX + weights_BLL @ likeness_BLX
         index_BMD = order_BM[..., None].expand(-1, -1, tokens_BLD.shape[-1])
         object_set = ObjectSet.of(tokens_BLD.gather(1, index_BMD), objects, rotations_BMR)
         return PointerPrompt(
@@ -137,6 +160,8 @@ class Pointer(PolicyNetwork):
             self._described_appearance(prompts.word_ids_BL, describes_BL, appearance_BLA),
             objects,
             replace(object_set, image_index_BK=_scene_index(objects)),
+            selected_BP,
+            likeness_BLX,
         )
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
@@ -192,7 +217,12 @@ class Pointer(PolicyNetwork):
         features_BTVNF = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self.images.embed_appearance(features_BTVNF, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
-        tokens = self._observation_tokens(history, features_BTVNF, self._changes_in_view(objects, prompt))
+        likeness_BTNX = None
+        if self.attributes is not None and prompt.selected_BP is not None:
+            likeness_BTNX = self.attributes.likeness(objects, prompt.selected_BP)
+            objects = without_crops(objects, prompt.selected_BP)
+        changes_BTND = self._changes_in_view(objects, prompt)
+        tokens = self._observation_tokens(history, objects.features_VNF, changes_BTND)
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
         outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
         objects_BTND = outputs_BTQD[:, :, :-1]
@@ -214,6 +244,7 @@ class Pointer(PolicyNetwork):
             steps_T=steps_T,
             first_step=first_step,
             prompt=prompt,
+            likeness_BTNX=likeness_BTNX,
         )
         return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
 

@@ -4,7 +4,9 @@ import torch
 from torch.nn import functional as F
 
 from openvima.policies.nn.object_encoder import ObjectEncoder
+from openvima.policies.pointer.attributes import Attributes
 from openvima.training.augmentation.channel_mixing import channel_mixing
+from openvima.training.pretraining.attribute_loss import attribute_loss
 from openvima.training.pretraining.pairs import Pairs
 from openvima.training.pretraining.rotation import is_rotation_correct, rotation_loss
 
@@ -12,7 +14,13 @@ LossAndMetrics = tuple[torch.Tensor, dict[str, torch.Tensor]]
 
 
 def contrastive_loss(
-    encoder: ObjectEncoder, pairs: Pairs, *, temperature: float, generator: torch.Generator
+    encoder: ObjectEncoder,
+    pairs: Pairs,
+    *,
+    temperature: float,
+    generator: torch.Generator,
+    attributes: Attributes | None = None,
+    attribute_weight: float = 1.0,
 ) -> LossAndMetrics:
     """InfoNCE loss between prompt images and scenes; with second views also theirs, and that of rotations.
 
@@ -24,6 +32,8 @@ def contrastive_loss(
         pairs: A batch.
         temperature: Softmax temperature.
         generator: Draws the mixing of channels.
+        attributes: Also gets the gradient of its own loss, on labelled pairs; None for none.
+        attribute_weight: Weight of that loss.
 
     Returns:
         The loss, and its parts and accuracies within the batch.
@@ -32,7 +42,7 @@ def contrastive_loss(
     """
     mixing = channel_mixing(generator).to(pairs.scene_crops.device)
     if pairs.second_view is not None:
-        return _two_view_loss(encoder, pairs, mixing, temperature)
+        return _two_view_loss(encoder, pairs, mixing, temperature, attributes, attribute_weight)
     prompt = embedded(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
     scene = embedded(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
     loss, accuracy = info_nce(prompt, scene, matches(pairs), temperature=temperature)
@@ -40,7 +50,12 @@ def contrastive_loss(
 
 
 def _two_view_loss(
-    encoder: ObjectEncoder, pairs: Pairs, mixing: torch.Tensor, temperature: float
+    encoder: ObjectEncoder,
+    pairs: Pairs,
+    mixing: torch.Tensor,
+    temperature: float,
+    attributes: Attributes | None,
+    attribute_weight: float,
 ) -> LossAndMetrics:
     view = pairs.second_view
     assert view is not None
@@ -65,6 +80,9 @@ def _two_view_loss(
         is_correct = is_rotation_correct(encoder, features, masks, view.rotations)
         loss, metrics["loss/rotation"] = loss + of_rotations, of_rotations.detach()
         metrics["rotation_accuracy"] = is_correct.float().mean()
+    if attributes and pairs.attributes:
+        of_attributes = attribute_loss(attributes, features, masks, pairs.attributes, temperature=temperature)
+        loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
     return loss, metrics
 
 

@@ -24,9 +24,10 @@ from openvima.training.augmentation.appearance_randomization import with_random_
 from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
 from openvima.training.augmentation.hard_negatives import with_hard_negatives
 from openvima.training.augmentation.rearranged_view import rearranged
+from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels
 from openvima.training.schedule import step_seed
 
-_NUM_COLUMNS = 8  # of `Pairs`, without those of the second view
+_NUM_COLUMNS, _NUM_VIEW_COLUMNS = 8, 3  # of `Pairs` without its other records, and of `SecondView`
 _DOMAIN = "user"  # neither training nor evaluation episodes are reused
 
 
@@ -60,6 +61,7 @@ class Pairs(TensorRecord):
         shapes: Index of its shape, shape (K,), int64.
         is_grayscale: Whether its prompt image is grayscale and matches by shape, shape (K,), bool.
         second_view: The objects in the rearranged view; None if there is none.
+        attributes: What the objects are like; None if they are not labelled.
     """
 
     prompt_crops: torch.Tensor
@@ -71,6 +73,7 @@ class Pairs(TensorRecord):
     shapes: torch.Tensor
     is_grayscale: torch.Tensor
     second_view: SecondView | None = None
+    attributes: AttributeLabels | None = None
 
     def second_view_pairs(self) -> "Pairs":
         """Return the pairs with the second view as prompt images, where it shows the object."""
@@ -119,6 +122,7 @@ def render_pairs(
     seed: int,
     assets: str,
     augmentation: SceneAugmentation = NO_AUGMENTATION,
+    with_attributes: bool = False,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Pairs:
     """Sample and render scenes, and prompt images of all objects in them.
@@ -129,10 +133,12 @@ def render_pairs(
         seed: Seed of the run.
         assets: Asset pack, as `load_assets` takes it.
         augmentation: Augmentation of the scenes.
+        with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
     """
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
+    labeller = AttributeLabeller(rasteriser.assets) if with_attributes else None
     pools = {task: task_spec(task).pool("train") for task in tasks}
     shades = {name for names in pools.values() for name in names.dragged_textures}
     indices: dict[tuple, int] = {}
@@ -149,7 +155,14 @@ def render_pairs(
         is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
         magnifications = _magnifications(episode)
         rows += pairs_of_scene(
-            scene, magnifications, rasteriser, indices, number, view, is_grayscale=is_grayscale
+            scene,
+            magnifications,
+            rasteriser,
+            indices,
+            number,
+            view,
+            is_grayscale=is_grayscale,
+            labeller=labeller,
         )
         if report and number % 50 == 0:
             report(number, num_scenes, "rendering scenes")
@@ -159,8 +172,13 @@ def render_pairs(
 def stacked(rows: Sequence[tuple]) -> Pairs:
     """Stack the pairs of several scenes, as `pairs_of_scene` returns them, into one record."""
     columns = [torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True)]
-    first, view = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
-    return Pairs(*first, second_view=SecondView(*view) if view else None)
+    first, others = columns[:_NUM_COLUMNS], columns[_NUM_COLUMNS:]
+    view, labels = others[:_NUM_VIEW_COLUMNS], others[_NUM_VIEW_COLUMNS:]
+    return Pairs(
+        *first,
+        second_view=SecondView(*view) if view else None,
+        attributes=AttributeLabels(*labels) if labels else None,
+    )
 
 
 def pairs_of_scene(
@@ -172,6 +190,7 @@ def pairs_of_scene(
     second_view: tuple[Scene, dict[int, float]] | None = None,
     *,
     is_grayscale: Sequence[bool] | np.ndarray = (),
+    labeller: AttributeLabeller | None = None,
 ) -> list[tuple]:
     """Render a scene and prompt images of its visible objects.
 
@@ -184,9 +203,11 @@ def pairs_of_scene(
         number: Index of the scene.
         second_view: The rearranged scene, and rotations by object id.
         is_grayscale: For each object of the scene whether its prompt image is grayscale; none by default.
+        labeller: Labels what the objects are like; only with a second view.
 
     Returns:
-        For each visible object the fields of `Pairs`, and those of `SecondView` if there is one.
+        For each visible object the fields of `Pairs`, and those of `SecondView` and `AttributeLabels` if
+        there are any.
     """
     seen = _seen(scene, rasteriser)
     seen_again = _seen(second_view[0], rasteriser) if second_view else None
@@ -195,11 +216,11 @@ def pairs_of_scene(
         if not seen.masks[:, slot].any():
             continue
         is_gray = bool(len(is_grayscale)) and bool(is_grayscale[slot])
-        prompt = _prompt_image(
+        shown, magnification = (
             grayscale(placement) if is_gray else placement,
             magnifications.get(placement.object, 1.0),
-            rasteriser,
         )
+        prompt = _prompt_image(shown, magnification, rasteriser)
         key = (placement.object, placement.texture, *(placement.scale if second_view else ()))
         appearance = indices.setdefault(key, len(indices))
         shape = indices.setdefault((placement.object,), len(indices))
@@ -216,6 +237,10 @@ def pairs_of_scene(
         if second_view and seen_again:
             rotations = _rotations(placement, second_view[1][placement.id])
             pair = (*pair, seen_again.crops[:, slot], seen_again.masks[:, slot], rotations)
+            if labeller:
+                labels = (labeller(shown, is_magnified=magnification != 1), labeller(placement))
+                boxes = np.stack([prompt.boxes[:, 0], seen.boxes[:, slot], seen_again.boxes[:, slot]])
+                pair = (*pair, *map(np.stack, zip(*labels, strict=True)), boxes)
         pairs.append(pair)
     return pairs
 

@@ -1,0 +1,103 @@
+"""Attributes: how alike two objects are in texture, colour, shape, profile, height or size alone.
+
+"Put all objects with the same texture as {base} into it." A word of the prompt selects the projection of the
+object's crops and boxes under which objects are then compared.
+
+Shape suffixes: V views, N objects, F width of crop features, P attributes, W width of a projection, X all
+projections in one vector; B batch, L prompt positions; `...` any axes.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from openvima.policies.batch import PromptBatch
+from openvima.policies.nn.mlp import mlp
+from openvima.policies.nn.object_encoder import NUM_VIEWS, ObjectEncoderConfig
+from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig
+from openvima.policies.pointer.correspondence import ObjectFeatures
+
+_BOX_UNIT_PX = 32.0  # sides of boxes are of this order
+_WORD_SCALE = 50.0  # logits in units of the weights, so that a few hundred steps of 1e-3 suffice
+_UNKNOWN_WORD = -0.04  # weight of words that no caption has
+
+
+class Attributes(nn.Module):
+    """A projection for each attribute, and the words that select them.
+
+    "the same colour and shape" selects two, and the likeness is the mean of both cosines. Without a word of
+    comparison, such as "same", a prompt selects none: "the shape in {scene}".
+
+    Args:
+        config: Sizes.
+        images: Those of the object encoder, whose crop features are projected.
+        vocabulary_size: Number of words.
+    """
+
+    def __init__(self, config: AttributeConfig, images: ObjectEncoderConfig, vocabulary_size: int) -> None:
+        super().__init__()
+        widths = (NUM_VIEWS * (images.crop.output_width + 4), config.hidden_width, config.width)
+        self.projections = nn.ModuleList(mlp(widths) for _ in ATTRIBUTES)
+        # Logits of each word: which attributes it names, and last whether it compares.
+        self.words = nn.Embedding(vocabulary_size, len(ATTRIBUTES) + 1)
+        nn.init.constant_(self.words.weight, _UNKNOWN_WORD)
+
+    def forward(
+        self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
+    ) -> torch.Tensor:
+        """Project objects; cosines of the results are likenesses.
+
+        Args:
+            features_VNF: Crop features, shape (..., 2, N, F).
+            boxes_VN4: Boxes in pixels, shape (..., 2, N, 4), integers.
+            masks_VN: Whether the object is visible in the view, shape (..., 2, N), bool.
+
+        Returns:
+            Unit vectors, shape (..., N, P, W).
+        """
+        # Without the column of the box, since pairs are mirrored in training.
+        sizes_VN3 = boxes_VN4[..., 1:].to(features_VNF.dtype) / _BOX_UNIT_PX
+        shown_VN1 = masks_VN[..., None].to(features_VNF.dtype)
+        views_VNX = (
+            torch.cat([features_VNF, sizes_VN3, torch.ones_like(sizes_VN3[..., :1])], dim=-1) * shown_VN1
+        )
+        both_NX = torch.cat(views_VNX.unbind(-3), dim=-1)
+        return F.normalize(torch.stack([layer(both_NX) for layer in self.projections], dim=-2), dim=-1)
+
+    def word_logits(self, word_ids_BL: torch.Tensor) -> torch.Tensor:
+        """Logits of the attributes that each word names, and last of whether it compares, (B, L, P + 1)."""
+        return _WORD_SCALE * self.words(word_ids_BL)
+
+    def selected(self, prompts: PromptBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Read which attributes prompts ask to compare.
+
+        Returns:
+            The attributes, (B, P), and the words that name them, (B, L); both bool.
+        """
+        is_word_BL = (prompts.object_index_BL < 0) & prompts.mask_BL
+        is_named_BLP = (self.word_logits(prompts.word_ids_BL) > 0) & is_word_BL[..., None]
+        compares_B1 = is_named_BLP[..., -1].any(dim=1)[:, None]
+        named_BLP = is_named_BLP[..., :-1] & compares_B1[..., None]
+        return named_BLP.any(dim=1), named_BLP.any(dim=-1)
+
+    def likeness(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> torch.Tensor:
+        """Return vectors whose dot products are mean cosines of the selected attributes, (B, ..., N, X).
+
+        They are zero, and cost nothing, where none is selected.
+        """
+        rows = torch.nonzero(selected_BP.any(dim=1))[:, 0]
+        projected = self(objects.features_VNF[rows], objects.boxes_VN4[rows], objects.masks_VN[rows])
+        weights_BP = selected_BP[rows].to(projected.dtype)
+        weights_BP = (weights_BP / weights_BP.sum(dim=1, keepdim=True)).sqrt()
+        weights_BP1 = weights_BP.view(len(rows), *(1,) * (projected.ndim - 3), -1, 1)
+        likeness = objects.features_VNF.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
+        return likeness.index_put((rows,), (projected * weights_BP1).flatten(-2))
+
+
+def without_crops(objects: ObjectFeatures, selected_BP: torch.Tensor) -> ObjectFeatures:
+    """Hide the crop features of objects, (B, ..., N), where attributes are selected."""
+    features = objects.features_VNF
+    is_shown = ~selected_BP.any(dim=1).view(-1, *(1,) * (features.ndim - 1))
+    return replace(objects, features_VNF=features * is_shown)
