@@ -24,7 +24,7 @@ The same command resumes an interrupted run from its last checkpoint.
 Example: openvima train --data demos --preset nano --out run
 
 --recipe selects default settings: "paper" (as in the VIMA paper), "workstation" (one GPU, less data), "nano"
-(minutes on a few cores), "small" (for a policy like the bundled openvima-small), "midas-pretrain",
+(minutes on a few cores), "small" (for a policy like the bundled openvima-small), "small-2" (its next version), "midas-pretrain",
 "midas-finetune" or "midas-in-context". The default is "small" for the preset of that name, "nano" for nano
 presets and your own learners, else "paper". --init-from disables the pretraining of recipe and file; set
 --pretraining.steps to pretrain anyway.

@@ -18,6 +18,7 @@ PARTS = {
         "observation_out.",
         "correspondence.",
         "prompt_correspondence.",
+        "attributes.",
     ),
     "decoder": ("decoder.self_blocks.", "decoder.cross_blocks."),
     "actions": ("actions.", "head.actions."),

@@ -29,6 +29,29 @@ _PAPER: Mapping[str, Any] = {
 }
 # MIDAS, Li et al. 2023: learning rates and batch sizes are not published, so they are VIMA's.
 _MIDAS: Mapping[str, Any] = {**_PAPER, "preset": "midas-92m"}
+# For a policy like the bundled openvima-small; its history is in docs/training.md.
+_SMALL: Mapping[str, Any] = {
+    "preset": "small",
+    "pretraining.steps": 4000,
+    "pretraining.num_scenes": 8000,
+    "pretraining.appearance_randomization_prob": 0.4,
+    "pretraining.hard_negative_prob": 0.4,
+    "pretraining.box_jitter_px": 1.0,
+    "pretraining.grayscale_prob": 0.3,
+    "pretraining.occlusion_prob": 0.35,
+    "schedule.steps": 3100,
+    "loader.batch_size": 128,
+    "optimizer.learning_rate": 4e-4,
+    "schedule.warmup_steps": 100,
+    "augmentation.inverse_dynamics_prob": 0.2,
+    "augmentation.drop_unused_objects_prob": 0.35,
+    "augmentation.rename_objects_prob": 0.3,
+    "augmentation.shuffle_sentences_prob": 0.3,
+    "augmentation.distractor_prob": 0.6,
+    "loader.validation_fraction": 0.02,
+    "loader.validation_episodes": 500,
+    "schedule.checkpoint_every": 250,
+}
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
@@ -66,29 +89,9 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
-        # For a policy like the bundled openvima-small; its history is in docs/training.md.
-        "small": {
-            "preset": "small",
-            "pretraining.steps": 4000,
-            "pretraining.num_scenes": 8000,
-            "pretraining.appearance_randomization_prob": 0.4,
-            "pretraining.hard_negative_prob": 0.4,
-            "pretraining.box_jitter_px": 1.0,
-            "pretraining.grayscale_prob": 0.3,
-            "pretraining.occlusion_prob": 0.35,
-            "schedule.steps": 3100,
-            "loader.batch_size": 128,
-            "optimizer.learning_rate": 4e-4,
-            "schedule.warmup_steps": 100,
-            "augmentation.inverse_dynamics_prob": 0.2,
-            "augmentation.drop_unused_objects_prob": 0.35,
-            "augmentation.rename_objects_prob": 0.3,
-            "augmentation.shuffle_sentences_prob": 0.3,
-            "augmentation.distractor_prob": 0.6,
-            "loader.validation_fraction": 0.02,
-            "loader.validation_episodes": 500,
-            "schedule.checkpoint_every": 250,
-        },
+        "small": _SMALL,
+        # Its next version; not trained at full length yet.
+        "small-2": {**_SMALL, "model.attributes": True, "pretraining.attribute_loss_weight": 1.0},
     }
 )
 

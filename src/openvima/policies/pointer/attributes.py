@@ -91,7 +91,7 @@ class Attributes(nn.Module):
         projected = self(objects.features_VNF[rows], objects.boxes_VN4[rows], objects.masks_VN[rows])
         weights_BP = selected_BP[rows].to(projected.dtype)
         weights_BP = (weights_BP / weights_BP.sum(dim=1, keepdim=True)).sqrt()
-        weights_BP1 = weights_BP.view(len(rows), *(1,) * (projected.ndim - 3), -1, 1)
+        weights_BP1 = weights_BP.view(len(rows), *(1,) * (projected.ndim - 3), weights_BP.shape[1], 1)
         likeness = objects.features_VNF.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
         return likeness.index_put((rows,), (projected * weights_BP1).flatten(-2))
 

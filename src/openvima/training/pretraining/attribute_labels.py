@@ -14,8 +14,11 @@ from openvima.scene import Placement
 
 _CATEGORIES = ("texture", "shape", "profile")
 _NUM_LEVELS = 4  # of each channel of a colour histogram
-_ROUND_WITHIN = 1.03  # ratio of the largest and the smallest width of a circle, which is a polygon here
-_SQUARE_WITHIN = 1.25  # ratio of sides; that of the catalogue's pallet, whose profile is square, is 1.2
+_NUM_DIRECTIONS = 72
+_CORNERS = slice(_NUM_DIRECTIONS // 8, None, _NUM_DIRECTIONS // 4)  # the four diagonals
+_ROUND_FROM = 0.9  # smallest reach of a circle, as a fraction of the largest; 0.92 for an octagon
+_CORNERS_FROM = 1.75  # reach of a square into its corners, which is 2 unless they are open
+_SIDES_WITHIN = 1.25  # ratio of the sides of a square; that of the catalogue's pallet is 1.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +62,8 @@ class AttributeLabeller:
         categories = [self._indices.setdefault(key, len(self._indices)) for key in keys]
         if placement.texture not in self._colours:
             self._colours[placement.texture] = _histogram(self._assets.texture(placement.texture))
-        lengths = [np.ptp(vertices[:, 2]), _widths(vertices).mean()]
+        # The mean width of a footprint is twice its mean reach, whatever the middle.
+        lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
         known = np.array(lengths, np.float32) if not is_magnified else np.full(2, np.nan, np.float32)
         return np.array(categories), self._colours[placement.texture], known
 
@@ -75,21 +79,31 @@ def profile(object_name: str, vertices: np.ndarray) -> str:
         return object_spec(object_name).profile or object_name
     if "container" not in object_name:
         return object_name
-    widths = _widths(vertices)
-    if widths.max() < _ROUND_WITHIN * widths.min():
+    points = vertices[:, :2] - (vertices[:, :2].max(axis=0) + vertices[:, :2].min(axis=0)) / 2
+    reach = _reach(points)
+    if reach.min() > _ROUND_FROM * reach.max():
         return "circle"
-    middle = vertices[:, :2] - (vertices[:, :2].max(axis=0) + vertices[:, :2].min(axis=0)) / 2
-    x, y = np.abs(middle).max(axis=0)
-    corners = (middle / (x, y)) @ np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)]).T
-    has_corners = corners.max(axis=0).min() > 1.9
-    return "square" if has_corners and max(x, y) < _SQUARE_WITHIN * min(x, y) else object_name
+    return (
+        "square" if any(_is_square(points @ _rotation(angle)) for angle in (0, math.pi / 4)) else object_name
+    )
 
 
-def _widths(vertices: np.ndarray) -> np.ndarray:
-    """Widths of a footprint in 36 directions, metres."""
-    angles = np.arange(36) * math.pi / 36
-    along = vertices[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])
-    return np.ptp(along, axis=0)
+def _is_square(points: np.ndarray) -> bool:
+    """Whether a footprint about the origin is a square along the axes, or nearly so."""
+    x, y = np.abs(points).max(axis=0)
+    corners = _reach(points / (x, y))[_CORNERS] * math.sqrt(2)
+    return bool(corners.min() > _CORNERS_FROM and max(x, y) < _SIDES_WITHIN * min(x, y))
+
+
+def _reach(points: np.ndarray) -> np.ndarray:
+    """How far a footprint reaches in each of 72 directions, the first along x."""
+    angles = np.arange(_NUM_DIRECTIONS) * (2 * math.pi / _NUM_DIRECTIONS)
+    return (points @ np.stack([np.cos(angles), np.sin(angles)])).max(axis=0)
+
+
+def _rotation(angle_rad: float) -> np.ndarray:
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([(cos, sin), (-sin, cos)])
 
 
 def _histogram(texture: np.ndarray) -> np.ndarray:

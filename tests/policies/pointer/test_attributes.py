@@ -1,0 +1,157 @@
+"""Comparison by the attributes that a prompt names: which are selected, and what they may change."""
+
+from dataclasses import replace
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.data.records import Demonstration, rollout_oracle  # noqa: E402
+from openvima.env import TabletopEnv  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import preset  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.inference import NetworkPolicy  # noqa: E402
+from openvima.policies.nn.history import shift_actions  # noqa: E402
+from openvima.policies.parameter_counts import policy_size  # noqa: E402
+from openvima.policies.pointer.attributes import Attributes  # noqa: E402
+from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
+from openvima.policies.pointer.inputs import HeadInputs  # noqa: E402
+from openvima.policies.pointer.model import Pointer  # noqa: E402
+from openvima.policies.processor import Processor  # noqa: E402
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
+from openvima.policies.variants import with_attributes  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
+from training_examples import collate_examples, examples_of  # noqa: E402
+
+SAME = "Put all objects with the same profile as {base_obj} into it."
+TOKENIZER = WordTokenizer(
+    Vocabulary().extended([SAME, "texture colour and put the into rotate degrees object"])
+)
+
+
+@pytest.fixture(scope="module")
+def demo() -> Demonstration:
+    """`same_shape`, whose prompt names one attribute."""
+    return rollout_oracle(TabletopEnv("same_shape", level="train", domain="user"), 1)
+
+
+@pytest.fixture(scope="module")
+def network() -> Pointer:
+    """It knows the words "texture", "colour" and "profile", and "same" as a comparison."""
+    network = build_network(replace(narrow_small(), attributes=AttributeConfig(16, 8)), seed=3).eval()
+    assert isinstance(network, Pointer) and network.attributes is not None
+    with torch.no_grad():
+        for word in ("texture", "colour", "profile"):
+            network.attributes.words.weight[TOKENIZER.encode(word), ATTRIBUTES.index(word)] = 0.1
+        network.attributes.words.weight[TOKENIZER.encode("same"), -1] = 0.1
+    return network.double()
+
+
+@torch.no_grad()
+def read(network: Pointer, demo: Demonstration, text: str = SAME, *, shift: float = 0.0) -> HeadInputs:
+    """Inputs of the head; `shift` is added to all crop features."""
+    demo = replace(demo, prompt=replace(demo.prompt, text=text))
+    processor = Processor.of(network.config.inputs, TOKENIZER)
+    examples, images = examples_of([demo], processor)
+    batch = collate_examples(processor, examples)
+    features = network.encode_images(images) + shift * torch.linspace(-1, 1, 16).double()
+    prompt = network.encode_prompt(batch.prompts, features)
+    previous = shift_actions(batch.targets)
+    return network._head_inputs(prompt, network.init_cache(prompt), batch.history, features, *previous)[0]
+
+
+def selected(inputs: HeadInputs) -> list[str]:
+    assert inputs.prompt.selected_BP is not None
+    return [name for name, flag in zip(ATTRIBUTES, inputs.prompt.selected_BP[0], strict=True) if flag]
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        (SAME, ["profile"]),
+        (SAME.replace("profile", "texture"), ["texture"]),
+        (SAME.replace("profile", "colour and profile"), ["colour", "profile"]),
+        (SAME.replace("same ", ""), []),
+        (SAME.replace("profile", "object"), []),
+    ],
+)
+def test_words_select_attributes_beside_a_comparison(network, demo, text, names):
+    assert selected(read(network, demo, text)) == names
+
+
+def test_the_word_decides_by_likeness_alone(network, demo):
+    profile, texture = read(network, demo), read(network, demo, SAME.replace("profile", "texture"))
+    assert torch.equal(profile.prompt.tokens_BLD, texture.prompt.tokens_BLD)
+    assert torch.equal(profile.objects_BTND, texture.objects_BTND)
+    pick = network.head.pick
+    assert not torch.allclose(pick(profile), pick(texture))
+
+
+def test_crops_reach_the_decoder_only_without_attributes(network, demo):
+    same, other = read(network, demo), read(network, demo, shift=0.5)
+    assert not torch.allclose(same.likeness_BTNX, other.likeness_BTNX)
+    # What similar appearance finds may change; here nothing is found.
+    assert torch.allclose(same.prompt.masked_BLD, other.prompt.masked_BLD)
+    assert torch.equal(same.prompt.features.features_VNF, torch.zeros_like(same.prompt.features.features_VNF))
+    plain = SAME.replace("same ", "")
+    shown, shifted = read(network, demo, plain), read(network, demo, plain, shift=0.5)
+    assert not torch.allclose(shown.prompt.tokens_BLD, shifted.prompt.tokens_BLD)
+    assert not shown.likeness_BTNX.any()
+
+
+def test_other_prompts_are_decided_as_without_attributes(network, demo):
+    bare = build_network(replace(network.config, attributes=None), seed=3).eval().double()
+    weights = {name: value for name, value in network.state_dict().items() if name in bare.state_dict()}
+    bare.load_state_dict(weights)
+    assert set(network.state_dict()) - set(weights) == {
+        "head.pick.appearance_weight",
+        *(f"attributes.{name}" for name in network.attributes.state_dict()),
+    }
+    text = SAME.replace("same ", "")
+    for first, second in zip(
+        *(
+            (net.head.pick(inputs), net.head.decode(inputs))
+            for net in (network, bare)
+            for inputs in [read(net, demo, text)]
+        ),
+        strict=True,
+    ):
+        assert torch.equal(first, second)
+
+
+def test_likeness_is_the_mean_cosine_of_the_selected_attributes(network, demo):
+    inputs = read(network, demo, SAME.replace("profile", "colour and profile"))
+    parts = inputs.likeness_BTNX.unflatten(-1, (len(ATTRIBUTES), -1))
+    norms = parts.norm(dim=-1).square()[inputs.masks_BTN]
+    expected = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0, 0.0]).double()
+    torch.testing.assert_close(norms, expected.expand_as(norms))
+
+
+def test_hidden_views_do_not_matter():
+    attributes = Attributes(AttributeConfig(16, 8), narrow_small().images, 4).double()
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(2, 3, 16, generator=generator).double()
+    boxes = torch.randint(1, 60, (2, 3, 4), generator=generator)
+    masks = torch.tensor([[True, True, False], [False, True, True]])
+    other = torch.where(masks[..., None], features, -features)
+    assert torch.equal(attributes(features, boxes, masks), attributes(other, boxes, masks))
+    torch.testing.assert_close(attributes(features, boxes, masks).norm(dim=-1), torch.ones(3, 6).double())
+
+
+def test_the_preset_has_none_and_with_them_stays_small():
+    assert preset("small").attributes is None
+    assert policy_size(with_attributes(preset("small"))).parameters.trainable < 10e6
+    with pytest.raises(ConfigError, match="preset small"):
+        with_attributes(preset("nano"))
+    with pytest.raises(ConfigError, match="place candidates"):
+        replace(preset("nano"), attributes=AttributeConfig())
+    with pytest.raises(ConfigError, match="width 0"):
+        AttributeConfig(width=0)
+
+
+def test_a_checkpoint_keeps_its_attributes(network, tmp_path):
+    policy = NetworkPolicy(network, tokenizer=TOKENIZER)
+    policy.save_pretrained(tmp_path / "with")
+    again = NetworkPolicy.from_pretrained(tmp_path / "with")
+    assert again.network.config.attributes == AttributeConfig(16, 8)

@@ -1,0 +1,205 @@
+"""Training of attributes: labels of rendered objects, captions, and the losses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openvima.catalog.packs import load_assets  # noqa: E402
+from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
+from openvima.errors import ConfigError  # noqa: E402
+from openvima.policies import presets  # noqa: E402
+from openvima.policies.build import build_network  # noqa: E402
+from openvima.policies.pointer.attributes import Attributes  # noqa: E402
+from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
+from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer  # noqa: E402
+from openvima.scene import Placement, Pose  # noqa: E402
+from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training.building import resolved  # noqa: E402
+from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels  # noqa: E402
+from openvima.training.pretraining.attribute_loss import (  # noqa: E402
+    _compared,
+    _images,
+    attribute_accuracy,
+    attribute_loss,
+    caption_loss,
+)
+from openvima.training.pretraining.captions import caption_texts, sample_captions  # noqa: E402
+from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs  # noqa: E402
+from openvima.training.recipes import recipe_settings  # noqa: E402
+from small_networks import narrow_small  # noqa: E402
+
+AUGMENTATION = SceneAugmentation(0.4, 0.5, second_view=True, grayscale_prob=0.3)
+TOKENIZER = WordTokenizer(Vocabulary().extended(caption_texts()))
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Pairs:
+    return render_pairs(
+        ("same_shape", "novel_adj"),
+        num_scenes=12,
+        seed=0,
+        assets="procedural",
+        augmentation=AUGMENTATION,
+        with_attributes=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def labeller() -> AttributeLabeller:
+    return AttributeLabeller(RandomAppearanceAssets(load_assets("procedural")))
+
+
+def placement(name: str, texture: str = "red", height: float = 1.0) -> Placement:
+    return Placement(5, name, texture, (0.07, 0.07, 0.07), Pose.planar(0.5, 0.0), scale=(1.0, 1.0, height))
+
+
+def labels_of(labeller: AttributeLabeller, *placements: Placement) -> AttributeLabels:
+    """Labels of objects that look in their prompt image as in their scene."""
+    columns = [torch.from_numpy(np.stack(column)) for column in zip(*map(labeller, placements), strict=True)]
+    boxes = torch.zeros(len(placements), 3, 2, 4, dtype=torch.int64)
+    return AttributeLabels(*(column[:, None].expand(-1, 2, -1) for column in columns), boxes)
+
+
+@pytest.mark.parametrize(
+    ("other", "same", "different"),
+    [
+        (placement("block"), ATTRIBUTES, ()),
+        (placement("block", "dark red"), ("shape", "profile", "height", "size"), ("texture", "colour")),
+        # Half of its pixels are red, so that its colour is neither the same nor another one.
+        (placement("block", "red and blue stripe"), ("shape", "profile", "height", "size"), ("texture",)),
+        (placement("block", height=2.0), ("texture", "colour", "shape", "profile", "size"), ("height",)),
+        (placement("frame"), ("texture", "colour", "profile"), ("shape", "height", "size")),
+        (placement("heart"), ("texture", "colour", "size"), ("shape", "profile", "height")),
+    ],
+)
+def test_a_block_is_compared_by_each_attribute(labeller, other, same, different):
+    images = _images(labels_of(labeller, placement("block"), other), (0,))
+    is_same, is_different = (
+        {name for name, flag in zip(ATTRIBUTES, flags[:, 0, 1].tolist(), strict=True) if flag}
+        for flags in _compared(images, images)
+    )
+    assert is_same == set(same)
+    assert is_different >= set(different)
+    assert not is_same & is_different
+
+
+def test_random_containers_are_round_square_or_neither(labeller):
+    known = {name: int(labeller(placement(name))[0][2]) for name in ("bowl", "frame")}
+    found = [int(labeller(placement(f"random container {seed}"))[0][2]) for seed in range(40)]
+    assert {found.count(index) > 4 for index in known.values()} == {True}
+    assert set(found) - set(known.values())
+    assert int(labeller(placement("random shape 3"))[0][2]) not in known.values()
+
+
+def test_magnified_objects_have_no_lengths(labeller):
+    assert np.isnan(labeller(placement("block"), is_magnified=True)[2]).all()
+    np.testing.assert_allclose(labeller(placement("block"))[2], [0.07, 0.089], atol=5e-4)
+
+
+def test_pairs_are_labelled_as_rendered(pairs):
+    labels, view = pairs.attributes, pairs.second_view
+    assert labels is not None and view is not None
+    # Grayscale prompt images have another texture than their scene, and only they.
+    is_same = labels.categories[:, 0] == labels.categories[:, 1]
+    assert is_same[:, 1:].all()
+    assert torch.equal(is_same[:, 0], ~pairs.is_grayscale)
+    shown = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks], dim=1)
+    assert torch.equal(labels.boxes.any(dim=-1), shown)
+    np.testing.assert_allclose(labels.colours.sum(dim=-1), 1.0, rtol=1e-5)
+    plain = render_pairs(
+        ("same_shape", "novel_adj"), num_scenes=2, seed=0, assets="procedural", augmentation=AUGMENTATION
+    )
+    assert plain.attributes is None
+    assert torch.equal(plain.scene_crops, pairs.scene_crops[: len(plain.scenes)])
+
+
+class Ideal(torch.nn.Module):
+    """Projections that are given."""
+
+    def __init__(self, projected_3KPW: torch.Tensor) -> None:
+        super().__init__()
+        self.projected_3KPW = projected_3KPW
+
+    def forward(self, *_: torch.Tensor) -> torch.Tensor:
+        return self.projected_3KPW
+
+
+def test_the_loss_falls_as_what_is_alike_is_projected_together(labeller):
+    objects = [placement("block"), placement("frame"), placement("heart", "blue"), placement("ring", "blue")]
+    labels, masks = labels_of(labeller, *objects), torch.ones(3, 2, 4, dtype=torch.bool)
+
+    def loss(by_texture: list[int]) -> float:
+        axes = torch.eye(4)[torch.tensor(by_texture)]  # of every attribute
+        projected = axes[None, :, None].expand(3, -1, len(ATTRIBUTES), -1).clone()
+        projected[:, :, 1:] = torch.eye(4)[0]  # the others learn nothing here
+        features = torch.zeros(3, 2, 4, 1)
+        return float(attribute_loss(Ideal(projected), features, masks, labels, temperature=0.1))
+
+    assert loss([0, 0, 1, 1]) < loss([0, 1, 2, 3]) < loss([0, 1, 0, 1])
+    right = loss([0, 0, 1, 1])
+    masks[:, :, 3] = False  # what is not seen does not count
+    assert loss([0, 0, 1, 0]) == pytest.approx(right, abs=0.3)
+
+
+def test_a_few_steps_fit_the_attributes(pairs):
+    network = build_network(replace(narrow_small(), attributes=AttributeConfig(32, 16)), seed=0)
+    encoder, attributes = network.images, network.attributes
+    assert isinstance(attributes, Attributes) and pairs.second_view is not None
+    crops = torch.stack([pairs.prompt_crops, pairs.scene_crops, pairs.second_view.crops])
+    masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, pairs.second_view.masks]).transpose(1, 2)
+    with torch.no_grad():
+        features = encoder.encode_images(crops).transpose(1, 2)
+    before = attribute_accuracy(encoder, attributes, pairs)
+    optimizer = torch.optim.Adam(attributes.projections.parameters(), 1e-3)
+    for _ in range(15):
+        optimizer.zero_grad()
+        attribute_loss(attributes, features, masks, pairs.attributes, temperature=0.1).backward()
+        optimizer.step()
+    after = attribute_accuracy(encoder, attributes, pairs)
+    assert list(after) == list(ATTRIBUTES)
+    # NaN where no prompt image has both; these scenes have few of a profile.
+    known = [name for name in ATTRIBUTES if after[name] == after[name]]
+    assert len(known) > 3
+    assert np.mean([after[name] for name in known]) > np.mean([before[name] for name in known]) + 0.05
+
+
+def test_captions_teach_every_word():
+    attributes = Attributes(AttributeConfig(4, 4), narrow_small().images, TOKENIZER.vocabulary.num_ids)
+    captions, unseen = (sample_captions(500, TOKENIZER.encode, np.random.default_rng(k)) for k in range(2))
+    optimizer = torch.optim.Adam(attributes.words.parameters(), 2e-3)
+    for _ in range(100):
+        optimizer.zero_grad()
+        caption_loss(attributes, captions).backward()
+        optimizer.step()
+    named = attributes.word_logits(unseen.word_ids) > 0
+    named &= (unseen.word_ids != PADDING_ID)[..., None]
+    assert torch.equal(named.any(dim=1), unseen.targets)
+
+
+def test_captions_are_no_prompt_of_a_task():
+    ids = sample_captions(300, TOKENIZER.encode, np.random.default_rng(0)).word_ids
+    known = {index: word for word, index in TOKENIZER.vocabulary.ids().items()}
+    words = {known[index] for index in ids.unique().tolist() if index != PADDING_ID}
+    assert not words & {"put", "into", "it", "all", "as", "with"}
+
+
+def test_the_weight_needs_attributes_and_these_the_preset_small(tmp_path):
+    settings = {"data": tmp_path, "out": tmp_path / "run", "preset": "small"}
+    with pytest.raises(ConfigError, match=r"set model\.attributes"):
+        resolved(TrainingConfig.of({**settings, "pretraining.attribute_loss_weight": 1}))
+    with pytest.raises(ConfigError, match="preset small"):
+        resolved(TrainingConfig.of({**settings, "preset": "nano", "model.attributes": True}))
+    resolved(TrainingConfig.of({**recipe_settings("small-2"), "data": tmp_path, "out": tmp_path / "run"}))
+
+
+@pytest.mark.slow
+def test_a_run_trains_them_and_then_keeps_them_frozen(settings, monkeypatch):
+    monkeypatch.setitem(presets.PRESETS, "tiny", narrow_small)
+    wanted = {"model.attributes": True, "pretraining.attribute_loss_weight": 1, "schedule.steps": 1}
+    folder = train(TrainingConfig.of({**settings, **wanted, "pretraining.num_scenes": 20}))
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    assert any('"loss/attributes"' in line and '"loss/captions"' in line for line in lines)
+    assert any('texture_accuracy"' in line for line in lines)
