@@ -87,7 +87,7 @@ def test_a_file_that_lacks_a_part_or_has_a_scalar_for_it_is_refused(name: str) -
     if isinstance(values[name], dict):
         with pytest.raises(OpenVimaError, match=rf"policy\.{name} is 3"):
             config_from_dict({**values, name: 3})
-    if name not in ("action_width", "correspondence", "coreference"):  # these have defaults
+    if name not in ("action_width", "correspondence", "coreference", "attributes"):  # these have defaults
         del values[name]
         with pytest.raises(OpenVimaError, match=name):
             config_from_dict(values)
