@@ -90,6 +90,9 @@ def test_a_variant_learns_and_acts(name, switches, demonstrations, starts) -> No
     together = act_twice(policy, starts[:2])
     assert np.array_equal(together[:1], act_twice(policy, starts[:1]))
     assert not np.array_equal(together[0], together[1])
+    if network.explains:
+        (explanation,) = policy.explain()
+        assert all(sum(weights) == pytest.approx(1) for weights in explanation.attention.values())
 
 
 def test_training_has_a_setting_for_every_switch() -> None:

@@ -10,10 +10,12 @@ pytest.importorskip("transformers")
 
 from openvima.env import TabletopEnv  # noqa: E402
 from openvima.errors import CheckpointError, ConfigError  # noqa: E402
-from openvima.policies import load_policy, presets  # noqa: E402
+from openvima.policies import load_policy, presets, sizes  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from openvima.policies.t5 import T5Tokenizer  # noqa: E402
+from openvima.policies.nn.prompt_encoder import PromptEncoderConfig  # noqa: E402
+from openvima.policies.nn.text_encoder import TextEncoderConfig  # noqa: E402
+from openvima.policies.t5 import T5Tokenizer, load_t5  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import build_learner  # noqa: E402
 from published_policies import small_vima, write_tokenizer  # noqa: E402
@@ -28,9 +30,13 @@ def small_t5_vima():
 @pytest.fixture
 def t5(tmp_path: Path) -> Path:
     """A folder with a small T5: tokenizer and weights."""
+    return write_t5(tmp_path / "t5", small_t5_vima().prompt)
+
+
+def write_t5(folder: Path, prompt: PromptEncoderConfig) -> Path:
+    """Write a T5 with random weights."""
     from transformers import T5Config, T5EncoderModel
 
-    prompt = small_t5_vima().prompt
     text = prompt.text
     sizes = T5Config(
         vocab_size=prompt.vocabulary_size,
@@ -40,7 +46,7 @@ def t5(tmp_path: Path) -> Path:
         num_layers=text.num_layers,
         num_heads=text.num_heads,
     )
-    folder = write_tokenizer(tmp_path / "t5")
+    write_tokenizer(folder)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         T5EncoderModel(sizes).save_pretrained(folder)
@@ -84,6 +90,32 @@ def test_every_checkpoint_contains_the_tokenizer(t5_settings, t5) -> None:
     policy = load_policy(str(run))
     policy.reset([env.prompt])
     assert policy.act([observation])[0] is not None
+
+
+def test_a_preset_with_words_takes_a_t5_of_the_size_that_is_named(
+    settings, t5, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(sizes, "T5_VOCABULARY_SIZE", small_t5_vima().prompt.vocabulary_size)
+    monkeypatch.setitem(sizes.T5_SIZES, "t5-small", TextEncoderConfig(24, 3, 2, 4, 32))
+    own = write_t5(tmp_path / "small", sizes.t5_prompt_encoder("t5-small"))
+    changes = {
+        "preset": "vima-nano",
+        "t5": str(own),
+        "model.text_encoder": "t5-small",
+        "pretraining.steps": 0,
+    }
+    config = {**settings, **changes, "schedule.steps": 2}
+    policy, env = load_policy(str(train(TrainingConfig.of(config)))), TabletopEnv("visual_manipulation")
+    assert policy.network.config.prompt == sizes.t5_prompt_encoder("t5-small")
+    observation, _ = env.reset(seed=0)
+    policy.reset([env.prompt])
+    assert policy.act([observation])[0] is not None
+    with pytest.raises(CheckpointError, match=r"needs a T5 1\.0: t5-small \(24 wide, 3 layers, 2 heads of 4"):
+        build_learner(TrainingConfig.of({**config, "t5": str(t5)}))
+    with pytest.raises(CheckpointError, match=r"t5 is t5-large, but the network has t5-small"):
+        load_t5(policy.network, "t5-large")
+    with pytest.raises(ConfigError, match=r"has its own vocabulary and no T5; .* model\.text_encoder"):
+        train(TrainingConfig.of({**config, "model.text_encoder": None}))
 
 
 class Killed(BaseException):
