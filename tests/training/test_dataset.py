@@ -8,18 +8,21 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openvima.data import Dataset  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
+from openvima.data.subsets.merging import MergeConfig, merge  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
+from openvima.tasks.registry import held_out_tasks  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.augmentation.false_positives import augmented  # noqa: E402
 from openvima.training.building import resolved  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import StoredEpisode  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.provenance import held_out_demonstrations  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     ExampleSource,
     Parts,
@@ -70,6 +73,19 @@ def test_demonstrations_of_some_tasks_are_left_out(data):
         ConfigError, match="has no other task, only rotate, sweep_without_exceeding, visual_m"
     ):
         open_demonstrations(data, ("rotate", "sweep_without_exceeding", "visual_manipulation"))
+
+
+def test_demonstrations_of_evaluation_levels_are_refused_also_in_merged_folders(data, tmp_path):
+    config = GenerateConfig(tmp_path / "L4", ("heldout",), 1, level="L4", images=False)
+    generate(config)
+    both = merge(MergeConfig((data, tmp_path / "L4"), tmp_path / "both"))
+    with pytest.raises(
+        DatasetError, match=r"follow_motion L4, .*, sweep_without_touching L4. .*allow-heldout"
+    ):
+        open_demonstrations(both)
+    assert len(held_out_demonstrations(open_demonstrations(both, allow_heldout=True))) == 4
+    assert len(open_demonstrations(both, held_out_tasks())) == 24
+    assert held_out_demonstrations(Dataset(data)) == []
 
 
 def test_excluded_tasks_identify_a_run_in_any_order(settings):

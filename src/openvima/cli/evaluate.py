@@ -60,7 +60,8 @@ def main(
             your own, published files, ids on the Hugging Face Hub and policy servers (ws://HOST:PORT, see
             `openvima serve`), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give
             another name.
-        tasks: Names of tasks with commas in between, or all. A level that does not hold a task leaves it out.
+        tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
+            does not see. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
         episodes: Episodes for each policy, task and level; 200 as in published tables.
         seed: Number of the first episode; evaluation episodes never occur in training.
@@ -142,6 +143,11 @@ def main(
         print_results(results)
     for invalid in results.invalid_actions():
         print(f"Warning: {invalid}", file=sys.stderr)
+    for name, what in results.policies.items():
+        if seen := what.get("held_out_data"):
+            print(
+                f"Warning: {name} was trained on held-out demonstrations: {', '.join(seen)}.", file=sys.stderr
+            )
     if num_near := sum(len(row.near_ties) for row in results.rows):
         print(
             f"Rounding may have decided {num_near} episodes; each row lists its own as near_ties.",

@@ -42,7 +42,8 @@ def main(
 
     Args:
         out: Folder to write to.
-        tasks: Names of tasks with commas between them, or "all".
+        tasks: Names of tasks with commas between them, "all", or "heldout" for the four tasks of L4 that
+            training does not see.
         episodes: Successful episodes of each task.
         level: Which objects and textures may occur: train, L1, L2, L3 or L4.
         workers: Number of processes; by default one, or all CPUs of the Ray cluster at --address.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openvima.cli.progress import progress_bar
+from openvima.errors import ConfigError
 
 if TYPE_CHECKING:
     from openvima.evaluation.online_eval import OnlineEval
@@ -89,13 +90,19 @@ def run(words: Sequence[str]) -> int:
 
 def _rollout(config: "TrainingConfig") -> "OnlineEval":
     """Return rollouts of a checkpoint on the tasks of the data, with prompts in their form."""
-    from openvima.data.reader import read_manifest
-    from openvima.env import EnvConfig
+    from openvima.data.reader import Dataset
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.tasks.registry import task_spec
 
-    manifest = read_manifest(config.data)
-    trained = sorted(set(manifest["tasks"]) - {*config.loader.excluded_tasks})
+    dataset = Dataset(config.data)
+    trained = sorted(set(dataset.manifest["tasks"]) - {*config.loader.excluded_tasks})
     playable = tuple(task for task in trained if ONLINE_EVAL_LEVEL in task_spec(task).levels)
-    env_config = replace(EnvConfig.from_record(manifest["config"]), assets=config.assets)
+    if not playable:
+        raise ConfigError(
+            f"none of the tasks in {config.data} exists at {ONLINE_EVAL_LEVEL}; leave out rollout.every."
+        )
+    setup = dataset.shard(
+        dataset.shard_names()[0]
+    ).info.env_config  # of merged folders, that of the first shard
+    env_config = replace(setup, assets=config.assets)
     return OnlineEval(playable, config.rollout.episodes, env_config)

@@ -23,6 +23,7 @@ from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
 from openvima.tasks import list_tasks, task_spec
+from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 
@@ -51,7 +52,7 @@ class GenerateConfig:
     Args:
         out: The folder.
         tasks: Names of the tasks; ("all",) means all that the level has, and with text prompts a
-            text form.
+            text form; "heldout" the four that are held out for L4.
         episodes: Successful episodes of each task.
         level: "train" or "L1" to "L4".
         start_seed: First seed.
@@ -134,10 +135,10 @@ class GenerateConfig:
             there = (task for task in list_tasks() if self.level in task_spec(task).levels)
             tasks = tuple(sorted(task for task in there if takes_prompts(task, self.env_config.prompts)))
         else:
-            for task in self.tasks:
+            tasks = tuple(sorted(named_tasks(self.tasks)))
+            for task in tasks:
                 task_spec(task).pool(self.level)
                 check_text_form(task, self.env_config.prompts)
-            tasks = tuple(sorted(set(self.tasks)))
         check_task_options(tasks, self.env_config.task_options)
         return tasks
 

@@ -31,7 +31,7 @@ from openvima.evaluation.in_context import HELD_OUT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
-from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
 from openvima.user_code import is_code, with_absolute_path
@@ -296,7 +296,7 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
         known = HELD_OUT_TASKS if config.uses(IN_CONTEXT) else list_tasks()
         tasks = [task for task in known if takes_prompts(task, prompts)]
     else:
-        tasks = list(dict.fromkeys(config.tasks))
+        tasks = list(named_tasks(config.tasks))
         for task in tasks:
             check_text_form(task, prompts)
     pairs = [

@@ -13,6 +13,7 @@ from openvima.input_files import open_regular
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.own_code import (
     LearnerCode,
+    held_out_data,
     learner_code,
     parameters_hash,
     policy_of_code,
@@ -87,7 +88,8 @@ class PolicySource:
 
         Returns:
             Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights
-            and, if its training excluded tasks, "excluded_tasks", as its settings declare;
+            and, as its settings declare, "excluded_tasks" of its training and "held_out_data", the
+            demonstrations among its data that are held out for evaluation;
             for a function its name without folders, "sha256" of its source file and, if the policy offers
             weights, "weights_sha256". Files that the source file imports are not hashed.
 
@@ -107,13 +109,17 @@ class PolicySource:
             return what if weights is None else {**what, "weights_sha256": weights}
         if code := self.learner:
             weights = weights_hash(self.source)
-            return {"kind": "run", "sha256": weights, "code": _code_record(code.source)}
+            return {"kind": "run", "sha256": weights, "code": _code_record(code.source), **self._seen()}
         if self.kind == "run":
             if self.source in BUNDLED:
                 return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
             left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
-            return {"kind": "run", "sha256": weights_hash(self.source), **left_out}
+            return {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
+
+    def _seen(self) -> dict[str, list[str]]:
+        found = held_out_data(self.source)
+        return {"held_out_data": found} if found else {}
 
 
 def policy_sources(policies: Sequence[str], *, trust_code: bool = False) -> tuple[PolicySource, ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from openvima.errors import ConfigError, OpenVimaError, PolicyError
+from openvima.errors import ConfigError, OpenVimaError, PolicyError, echo
 from openvima.input_files import read_yaml
 from openvima.policies.base import Policy, require_torch
 from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE
@@ -59,14 +59,22 @@ def tasks_left_out(folder: str | Path) -> list[str]:
     return tasks.split(",") if isinstance(tasks, str) and tasks else []
 
 
-def _run_setting(folder: str | Path, name: str) -> tuple[Path, Any]:  # Any: YAML
+def held_out_data(folder: str | Path) -> list[str]:
+    """Return the tasks and levels held out for evaluation on which a run folder was trained all the same."""
+    _, found = _run_setting(folder, "held_out", section="demonstrations")
+    return [echo(name) for name in found if isinstance(name, str)] if isinstance(found, list) else []
+
+
+def _run_setting(
+    folder: str | Path, name: str, *, section: str = "training"
+) -> tuple[Path, Any]:  # Any: YAML
     """Return a setting of the run that a folder belongs to, None without any, and the file that holds it."""
     path = Path(folder)
     run = path.absolute().parent
     for place in (path, run.parent) if run.name == CHECKPOINTS_FOLDER else (path,):
         file = place / CONFIG_FILE
         try:
-            return file, read_yaml(file)["training"][name]
+            return file, read_yaml(file)[section][name]
         except (OSError, OpenVimaError, KeyError, TypeError):
             continue
     return path, None

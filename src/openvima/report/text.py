@@ -57,11 +57,12 @@ def ablation_descriptions(ablations: Iterable[str]) -> dict[str, str]:
 
 
 def role(results: Results, policy: str) -> str:
-    """One or two sentences on what a policy is, and the tasks that its training left out."""
+    """Sentences on what a policy is, the tasks that its training left out, and held-out data that it saw."""
     record = results.policies.get(policy, {})
-    excluded = record.get("excluded_tasks")
+    excluded, seen = record.get("excluded_tasks"), record.get("held_out_data")
     left_out = f" Trained without {', '.join(map(str, excluded))}." if isinstance(excluded, list) else ""
-    return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + left_out
+    saw = f" Trained on held-out {', '.join(map(str, seen))}." if isinstance(seen, list) else ""
+    return _ROLES.get(record.get("kind", "run"), _ROLES["run"]) + left_out + saw
 
 
 def series_colours(results: Results) -> dict[str, str]:

@@ -4,9 +4,10 @@ import functools
 import importlib
 import importlib.metadata
 import inspect
+import itertools
 import os
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from openvima.user_code import load_file
 
 TASK_FILES_VARIABLE = "OPENVIMA_TASK_FILES"
 ENTRY_POINTS = "openvima.tasks"
+HELD_OUT = "heldout"  # stands for the tasks that are held out, as "all" does for all
 EXTRA_STEPS = 2  # of a policy beyond the oracle's
 MAX_EPISODE_STEPS = 20  # of a policy; the longest of the 17 tasks has 10
 SampleFunction = Callable[..., Problem]  # (table, *, options with defaults) -> Problem
@@ -185,6 +187,17 @@ def list_tasks() -> tuple[str, ...]:
     """Names of all tasks, in alphabetical order."""
     _load_task_files()
     return tuple(sorted(_TASKS))
+
+
+def held_out_tasks() -> tuple[str, ...]:
+    """Names of the tasks that are undefined at level "train", which policies meet in evaluation only."""
+    return tuple(task for task in list_tasks() if "train" not in task_spec(task).levels)
+
+
+def named_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """Replace "heldout" in a list of tasks by the names of these; drop repeated names."""
+    parts = (held_out_tasks() if name == HELD_OUT else (name,) for name in names)
+    return tuple(dict.fromkeys(itertools.chain.from_iterable(parts)))
 
 
 @functools.cache

@@ -248,6 +248,8 @@ class RunConfig:
         out: Run folder: checkpoints, settings, metrics.
         seed: Seed of weights, order and augmentation.
         force: Replace a run with other settings.
+        allow_heldout: Also train on demonstrations of evaluation levels, such as those of the held-out tasks;
+            results of the policy then say so.
         optimizer: The optimizer.
         schedule: Length, learning rate, checkpoints.
         runtime: Device, precision, processes.
@@ -260,6 +262,7 @@ class RunConfig:
     out: Path
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     force: bool = False
+    allow_heldout: bool = False
     optimizer: OptimizerConfig = OptimizerConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     runtime: RuntimeConfig = RuntimeConfig()

@@ -3,6 +3,7 @@
 import math
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from openvima.catalog.packs import load_assets
 from openvima.data.object_cache.cache import Boxes, ObjectCache, open_object_cache
@@ -11,6 +12,7 @@ from openvima.data.reader import Dataset
 from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
+from openvima.policies.own_code import held_out_data
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
@@ -20,6 +22,7 @@ from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer
 from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
+from openvima.training.provenance import held_out_demonstrations
 from openvima.training.run_folder import run_lock
 from openvima.training.sequence_lengths import check_lengths
 from openvima.training.source import (
@@ -49,7 +52,8 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     Raises:
         ConfigError: The folder holds a run with other settings, preset and settings contradict each other,
             there is no such detector or excluded task, or the loss diverged.
-        DatasetError: There are no demonstrations, or one is too long for the network.
+        DatasetError: There are no demonstrations, some are held out for evaluation, or one is too long for
+            the network.
         CheckpointError: The last checkpoint or the detector is damaged, or T5 is not where the settings say,
             or of other sizes.
         PromptError: A prompt has a word that T5 lacks, or the prompts have too many different words.
@@ -58,7 +62,9 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     """
     config = resolved(config)
     load_assets(config.assets)  # fails before there is a run folder
-    dataset = open_demonstrations(config.data, config.loader.excluded_tasks)
+    dataset = open_demonstrations(
+        config.data, config.loader.excluded_tasks, allow_heldout=config.allow_heldout
+    )
     if config.loader.rerendered_prob:
         check_scenes(dataset)
     boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
@@ -84,9 +90,15 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
             report=report,
             rollout=rollout,
             rollout_every=config.rollout.every,
-            demonstrations={"boxes": boxes.name} if boxes else None,
+            demonstrations=_origin(config, dataset, boxes),
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())
+
+
+def _origin(config: TrainingConfig, dataset: Dataset, boxes: Boxes | None) -> dict[str, Any]:  # Any: YAML
+    """Return what identifies the demonstrations besides their index."""
+    seen = {*held_out_demonstrations(dataset), *(held_out_data(config.init_from) if config.init_from else ())}
+    return {**({"boxes": boxes.name} if boxes else {}), **({"held_out": sorted(seen)} if seen else {})}
 
 
 class _Stages:

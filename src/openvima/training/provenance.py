@@ -27,6 +27,19 @@ def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
     }
 
 
+def held_out_demonstrations(dataset: Dataset) -> list[str]:
+    """Return the task and level of demonstrations of evaluation levels or seeds, such as "twist L3".
+
+    Each episode says its own level and domain, so merging or sampling folders hides nothing.
+    """
+    found = dataset.index.select(["task", "level", "domain"]).group_by(["task", "level", "domain"])
+    return sorted(
+        f"{row['task']} {row['level']}" + (" eval" if row["domain"] == "eval" else "")
+        for row in found.aggregate([]).to_pylist()
+        if row["level"] != "train" or row["domain"] == "eval"
+    )
+
+
 def index_hash(folder: Path) -> str:
     """Return a hash of the index of a folder of demonstrations."""
     return hashlib.blake2b((folder / INDEX_NAME).read_bytes(), digest_size=16).hexdigest()

@@ -19,6 +19,7 @@ from openvima.training.augmentation.distractor_insertion import allows_distracto
 from openvima.training.dataset import Example, StoredEpisode
 from openvima.training.hash_split import split_hashes
 from openvima.training.learner import Collate
+from openvima.training.provenance import held_out_demonstrations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,17 +116,30 @@ class Parts:
         ]
 
 
-def open_demonstrations(folder: Path, excluded: Sequence[str]) -> Dataset:
-    """Open a folder of demonstrations without those of some tasks.
+def open_demonstrations(
+    folder: Path, excluded: Sequence[str] = (), *, allow_heldout: bool = False
+) -> Dataset:
+    """Open a folder of demonstrations without those of some tasks, for training.
 
     Args:
         folder: The folder.
         excluded: Names of tasks; the folder need not have any of them.
+        allow_heldout: Accept demonstrations that are held out for evaluation.
 
     Raises:
         ConfigError: There is no such task, or no other one is left.
-        DatasetError: The folder is no finished data set.
+        DatasetError: The folder is no finished data set, or holds demonstrations that are held out.
     """
+    dataset = _without_tasks(folder, excluded)
+    if (found := held_out_demonstrations(dataset)) and not allow_heldout:
+        raise DatasetError(
+            f"{folder} holds demonstrations for evaluation only: {', '.join(found)}. Train on level train, "
+            "leave these tasks out, or give --allow-heldout, which is recorded with the policy."
+        )
+    return dataset
+
+
+def _without_tasks(folder: Path, excluded: Sequence[str]) -> Dataset:
     if not excluded:
         return Dataset(folder)
     present = sorted(read_manifest(folder)["tasks"])

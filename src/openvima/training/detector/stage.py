@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from openvima.data.batching import BatchOrder
-from openvima.data.reader import Dataset
 from openvima.detector.augmentation import augment_frame
 from openvima.detector.checkpoint import load_network
 from openvima.detector.config import detector_config
@@ -21,8 +20,10 @@ from openvima.training.detector.learner import DetectorLearner, FrameBatch
 from openvima.training.detector.split import split_episodes
 from openvima.training.loop import Metrics, PlannedStage, Report, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
+from openvima.training.provenance import held_out_demonstrations
 from openvima.training.run_folder import run_lock
 from openvima.training.schedule import step_generator, step_seed
+from openvima.training.source import open_demonstrations
 
 VALIDATION_BATCH = 8  # frames
 
@@ -40,11 +41,11 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
     Raises:
         ConfigError: The folder holds a run with other settings, the loss diverged, or there are several
             processes.
-        DatasetError: There are not enough demonstrations.
+        DatasetError: There are not enough demonstrations, or some are held out for evaluation.
         CheckpointError: The last checkpoint, or the initial one, is damaged.
         FolderLockedError: Another run writes to the folder.
     """
-    dataset, loader = Dataset(config.data), config.loader
+    dataset, loader = open_demonstrations(config.data, allow_heldout=config.allow_heldout), config.loader
     training, held_out = split_episodes(dataset, loader.validation_fraction)
     if 2 * len(training) < loader.batch_size or not len(held_out):
         raise DatasetError(
@@ -61,7 +62,9 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
         if parallel.num_ranks > 1:
             raise ConfigError("a detector trains in one process; start it without torchrun.")
         learner = DetectorLearner(_network(config), sampled=config.proposals_per_frame)
-        trainer = Trainer(config, dataset, learner, parallel, report=report)
+        found = held_out_demonstrations(dataset)
+        origin = {"held_out": found} if found else None
+        trainer = Trainer(config, dataset, learner, parallel, report=report, demonstrations=origin)
         learner.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
         if runtime.compile:
             compile_layers(learner)
