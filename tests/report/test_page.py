@@ -297,6 +297,13 @@ def test_tables_are_marked_if_all_outcomes_were_confirmed_by_replay(results, tmp
     assert "the actions were not recorded" in section(text, "verification")
 
 
+def test_settings_other_than_the_usual_ones_are_stated_at_the_top(results, tmp_path):
+    settings = {"prompts": "text", "task_options": "num_distractors=3", "assets": "original", "compat": True}
+    other = replace(results, config={**results.config, **settings})
+    top = write_report(other, tmp_path / "a.html").read_text("utf-8").split("<main>")[0]
+    assert "Prompts: text. Task options: num_distractors=3. Assets: original. The quirks of" in top
+
+
 def test_notes_stand_at_the_top(results, tmp_path):
     path = write_report(results, tmp_path / "a.html", notes=["Beware of <this>."])
     assert "Beware of &lt;this&gt;." in path.read_text(encoding="utf-8").split("<main>")[0]

@@ -175,8 +175,15 @@ def measured(results: Results) -> str:
         f"{counted(len(results.policy_names()), 'policy').replace('policys', 'policies')}, "
         f"{counted(len(results.tasks()), 'task')}, {counted(len(results.levels()), 'level')}, {each} each; "
         f"{counted(sum(row.episodes for row in results.rows), 'episode')} in all, on seeds that training "
-        "never uses." + unpublished_settings(results)
+        "never uses." + unpublished_settings(results) + _fidelity(results)
     )
+
+
+def _fidelity(results: Results) -> str:
+    """Name the assets and the compatibility mode unless they are the usual ones."""
+    assets = results.config.get("assets", "procedural")
+    compat = " The quirks of VIMA-Bench are reproduced (compat)." if results.config.get("compat") else ""
+    return (f" Assets: {assets}." if assets != "procedural" else "") + compat
 
 
 def finding(comparison: Comparison, difference: Difference | None = None) -> str:
