@@ -8,6 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from object_rows import rows_of  # noqa: E402
+from openvima.data import Dataset, GenerateConfig, generate  # noqa: E402
 from openvima.data.object_cache.episode import preprocess  # noqa: E402
 from openvima.data.records import rollout_oracle  # noqa: E402
 from openvima.env import TabletopEnv  # noqa: E402
@@ -18,10 +19,14 @@ from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.augmentation.demonstrations import DemonstrationAugmentation, Randomly  # noqa: E402
 from openvima.training.augmentation.drop_unused_objects import without_unused_objects  # noqa: E402
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
+from openvima.training.augmentation.paraphrase import paraphrased  # noqa: E402
 from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
 from openvima.training.augmentation.shuffle_sentences import shuffled  # noqa: E402
+from openvima.training.augmentation.unknown_words import UnknownWords  # noqa: E402
+from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.vocabulary import training_texts  # noqa: E402
 from training_examples import rngs_of  # noqa: E402
 
 NAMED = (
@@ -46,6 +51,38 @@ def _images(episode) -> dict[str, list]:
     prompt = episode.prompt
     parts = zip(prompt.image_names, prompt.objects.split(prompt.objects_per_image), strict=True)
     return {name: rows_of(table).tolist() for name, table in parts}
+
+
+@pytest.mark.parametrize("task", ["visual_manipulation", "rotate", "scene_understanding", "same_shape"])
+def test_a_paraphrase_keeps_images_numbers_and_textures(task, episodes):
+    episode, texts = episodes[task], set()
+    for seed in range(20):
+        said = paraphrased(episode, np.random.default_rng(seed))
+        assert _images(said) == _images(episode)
+        assert re.findall(r"\b\d+", said.prompt.text) == re.findall(r"\b\d+", episode.prompt.text)
+        texts.add(said.prompt.text)
+    assert len(texts) > 3
+    assert episode.prompt.text not in texts
+    assert paraphrased(episodes["novel_adj"], np.random.default_rng(0)) is episodes["novel_adj"]
+
+
+def test_unknown_words_are_words_and_neither_images_nor_numbers(episodes):
+    example = Example(episodes["rotate"])
+    all_unknown = UnknownWords(1.0)(example, np.random.default_rng(0)).episode.prompt.text
+    assert re.fullmatch(r"<unknown> <unknown> \{dragged_obj\} \d+ <unknown>\.", all_unknown)
+    assert UnknownWords(0.0)(example, np.random.default_rng(0)) is example
+    texts = [UnknownWords(0.3)(example, np.random.default_rng(k)).episode.prompt.text for k in range(200)]
+    assert abs(np.mean([text.count("<unknown>") for text in texts]) - 0.9) < 0.2
+
+
+def test_the_vocabulary_has_the_words_of_paraphrases(tmp_path):
+    folder = generate(GenerateConfig(out=tmp_path / "demos", tasks=("rotate",), episodes=1))
+    plain, said = (
+        " ".join(training_texts(Dataset(folder), AugmentationConfig(paraphrase_prob=prob)))
+        for prob in (0.0, 0.5)
+    )
+    assert "Twist" in said and "Twist" not in plain
+    assert "Brush" not in said  # of another task
 
 
 @pytest.mark.parametrize("task", NAMED)

@@ -207,6 +207,10 @@ class AugmentationConfig:
             whose prompts allow it.
         text_description_prob: Probability for each object image of a task's prompt of the text "red swirl
             letter A" in its place.
+        paraphrase_prob: Probability of another phrasing of a task's prompt, of those in
+            `tasks/paraphrases.yaml`.
+        unknown_word_prob: Probability for each word of a task's prompt of the unknown token in its place, so
+            that words which training lacks can be read past. Not with T5, which has no such token.
     """
 
     false_positive_prob: Probability = 0.05
@@ -216,6 +220,8 @@ class AugmentationConfig:
     shuffle_sentences_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
     text_description_prob: Probability = 0.0
+    paraphrase_prob: Probability = 0.0
+    unknown_word_prob: Probability = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from openvima.data.reader import Dataset
 from openvima.perception.preprocessing import split_prompt
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
+from openvima.tasks.paraphrasing import training_paraphrases
 from openvima.tasks.prompts import description_of
 from openvima.training.augmentation.describe_objects import text_of
 from openvima.training.augmentation.inverse_dynamics import motion_text
@@ -37,6 +38,9 @@ def training_texts(
         prompts.add(motion_text(1))
     if augmentation.text_description_prob:
         prompts.update(map(text_of, _descriptions(dataset)))
+    if augmentation.paraphrase_prob:
+        tasks = set(dataset.index.column("task").to_pylist())
+        prompts.update(text for task in tasks for text in training_paraphrases().get(task, ()))
     if augmentation.rename_objects_prob:
         prompts.update(DEFINITION.format(noun=f"the {noun}", image="") for noun in NOUNS)
     if with_captions:

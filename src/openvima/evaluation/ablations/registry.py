@@ -23,6 +23,7 @@ from openvima.evaluation.ablations.objects import jittered, shuffled
 from openvima.evaluation.ablations.words import gibberish, masked, scrambled, swapped
 from openvima.evaluation.in_context import in_context_prompt
 from openvima.evaluation.oracle_demonstration import demonstrated
+from openvima.evaluation.phrasings import has_phrasings, in_held_out_phrasing
 from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.tasks.options import MAX_DISTRACTORS
 from openvima.tasks.seeding import make_rng
@@ -160,6 +161,17 @@ INPUT_ABLATIONS = {
             "The prompt is edited to contain an example from the task's own prompt, as in MIDAS.",
             lambda env, seen, rate, rng: AblatedInput(in_context_prompt(seen.prompt, env.task)),
             exclusive="prompts",
+        ),
+        InputAblation(
+            "held_out_phrasings",
+            "The prompt is in other words, in one of twenty phrasings that no training used.",
+            lambda env, seen, rate, rng: replace(
+                seen,
+                prompt=replace(
+                    seen.prompt, text=in_held_out_phrasing(seen.prompt.text, env.episode.task, rng)
+                ),
+            ),
+            takes=lambda task, env_config: has_phrasings(task),
         ),
         InputAblation(
             "scrambled_words",

@@ -11,8 +11,10 @@ from openvima.training.augmentation.describe_objects import DescribeObjects
 from openvima.training.augmentation.distractor_insertion import with_distractors
 from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt
+from openvima.training.augmentation.paraphrase import paraphrased
 from openvima.training.augmentation.rename_objects import renamed
 from openvima.training.augmentation.shuffle_sentences import shuffled
+from openvima.training.augmentation.unknown_words import UnknownWords
 from openvima.training.config import AugmentationConfig
 from openvima.training.dataset import Example
 
@@ -57,7 +59,8 @@ class DemonstrationAugmentation:
         """Whether demonstrations stay as they are, those without a source of distractors."""
         transforms = [each for each in self.of_tasks if each is not with_distractors]
         return not self.inverse_dynamics_prob and all(
-            isinstance(each, Randomly | DescribeObjects) and not each.prob for each in transforms
+            isinstance(each, Randomly | DescribeObjects | UnknownWords) and not each.prob
+            for each in transforms
         )
 
     def __call__(self, example: Example, rng: np.random.Generator | None) -> Example:
@@ -82,8 +85,10 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
         of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob),),
         of_tasks=(
             with_distractors,  # acts where the loader supplies another demonstration
+            Randomly(config.paraphrase_prob, paraphrased),  # before others change the text
             Randomly(config.rename_objects_prob, renamed),
             Randomly(config.shuffle_sentences_prob, shuffled),
-            DescribeObjects(config.text_description_prob),  # last: the others look for images
+            DescribeObjects(config.text_description_prob),  # after those that look for images
+            UnknownWords(config.unknown_word_prob),
         ),
     )
