@@ -1,12 +1,17 @@
 """Pairs of contrastive pretraining: where they come from, channel mixing, and the loss."""
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.partitions import pool  # noqa: E402
+from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
+from openvima.tasks import sample_episode  # noqa: E402
+from openvima.training.augmentation.appearance_randomization import with_random_appearance  # noqa: E402
 from openvima.training.augmentation.channel_mixing import channel_mixing  # noqa: E402
 from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
 from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy  # noqa: E402
@@ -76,3 +81,22 @@ def test_the_contrastive_loss_decreases():
         losses.append(loss.item())
     assert sum(losses[-5:]) < 0.7 * sum(losses[:5])
     assert retrieval_accuracy(encoder, pairs) > 0.7
+
+
+def test_random_containers_are_gratings_as_often_as_asked():
+    assets = RandomAppearanceAssets(load_assets("procedural"))
+    scene = sample_episode("visual_manipulation", level="train", seed=0, domain="user").problem.scene
+    containers = {
+        prob: {
+            placement.object.rpartition(" ")[0]
+            for seed in range(20)
+            for placement in with_random_appearance(
+                scene, 1.0, assets, np.random.default_rng(seed), prob
+            ).placements
+            if placement.object.startswith(("random container", "random grating"))
+        }
+        for prob in (0.0, 0.5, 1.0)
+    }
+    assert containers[0.0] == {"random container"}
+    assert containers[0.5] == {"random container", "random grating"}
+    assert containers[1.0] == {"random grating"}

@@ -21,7 +21,7 @@ from openvima.training.pretraining.stage import crop_parameters
 from openvima.training.source import ExampleSource, Parts, by_length, order_of
 
 CHUNK = 64  # demonstrations per batch of precomputed features
-MAX_FEATURES = 2_000_000  # images; above, features are computed in every step
+MAX_FEATURES = 4_000_000  # images, about 1 kB each; above, features are computed in every step
 
 
 class BehaviourCloning:

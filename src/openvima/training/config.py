@@ -168,6 +168,7 @@ class PretrainingConfig:
         box_jitter_px: Largest random shift of a crop's borders, in pixels of its 32.
         grayscale_prob: Probability for each object of a prompt image in neutral grey, which matches by shape.
         occlusion_prob: Probability for each object that bars of the background are painted over it.
+        grating_prob: Probability that a random container is a grating, whose gaps are real.
         attribute_loss_weight: Weight of the loss of attributes ("the same texture") on labelled pairs. Above
             0 it needs `model.attributes`, and captions of the pairs teach the words.
         finetune_crop_encoder: Also train the crop encoder in behaviour cloning. Slower: each step encodes its
@@ -184,6 +185,7 @@ class PretrainingConfig:
     box_jitter_px: Annotated[float, Range(0, 8)] = 0.0
     grayscale_prob: Probability = 0.0
     occlusion_prob: Probability = 0.0
+    grating_prob: Probability = 0.0
     attribute_loss_weight: Annotated[float, Range(0, 100)] = 0.0
     finetune_crop_encoder: bool = False
 

@@ -139,6 +139,7 @@ class _Stages:
                 config.hard_negative_prob,
                 second_view=(compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes),
                 grayscale_prob=config.grayscale_prob,
+                grating_prob=config.grating_prob,
             ),
             with_attributes=with_attributes,
             report=self._say,

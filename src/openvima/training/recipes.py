@@ -91,7 +91,16 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "nano": {},
         "small": _SMALL,
         # Its next version; not trained at full length yet.
-        "small-2": {**_SMALL, "model.attributes": True, "pretraining.attribute_loss_weight": 1.0},
+        "small-2": {
+            **_SMALL,
+            "model.attributes": True,
+            "pretraining.attribute_loss_weight": 1.0,
+            "pretraining.grating_prob": 0.4,
+            "loader.rerendered_prob": 0.4,
+            "augmentation.text_description_prob": 0.3,
+            "augmentation.paraphrase_prob": 0.4,
+            "augmentation.unknown_word_prob": 0.03,
+        },
     }
 )
 

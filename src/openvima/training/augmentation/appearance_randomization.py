@@ -13,7 +13,9 @@ _MOVABLE, _CONTAINERS = OBJECT_SETS["D_shape"], OBJECT_SETS["B_train"]
 _PALETTE_SIZE = 3  # random textures of a scene, so that some of its objects share one
 
 
-def with_random_appearance(scene: Scene, prob: float, assets: Assets, rng: np.random.Generator) -> Scene:
+def with_random_appearance(
+    scene: Scene, prob: float, assets: Assets, rng: np.random.Generator, grating_prob: float = 0.0
+) -> Scene:
     """Give some of the objects a random texture, and some a random shape.
 
     Args:
@@ -21,6 +23,7 @@ def with_random_appearance(scene: Scene, prob: float, assets: Assets, rng: np.ra
         prob: Probability of either for each object.
         assets: A pack with random textures and shapes.
         rng: Source of all draws.
+        grating_prob: Probability that a random container is a grating.
     """
     palette = [random_name("texture", rng) for _ in range(_PALETTE_SIZE)]
     # In half of the scenes equal containers stay equal, so that only texture distinguishes them.
@@ -31,7 +34,7 @@ def with_random_appearance(scene: Scene, prob: float, assets: Assets, rng: np.ra
             dark = "dark " if rng.random() < 0.25 else ""
             placement = replace(placement, texture=dark + palette[int(rng.integers(_PALETTE_SIZE))])
         if rng.random() < prob:
-            placement = _with_random_shape(placement, assets, rng, common)
+            placement = _with_random_shape(placement, assets, rng, common, grating_prob)
         placements.append(placement)
     return replace(scene, placements=tuple(placements))
 
@@ -43,15 +46,19 @@ def at_rest(placement: Placement, assets: Assets) -> Placement:
 
 
 def _with_random_shape(
-    placement: Placement, assets: Assets, rng: np.random.Generator, common: dict[str, str] | None
+    placement: Placement,
+    assets: Assets,
+    rng: np.random.Generator,
+    common: dict[str, str] | None,
+    grating_prob: float,
 ) -> Placement:
     if placement.object in _MOVABLE:
         kind = "shape"
     elif placement.object in _CONTAINERS:
-        kind = "container"
+        kind = "grating" if grating_prob and rng.random() < grating_prob else "container"
     else:
         return placement
     name = random_name(kind, rng)
-    if common is not None and kind == "container":
+    if common is not None and kind != "shape":
         name = common.setdefault(placement.object, name)
     return at_rest(replace(placement, object=name), assets)

@@ -94,19 +94,21 @@ class SceneAugmentation:
         hard_negative_prob: Probability for each movable object of a hard negative.
         second_view: Add a rearranged view of each scene.
         grayscale_prob: Probability for each object of a grayscale prompt image.
+        grating_prob: Probability that a random container is a grating.
     """
 
     appearance_randomization_prob: float = 0.0
     hard_negative_prob: float = 0.0
     second_view: bool = False
     grayscale_prob: float = 0.0
+    grating_prob: float = 0.0
 
     def __call__(
         self, scene: Scene, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
     ) -> Scene:
         """Augment a scene; `shades` are the textures that movable objects may have."""
-        if self.appearance_randomization_prob:
-            scene = with_random_appearance(scene, self.appearance_randomization_prob, assets, rng)
+        if prob := self.appearance_randomization_prob:
+            scene = with_random_appearance(scene, prob, assets, rng, self.grating_prob)
         if self.hard_negative_prob:
             scene = with_hard_negatives(scene, self.hard_negative_prob, shades, assets, rng)
         return scene
