@@ -92,6 +92,7 @@ def test_every_checkpoint_contains_the_tokenizer(t5_settings, t5) -> None:
     assert policy.act([observation])[0] is not None
 
 
+@pytest.mark.slow
 def test_a_preset_with_words_takes_a_t5_of_the_size_that_is_named(
     settings, t5, tmp_path, monkeypatch
 ) -> None:

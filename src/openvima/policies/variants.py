@@ -114,17 +114,15 @@ def with_image_tokens(config: PolicyConfig, name: str) -> PolicyConfig:
             f"image_tokens is {name!r}, but this network has {own!r} alone; take a preset vima-… or midas-…."
         )
     crop, decoder = images.crop, config.decoder
-    nano = size("nano")
-    layers = crop.num_layers if isinstance(crop, VitConfig) else nano.resampler_layers
-    of = replace(
-        nano,
-        width=decoder.width,
-        resampler_layers=layers,
-        dropout=decoder.dropout,
-        initial_std=decoder.initial_std,
-    )
+    of = replace(size("nano"), width=decoder.width, dropout=decoder.dropout, initial_std=decoder.initial_std)
     if isinstance(crop, VitConfig):
-        of = replace(of, image_width=crop.width, image_layers=layers, image_heads=crop.num_heads)
+        of = replace(
+            of,
+            image_width=crop.width,
+            image_layers=crop.num_layers,
+            image_heads=crop.num_heads,
+            resampler_layers=crop.num_layers,
+        )
     return replace(
         config,
         images=images if name.startswith("object") else of.frame_encoder(class_token=name == "image"),
