@@ -128,7 +128,7 @@ def test_it_changes_prompts_of_tasks_in_training_only(demos) -> None:
 def test_descriptions_count_for_the_length_of_prompts(data) -> None:
     dataset = Dataset(data)
     tokenizer = WordTokenizer(Vocabulary().extended(training_texts(dataset, ALWAYS)))
-    cache, processor = open_object_cache(dataset), Processor("objects", tokenizer)
+    cache, processor = open_object_cache(dataset), Processor("objects", tokenizer=tokenizer)
     bounds, _ = sequence_lengths._upper_bounds(cache, processor, False, True)
     for episode, bound in zip(cache, bounds, strict=True):
         text = with_descriptions(episode, 1.0, np.random.default_rng(0)).prompt.text
