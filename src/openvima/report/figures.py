@@ -15,7 +15,7 @@ from openvima.report.rate_curves import RateFigure
 _INK, _MUTED, _GRID = "#010101", "#020202", "#030303"
 _PANEL_WIDTH_IN = 3.9
 _LEAST_GAP = 0.12  # between named values of an axis, as a fraction of its length
-_DODGE = 0.1  # between the curves of named values, which are 1 apart
+_DODGE = 0.16  # between the curves of named values, which are 1 apart
 _CHARACTER_IN = 0.055  # height of a tilted name, for each of its characters
 _MAX_TILTED = 24  # characters of a tilted name
 _STYLE: Any = {  # Any: the type of matplotlib's settings is not public

@@ -11,6 +11,8 @@ from openvima.report.rate_curves import RateCurve, RateFigure, RatePanel, RatePo
 from openvima.studies.results import Point
 from openvima.studies.study import Study, StudyInputs
 
+_MAX_NAMED = 6  # means in the first sentence
+
 
 def study_page(
     study: Study,
@@ -110,14 +112,15 @@ def _mean_costs(costs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:  # Any: J
 
 
 def _summary(points: Sequence[Point]) -> str:
-    """The means of the first level as a sentence."""
+    """The first means of the first level as a sentence."""
     first = points[0].level
     means = [
         f"{' · '.join(filter(None, (p.run, text.ablation_name(p.ablation))))}: {text.percent(p.score.mean)}"
         for p in points
         if p.level == first
     ]
-    return f"Solved episodes on {first}: {', '.join(means)}."
+    more = f", and {len(means) - _MAX_NAMED} more" if len(means) > _MAX_NAMED else ""
+    return f"Solved episodes on {first}: {', '.join(means[:_MAX_NAMED])}{more}."
 
 
 def duration(seconds: float) -> str:
