@@ -1,5 +1,7 @@
 """Studies: experiments of several runs, each a list of runs as data, ending in one page."""
 
+from typing import TYPE_CHECKING
+
 from openvima.lazy import lazy_names
 from openvima.studies.scales import SCALES, Scale, scale_named
 from openvima.studies.study import (
@@ -11,6 +13,10 @@ from openvima.studies.study import (
     StudyInputs,
     published_points,
 )
+
+if TYPE_CHECKING:
+    from openvima.studies.registry import STUDIES, check_options, make_study
+    from openvima.studies.runner import Execution, run_study
 
 __all__ = [
     "SCALES",
