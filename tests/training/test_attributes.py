@@ -92,6 +92,10 @@ def test_random_containers_are_round_square_or_neither(labeller):
     assert {found.count(index) > 4 for index in known.values()} == {True}
     assert set(found) - set(known.values())
     assert int(labeller(placement("random shape 3"))[0][2]) not in known.values()
+    eared = [int(labeller(placement(f"random eared container {seed}"))[0][2]) for seed in range(40)]
+    assert [index if index in known.values() else None for index in eared] == [
+        index if index in known.values() else None for index in found
+    ]
 
 
 def test_magnified_objects_have_no_lengths(labeller):

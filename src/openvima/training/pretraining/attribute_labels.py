@@ -1,7 +1,7 @@
 """What rendered objects are like: labels of the attributes in which contrastive pretraining compares them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -55,9 +55,10 @@ class AttributeLabeller:
         self, placement: Placement, *, is_magnified: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return categories (3,), colours (64,) and lengths (2,) of an object."""
-        vertices = self._assets.geometry(placement.object, placement.size, placement.scale).visual.vertices
-        vertices = vertices.reshape(-1, 3)
-        names = (placement.texture, placement.object, profile(placement.object, vertices))
+        vertices = self._vertices(placement)
+        # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
+        body = replace(placement, object=placement.object.replace("random eared", "random"))
+        names = (placement.texture, placement.object, profile(body.object, self._vertices(body)))
         keys = zip(_CATEGORIES, names, strict=True)
         categories = [self._indices.setdefault(key, len(self._indices)) for key in keys]
         if placement.texture not in self._colours:
@@ -67,17 +68,21 @@ class AttributeLabeller:
         known = np.array(lengths, np.float32) if not is_magnified else np.full(2, np.nan, np.float32)
         return np.array(categories), self._colours[placement.texture], known
 
+    def _vertices(self, placement: Placement) -> np.ndarray:
+        mesh = self._assets.geometry(placement.object, placement.size, placement.scale).visual
+        return mesh.vertices.reshape(-1, 3)
+
 
 def profile(object_name: str, vertices: np.ndarray) -> str:
     """Return "circle", "square", or the object's name, since any other outline is a class of its own.
 
     Args:
-        object_name: Of the catalogue, or random: of those only containers can be round or square.
+        object_name: Of the catalogue, or random; of those only containers can be round or square.
         vertices: Shape (N, 3), metres.
     """
     if not is_random(object_name):
         return object_spec(object_name).profile or object_name
-    if "container" not in object_name:
+    if "shape" in object_name:
         return object_name
     points = vertices[:, :2] - (vertices[:, :2].max(axis=0) + vertices[:, :2].min(axis=0)) / 2
     reach = _reach(points)
