@@ -13,6 +13,7 @@ from openvima.data.object_cache.cache import open_object_cache  # noqa: E402
 from openvima.data.subsets.merging import MergeConfig, merge  # noqa: E402
 from openvima.errors import ConfigError, DatasetError, PromptError  # noqa: E402
 from openvima.perception.objects import observe  # noqa: E402
+from openvima.policies.own_code import held_out_data  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
 from openvima.tasks.registry import held_out_tasks  # noqa: E402
@@ -86,6 +87,14 @@ def test_demonstrations_of_evaluation_levels_are_refused_also_in_merged_folders(
     assert len(held_out_demonstrations(open_demonstrations(both, allow_heldout=True))) == 4
     assert len(open_demonstrations(both, held_out_tasks())) == 24
     assert held_out_demonstrations(Dataset(data)) == []
+
+
+def test_a_run_says_which_held_out_demonstrations_it_saw(tmp_path):
+    (tmp_path / "config.yaml").write_text(
+        'demonstrations: {held_out: [twist L3, 5, "a\\e[2J"]}\ntraining: {}\n'
+    )
+    assert held_out_data(tmp_path) == ["twist L3", "a\N{REPLACEMENT CHARACTER}[2J"]
+    assert held_out_data(tmp_path / "none") == []
 
 
 def test_excluded_tasks_identify_a_run_in_any_order(settings):
