@@ -27,6 +27,8 @@ def data_scaling(inputs: StudyInputs) -> Study:
         ticks={fraction: _percent(fraction) for fraction in FRACTIONS},
         published=published_points(scale.levels, data_fraction_curves),
         notes=(
+            f"100 % are {scale.demonstrations:,} demonstrations of each of {len(scale.tasks)} tasks here, "
+            "and 50,000 of each of 13 in the papers.",
             "All fractions are trained for the same number of steps. A batch has no more demonstrations than "
             "there are, so those of small fractions are smaller.",
             "Contrastive pretraining, where the preset has it, uses rendered scenes and no demonstrations: "
