@@ -193,7 +193,32 @@ def test_a_batch_with_a_damaged_record_is_refused(copy: Path, part) -> None:
         episodes.images.read_first(counts, (np.cumsum(counts) - counts).tolist(), stack)
 
 
-@pytest.mark.parametrize(("field", "value"), [("num_steps", 10_000), ("start", -64)])
+@pytest.mark.parametrize(
+    ("head", "reason"),
+    [
+        ({"version": 6, "kind": "objects"}, "its head lacks descriptions, rows, source, tasks, variant"),
+        ({"version": 6, "kind": ["objects"]}, "its kind is"),
+        ({}, "it is of version None, not 6"),
+        ([], "no attribute 'get'"),
+        (
+            {"version": 6, "kind": "objects", "source": 1, "variant": "", "tasks": [], "descriptions": []}
+            | {"rows": 0},
+            "other values than texts",
+        ),
+    ],
+)
+def test_a_foreign_head_is_no_cache_file(tmp_path: Path, head: object, reason: str) -> None:
+    content = json.dumps(head).encode()
+    end = PREAMBLE.itemsize + len(content)
+    preamble = np.array((b"ovcache\n", 0, end, len(content)), PREAMBLE)
+    preamble["checksum"] = xxh3_64_intdigest(preamble.tobytes()[16:] + content)
+    path = tmp_path / "foreign.cache"
+    path.write_bytes(preamble.tobytes() + content)
+    with pytest.raises(ShardError, match=rf"no readable file of the object cache \(.*{reason}"):
+        CacheFile(path)
+
+
+@pytest.mark.parametrize(("field", "value"), [("num_steps", 10_000), ("start", -64), ("task", 2)])
 def test_counts_beyond_a_record_are_found_when_a_file_is_opened(copy: Path, field: str, value: int) -> None:
     path = next(iter(sorted(open_object_cache(Dataset(copy)).folder.iterdir())))
     content = bytearray(path.read_bytes())

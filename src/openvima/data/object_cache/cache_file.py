@@ -192,7 +192,7 @@ class CacheFile:
         try:
             self.content = mapped(path).cast("B")
             about = self._read_head()
-        except ODD_ERRORS as error:
+        except (*ODD_ERRORS, AttributeError, RecursionError) as error:
             raise ShardError(_unfit(path, str(error).splitlines()[0] if str(error) else "empty")) from None
         self.kind: InputKind = about["kind"]
         self.source: str = about["source"]
@@ -206,7 +206,8 @@ class CacheFile:
         num_bytes = _aligned(int(ends.max(initial=len(self.content) if not len(self) else 0)))
         if len(self.content) != num_bytes:
             raise ShardError(_unfit(path, f"it has {len(self.content):,} of {num_bytes:,} bytes"))
-        if not _fits(self.index, len(self.content)):
+        tasks_there = (self.index["task"] >= 0) & (self.index["task"] < len(self.tasks))
+        if not (_fits(self.index, len(self.content)) and tasks_there.all()):
             raise ShardError(_unfit(path, "its index counts more than its records hold"))
 
     def __len__(self) -> int:
@@ -300,10 +301,15 @@ class CacheFile:
         if xxh3_64_intdigest(content[_HASHED_FROM:head_bytes]) != checksum:
             raise ValueError("the checksum of its index is wrong")
         about = json.loads(bytes(content[size : size + json_bytes]))
-        if about["version"] != CACHE_VERSION or about["kind"] not in KINDS:
-            raise ValueError(f"it is of version {about['version']}, not {CACHE_VERSION}")
-        if not all(isinstance(text, str) for text in about["descriptions"]):
-            raise ValueError("its descriptions are no texts")
+        if about.get("version") != CACHE_VERSION:
+            raise ValueError(f"it is of version {about.get('version')!r:.20}, not {CACHE_VERSION}")
+        if about.get("kind") not in KINDS:
+            raise ValueError(f"its kind is {about.get('kind')!r:.80}")
+        if missing := sorted({"source", "variant", "tasks", "rows", "descriptions"} - about.keys()):
+            raise ValueError(f"its head lacks {', '.join(missing)}")
+        texts = about["source"], about["variant"], *about["tasks"], *about["descriptions"]
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("its head holds other values than texts")
         self._index_bytes = content[size + json_bytes :][: about["rows"] * INDEX.itemsize]
         self.index = np.frombuffer(self._index_bytes, INDEX)
         return about
