@@ -70,3 +70,10 @@ def test_values_stay_where_a_phrasing_orders_slots_anew():
         "Put the red bowl into the {b}.", "Put the {x} into the {y}.", "Into the {y} goes the {x}."
     )
     assert text == "Into the {b} goes the red bowl."
+
+
+def test_a_description_of_several_words_is_one_value():
+    text = rephrased(
+        "Rotate the red letter A 30 degrees.", "Rotate the {x} {n} degrees.", "By {n} degrees, turn the {x}."
+    )
+    assert text == "By 30 degrees, turn the red letter A."

@@ -45,5 +45,6 @@ def rephrased(text: str, template: str, phrasing: str) -> str | None:
 @lru_cache
 def _pattern(template: str) -> re.Pattern[str]:
     pieces = PLACEHOLDER.split(template)
-    parts = (f"(?P<{piece}>.+?)" if place % 2 else re.escape(piece) for place, piece in enumerate(pieces))
+    # Greedy: of "the red letter A 30 degrees" the first slot takes all words but the last.
+    parts = (f"(?P<{piece}>.+)" if place % 2 else re.escape(piece) for place, piece in enumerate(pieces))
     return re.compile("".join(parts))
