@@ -14,7 +14,7 @@ from openvima.policies.pointer.config import ATTRIBUTES
 from openvima.policies.tokenizer import PADDING_ID
 
 WORDS: dict[str, tuple[str, ...]] = {
-    "texture": ("texture", "textures", "pattern", "patterns", "surface", "material", "look"),
+    "texture": ("texture", "textures", "pattern", "patterns", "surface", "material"),
     "colour": ("colour", "color", "colours", "colors", "hue", "tint"),
     "shape": ("shape", "shapes", "form", "geometry"),
     "profile": ("profile", "profiles", "outline", "contour", "silhouette"),
