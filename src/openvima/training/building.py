@@ -64,11 +64,6 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
             f"{t5_name(sizes.prompt.text)}, or to its name to fetch it from the Hugging Face Hub, or set "
             "model.text_encoder to 'small', which needs no files."
         )
-    if needs_t5 and augmentation.unknown_word_prob:
-        raise ConfigError(
-            f"augmentation.unknown_word_prob is {augmentation.unknown_word_prob:g}, but T5 has no unknown "
-            "token; leave it out, or set model.text_encoder to 'small'."
-        )
     if config.t5 is not None and not needs_t5:
         raise ConfigError(
             f"preset {config.preset!r} has its own vocabulary and no T5; leave t5 out, or set "

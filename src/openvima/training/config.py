@@ -212,7 +212,7 @@ class AugmentationConfig:
         paraphrase_prob: Probability of another phrasing of a task's prompt, of those in
             `tasks/paraphrases.yaml`.
         unknown_word_prob: Probability for each word of a task's prompt of the unknown token in its place, so
-            that words which training lacks can be read past. Not with T5, which has no such token.
+            that words which training lacks can be read past.
     """
 
     false_positive_prob: Probability = 0.05
