@@ -31,6 +31,7 @@ from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
 
 Report = Callable[[int, int, str], None]
+_RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class Variant:
         """Part of the folder's name."""
         names = [self.boxes.name] if self.boxes else []
         if self.appearance is not None:
-            names.append(f"rerendered-v{RERENDERING_VERSION}-{self.appearance}")
+            names.append(f"{_RERENDERED}{RERENDERING_VERSION}-{self.appearance}")
         return "-".join(names)
 
 
@@ -97,6 +98,8 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         missing = [name for name, file in found.items() if file is None]
         if missing:
             option = "--boxes DETECTOR" if variant else f"--kind {kind}"
+            if variant.startswith(_RERENDERED):
+                option = f"--kind {kind} --rerendered {variant.rpartition('-')[2]}"
             raise DatasetError(
                 f"{self.folder} lacks {len(missing)} shards, first {missing[0]}; "
                 f"`openvima data preprocess {shlex.quote(str(dataset.path))} {option}` writes them."
