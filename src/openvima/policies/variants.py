@@ -211,8 +211,10 @@ def with_attributes(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
     """Return the same network with or without comparison by attributes.
 
     Raises:
-        ConfigError: The network is no pointer model with place candidates.
+        ConfigError: They are wanted, but the network is no pointer model with place candidates.
     """
+    if wanted == bool(getattr(config, "attributes", None)):
+        return config
     if not isinstance(config, PointerConfig) or not isinstance(config.head, CandidateHeadConfig):
         raise ConfigError("attributes need a pointer model with place candidates; take the preset small.")
     return replace(config, attributes=AttributeConfig() if wanted else None)
