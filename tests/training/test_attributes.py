@@ -10,12 +10,16 @@ torch = pytest.importorskip("torch")
 from openvima.catalog.packs import load_assets  # noqa: E402
 from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.errors import ConfigError  # noqa: E402
+from openvima.evaluation.phrasings import held_out_phrasings  # noqa: E402
 from openvima.policies import presets  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.pointer.attributes import Attributes  # noqa: E402
 from openvima.policies.pointer.config import ATTRIBUTES, AttributeConfig  # noqa: E402
-from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer  # noqa: E402
+from openvima.policies.tokenizer import PADDING_ID, Vocabulary, WordTokenizer, split_words  # noqa: E402
 from openvima.scene import Placement, Pose  # noqa: E402
+from openvima.scene.prompt import PLACEHOLDER  # noqa: E402
+from openvima.tasks import list_tasks, task_spec  # noqa: E402
+from openvima.tasks.paraphrasing import training_paraphrases  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.building import resolved  # noqa: E402
 from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels  # noqa: E402
@@ -26,8 +30,9 @@ from openvima.training.pretraining.attribute_loss import (  # noqa: E402
     attribute_loss,
     caption_loss,
 )
-from openvima.training.pretraining.captions import caption_texts, sample_captions  # noqa: E402
+from openvima.training.pretraining.captions import WORDS, caption_texts, sample_captions  # noqa: E402
 from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs  # noqa: E402
+from openvima.training.pretraining.stage import crop_parameters  # noqa: E402
 from openvima.training.recipes import recipe_settings  # noqa: E402
 from small_networks import narrow_small  # noqa: E402
 
@@ -163,11 +168,10 @@ def test_a_few_steps_fit_the_attributes(pairs):
         attribute_loss(attributes, features, masks, pairs.attributes, temperature=0.1).backward()
         optimizer.step()
     after = attribute_accuracy(encoder, attributes, pairs)
-    assert list(after) == list(ATTRIBUTES)
-    # NaN where no prompt image has both; these scenes have few of a profile.
-    known = [name for name in ATTRIBUTES if after[name] == after[name]]
-    assert len(known) > 3
-    assert np.mean([after[name] for name in known]) > np.mean([before[name] for name in known]) + 0.05
+    # Those without a prompt image that has both are left out; these scenes have few of a profile.
+    assert len(after) > 3 and after.keys() == before.keys() <= set(ATTRIBUTES)
+    assert np.mean(list(after.values())) > np.mean(list(before.values())) + 0.05
+    assert {*map(id, attributes.parameters())} <= {*map(id, crop_parameters(network))}  # later frozen
 
 
 def test_captions_teach_every_word():
@@ -190,6 +194,18 @@ def test_captions_are_no_prompt_of_a_task():
     assert not words & {"put", "into", "it", "all", "as", "with"}
 
 
+def test_only_prompts_that_compare_by_attributes_name_them():
+    words = {word for names in WORDS.values() for word in names}
+    texts = {task: [task_spec(task).template] for task in list_tasks()}
+    for phrasings in (training_paraphrases(), held_out_phrasings()):
+        for task, more in phrasings.items():
+            texts[task] += more
+    named = {
+        task for task, of in texts.items() if words & set(split_words(PLACEHOLDER.sub("", " ".join(of))))
+    }
+    assert named == {"same_shape", "same_texture"}
+
+
 def test_the_weight_needs_attributes_and_these_the_preset_small(tmp_path):
     settings = {"data": tmp_path, "out": tmp_path / "run", "preset": "small"}
     with pytest.raises(ConfigError, match=r"set model\.attributes"):
@@ -200,10 +216,9 @@ def test_the_weight_needs_attributes_and_these_the_preset_small(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_trains_them_and_then_keeps_them_frozen(settings, monkeypatch):
+def test_a_run_trains_them(settings, monkeypatch):
     monkeypatch.setitem(presets.PRESETS, "tiny", narrow_small)
     wanted = {"model.attributes": True, "pretraining.attribute_loss_weight": 1, "schedule.steps": 1}
     folder = train(TrainingConfig.of({**settings, **wanted, "pretraining.num_scenes": 20}))
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     assert any('"loss/attributes"' in line and '"loss/captions"' in line for line in lines)
-    assert any('texture_accuracy"' in line for line in lines)

@@ -78,8 +78,8 @@ def attribute_accuracy(
 ) -> dict[str, float]:
     """How often the most similar other object of the scene is alike, by name of the attribute.
 
-    Only prompt images count for which the scene has another object that is alike and one that differs; NaN
-    where there are none.
+    Only prompt images count for which the scene has another object that is alike and one that differs;
+    attributes without any are left out.
     """
     labels = pairs.attributes
     assert labels is not None
@@ -101,7 +101,7 @@ def attribute_accuracy(
     is_correct_PK = same_PKK.gather(-1, scores_PKK.argmax(dim=-1, keepdim=True)).squeeze(-1)
     counts_PK = same_PKK.any(dim=-1) & different_PKK.any(dim=-1)
     rates = (is_correct_PK & counts_PK).sum(dim=-1) / counts_PK.sum(dim=-1)
-    return dict(zip(ATTRIBUTES, rates.tolist(), strict=True))
+    return {name: rate for name, rate in zip(ATTRIBUTES, rates.tolist(), strict=True) if not math.isnan(rate)}
 
 
 def _images(labels: AttributeLabels, which: Sequence[int]) -> tuple[torch.Tensor, ...]:
