@@ -25,6 +25,8 @@ def _restored(monkeypatch):
     """Leave the search path and the loaded modules as they were."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(user_code, "_loaded", {})
+    for name in ("mine", "beside_it"):  # of files that other tests loaded
+        monkeypatch.delitem(sys.modules, name, raising=False)
     before = dict(sys.modules)
     yield
     for name in set(sys.modules) - set(before):

@@ -39,8 +39,9 @@ from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.bundled import BUNDLED
 from openvima.policies.checkpoint import read_info
 from openvima.policies.parameter_counts import policy_size
-from openvima.report.paper import Estimate, Line, Table, markdown, paper_tables
+from openvima.report.paper import paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
+from openvima.report.typesetting import Estimate, Line, Table, markdown
 from sim import circumstances
 
 OUT = Path("results/2026-11-22_small")

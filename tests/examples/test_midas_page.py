@@ -50,7 +50,8 @@ def test_the_figure_shows_every_crop_and_component(monkeypatch: pytest.MonkeyPat
     figure = runpy.run_path(str(DOCS / "images" / "midas.py"))["draw"]()
     sys.modules.pop("policy", None)
     (axes,) = figure.axes
-    # 4 crops of the prompt and 6 of the step; 3 frames, and the 6 objects of each in both views
-    assert len(axes.images) == 4 + 6 + 3 + 3 * 12
+    # 4 crops of the prompt and 6 of the step; 3 frames, and the 6 objects of each in both views; those of
+    # two prompts in context, with an observation of each
+    assert len(axes.images) == 4 + 6 + 3 + 3 * 12 + 7
     texts = [text.get_text() for text in axes.texts]
     assert texts.count("qw₁") == 2 and texts.count("motion") == 1

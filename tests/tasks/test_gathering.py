@@ -47,8 +47,12 @@ def test_counts_can_be_chosen(task: str) -> None:
         options = {"num_dragged": num_dragged, "num_distractors": num_distractors}
         _, dragged, distractors = roles(problem_of(task, **options))
         assert (len(dragged), len(distractors)) == (num_dragged, num_distractors)
-    for name, count, low in (("num_dragged", 0, 1), ("num_distractors", 4, 0), ("num_dragged", 4, 1)):
-        with pytest.raises(ConfigError, match=f"{name} is {count}; give an integer from {low} to 3"):
+    for name, count, low, high in (
+        ("num_dragged", 0, 1, 3),
+        ("num_distractors", 7, 0, 6),
+        ("num_dragged", 4, 1, 3),
+    ):
+        with pytest.raises(ConfigError, match=f"{name} is {count}; give an integer from {low} to {high}"):
             problem_of(task, **{name: count})
     with pytest.raises(ConfigError, match="difficulty 'medum'"):
         problem_of(task, difficulty="medum")

@@ -202,8 +202,11 @@ def test_settings_out_of_range_are_named(settings, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"preset": "vima-2m"}, "'vima-2m' encodes prompts with T5.* take nano"),
-        ({"preset": "gato-nano", "pretraining.steps": 5}, "'gato-nano' has no appearance embedding"),
+        ({"preset": "vima-2m"}, "'vima-2m' encodes prompts with T5.*model.text_encoder"),
+        (
+            {"preset": "gato-nano", "pretraining.steps": 5},
+            "'gato-nano' with image tokens 'patches' has no appearance embedding",
+        ),
     ],
 )
 def test_settings_that_contradict_the_preset_leave_no_run_folder(settings, change, message):

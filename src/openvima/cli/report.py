@@ -135,7 +135,8 @@ def _confirmations(evaluations: dict[Path, "Results"]) -> list["Confirmation"]:
     from openvima.report.confirmation import Confirmation
     from openvima.report.curves import run_labels
 
-    labels = run_labels([_folder(path) for path in evaluations])
+    # One evaluation has no name, so that its report is the one that `evaluate` wrote, wherever it lies.
+    labels = run_labels([_folder(path) for path in evaluations]) if len(evaluations) > 1 else ["DIR"]
     return [
         Confirmation.of(results, label, confirmed=is_marked_verified(_folder(path)))
         for label, (path, results) in zip(labels, evaluations.items(), strict=True)
