@@ -84,6 +84,15 @@ def test_damaged_results_are_refused(tmp_path, text):
         Results.read(tmp_path)
 
 
+@pytest.mark.parametrize("steps", [-1, 2**63, 10**400, True, "1"])
+def test_counts_of_another_type_or_size_are_refused(results, tmp_path, steps):
+    content = json.loads(results.to_json())
+    content["rows"][0]["outcomes"][0]["steps"] = steps
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    with pytest.raises(DatasetError, match=r"is damaged \("):
+        Results.read(tmp_path)
+
+
 def test_results_of_another_schema_are_refused(tmp_path):
     (tmp_path / "results.json").write_text('{"schema": 2}')
     with pytest.raises(DatasetError, match="schema 2"):

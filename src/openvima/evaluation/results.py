@@ -323,6 +323,7 @@ def _from_content(content: Mapping[str, Any]) -> Results:
     Raises:
         KeyError: Something is missing.
         TypeError: A value is of another type.
+        ValueError: A count or seed is below 0 or beyond 64 bits.
     """
     rows = tuple(_row_from_record(record) for record in content["rows"])
     described = (content["config"], content["versions"], content["policies"])
@@ -398,6 +399,8 @@ def _check_types(values: Iterable[object], allowed: type) -> None:
     for value in values:
         if type(value) is not allowed:  # a bool is no count
             raise TypeError(f"{value!r} stands for a value of type {allowed.__name__}")
+        if isinstance(value, int) and not 0 <= value < 2**63:
+            raise ValueError(f"{value!r} is no count or seed")
 
 
 def _level_record(mean: LevelMean) -> dict[str, object]:

@@ -97,7 +97,7 @@ def verify_results(
         _check_simulator(path, results.versions)
         env_config = _env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
-    except (TypeError, AttributeError, KeyError, ValueError) as error:
+    except (TypeError, AttributeError, LookupError, ValueError, ArithmeticError, RecursionError) as error:
         if isinstance(error, OpenVimaError):
             raise
         raise DatasetError(f"{path} is damaged ({echo(repr(error))}).") from None
@@ -125,7 +125,7 @@ def is_marked_verified(folder: Path) -> bool:
         if mark != file.sha256 or next(_text_problems(file), None):
             return False
         return read_actions(folder, file.results.rows)[1] == file.results.actions_sha256
-    except (OSError, ValueError, TypeError, LookupError, AttributeError):
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         return False
 
 
@@ -155,12 +155,13 @@ def _row_problems(results: Results) -> Iterator[str]:
         ablations=(*config.get("ablations", ()),),
         boxes=config.get("boxes"),
     )
-    seeds = list(range(whole.seed, whole.seed + whole.episodes))
+    last = whole.seed + whole.episodes - 1
     played: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for row in results.rows:
         played.setdefault((row.policy, row.ablation), []).append((row.task, row.level))
-        if [outcome.seed for outcome in row.outcomes] != seeds:
-            yield f"{_named(row)} has other seeds than {seeds[0]} to {seeds[-1]}"
+        seeds = [outcome.seed for outcome in row.outcomes]
+        if row.episodes != whole.episodes or seeds != [*range(whole.seed, last + 1)]:
+            yield f"{_named(row)} has other seeds than {whole.seed} to {last}"
     for (policy, ablation), found in played.items():
         try:
             expected = set(cells(whole, ablation))
