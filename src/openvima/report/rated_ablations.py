@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 
+from openvima.errors import ConfigError
+from openvima.evaluation.ablations import ablation_parts
 from openvima.evaluation.results import Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.report.rate_curves import RateCurve, RateFigure, RatePanel, RatePoint
 from openvima.report.text import ablation_name, counted
 
-_SEPARATOR = ":"  # between name and rate
 _DEFAULTS = ("num_distractors",)  # of which a task has a number of its own without the ablation
 _UNITS = {"noisy_boxes": " (pixels)"}
 
@@ -27,17 +28,17 @@ def rate_figures(results: Results) -> list[RateFigure]:
 
 
 def rated(ablation: str) -> tuple[str, float | None]:
-    """Split an ablation into name and rate; the rate is None for one without, or for several at once.
+    """Split an ablation into name and rate; the rate is None for one without, several, or no ablation.
 
     Example:
         >>> rated("masked_words:0.2"), rated("no_prompt")
         (('masked_words', 0.2), ('no_prompt', None))
     """
-    name, separator, number = ablation.partition(_SEPARATOR)
     try:
-        return (name, float(number)) if separator else (name, None)
-    except ValueError:
+        (part,) = ablation_parts(ablation)
+    except (ConfigError, ValueError):  # no ablation of this version, or not a single one
         return ablation, None
+    return part.ablation.name, part.rate if part.ablation.rate else None
 
 
 def _figure(results: Results, name: str, levels: dict[str, dict[float, list[Row]]]) -> RateFigure:

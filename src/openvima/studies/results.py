@@ -14,6 +14,7 @@ from openvima.evaluation.statistics import (
     mean_over_seeds,
 )
 from openvima.input_files import read_json
+from openvima.report.rated_ablations import rated
 from openvima.report.text import ablation_name
 from openvima.studies.plan import COST_FILE, Plan
 from openvima.studies.study import Run, Study
@@ -102,7 +103,7 @@ def _position(study: Study, run: Run, level: str, ablation: str) -> float | str:
     if study.x_axis == "ablation":
         return ablation_name(ablation) or "as it is"
     if study.x_axis == "rate":
-        return float(ablation.partition(":")[2] or 0)
+        return rated(ablation)[1] or 0.0
     return run.label if run.x == "" else run.x
 
 
