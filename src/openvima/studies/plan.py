@@ -208,12 +208,13 @@ def _folder_name(label: str) -> str:
     return re.sub(r"[^\w.+-]+", "-", label).strip("-.") or "run"
 
 
-def record_of(study: Study, inputs: StudyInputs) -> dict[str, Any]:  # Any: JSON
+def record_of(study: Study, inputs: StudyInputs, device: str | None) -> dict[str, Any]:  # Any: JSON
     """Return what identifies the content of a study's folder, the number of seeds apart."""
     return {
         "study": study.name,
         "scale": inputs.scale.name,
         "assets": inputs.assets,
+        "device": device,
         "recipe": inputs.scale.recipe,
         "settings": _plain({**inputs.scale.settings, **study.settings}),
         "data": _plain(study.data),

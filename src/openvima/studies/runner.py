@@ -11,7 +11,7 @@ from openvima.catalog.packs import load_assets
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.resuming import is_finished
 from openvima.data.subsets import SubsetConfig, sample
-from openvima.errors import ConfigError, InputFileError
+from openvima.errors import ConfigError, InputFileError, echo
 from openvima.evaluation.results import Results
 from openvima.evaluation.runner import evaluate_prepared, prepare
 from openvima.folder_lock import folder_lock, is_lock_file
@@ -30,6 +30,7 @@ RESULTS_FILE = "study.json"
 PAGE_FILE = "report.html"
 SCHEMA = 1
 _MAX_DIFFERENCES = 3  # in a message
+_MAX_SETTINGS_BYTES = 1 << 20
 
 Report = Callable[[int, int, str], None]
 
@@ -110,18 +111,21 @@ def run_study(
     plan = plan_study(study, inputs, out, seeds=seeds, device=device)
     check_plan(plan, inputs)
     with folder_lock(out):
-        _claim(out, record_of(study, inputs))
+        record = record_of(study, inputs, device)
+        _claim(out, record)
         _Runner(plan, execution, report or (lambda *_: None)).run()
-        return _write(study, inputs, plan, out, command)
+        return _write(study, inputs, plan, out, record, command)
 
 
-def _write(study: Study, inputs: StudyInputs, plan: Plan, out: Path, command: str) -> Path:
+def _write(
+    study: Study, inputs: StudyInputs, plan: Plan, out: Path, record: dict[str, Any], command: str
+) -> Path:
     """Write `study.json` and the page."""
     points, costs = study_points(study, plan), study_costs(plan)
     versions = Results.read(plan.evaluations[0].config.out).versions
     content = {
         "schema": SCHEMA,
-        "settings": record_of(study, inputs),
+        "settings": record,
         "points": [asdict(point) for point in points],
         "published": [asdict(point) for point in study.published],
         "costs": costs,
@@ -166,13 +170,16 @@ def _claim(out: Path, record: dict[str, Any]) -> None:  # Any: JSON
         atomic_write_file(file, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
         return
     try:
-        there = flattened(read_json(file))
-    except (OSError, ValueError, InputFileError) as error:
+        there = flattened(read_json(file, max_bytes=_MAX_SETTINGS_BYTES))
+    except (OSError, InputFileError) as error:
         raise ConfigError(f"{file} cannot be read ({error}); give another --out.") from None
     here = flattened(record)
     names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
     if names:
-        shown = [f"{n} is {there.get(n)!r} there and {here.get(n)!r} here" for n in names[:_MAX_DIFFERENCES]]
+        shown = [
+            f"{echo(n)} is {echo(repr(there.get(n)))} there and {echo(repr(here.get(n)))} here"
+            for n in names[:_MAX_DIFFERENCES]
+        ]
         more = f"; and {len(names) - _MAX_DIFFERENCES} more" if len(names) > _MAX_DIFFERENCES else ""
         raise ConfigError(f"{out} holds another study: {'; '.join(shown)}{more}. Give another --out.")
 
