@@ -45,7 +45,7 @@ def main(
             corrupted-prompts, level-drop, midas, in-context or published; or FILE.py:FUNCTION for a study of
             your own.
         out: Folder of the study.
-        scale: Sizes of networks, data and evaluation. nano takes minutes to an hour on two cores; the others
+        scale: Sizes of networks, data and evaluation. nano takes minutes to hours on two cores; the others
             follow the papers.
         seeds: Training seeds; 3 show the variation between trainings. More can be added later.
         episodes: Episodes of each task, level and training seed; by default 50 at nano, else 200.

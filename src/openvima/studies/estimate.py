@@ -127,10 +127,10 @@ class _Calibration:
             self.say(f"training {config.preset} for {_STEPS} steps")
             self.speeds[key] = self._measured(config)
         run, step, pretraining_step, scene = self.speeds[key]
+        step *= self._batch_size(config) / self._num_measured(config)
+        num_scenes = config.pretraining.num_scenes if steps else 0
         count = config.schedule.steps  # studies set steps, not epochs
-        return run, count * step + steps * pretraining_step + bool(
-            steps
-        ) * config.pretraining.num_scenes * scene
+        return run, count * step + steps * pretraining_step + num_scenes * scene
 
     def _measured(self, config: TrainingConfig) -> tuple[Path, float, float, float]:
         """Return the run folder, and seconds a step, a step of pretraining, and a rendered scene."""
@@ -172,6 +172,7 @@ class _Calibration:
         return min(config.loader.batch_size, of_each * len(demonstrations.tasks))
 
     def _num_measured(self, config: TrainingConfig) -> int:
+        """Return the demonstrations of a measured batch."""
         return min(config.loader.batch_size, len(Dataset(self._data_of(config))))
 
     def _data_of(self, config: TrainingConfig) -> Path:
