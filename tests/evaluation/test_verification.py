@@ -144,6 +144,7 @@ def test_an_episode_that_an_invalid_action_ends_is_replayed_up_to_it():
     assert (again.success, again.steps) == (False, 1)
 
 
+@pytest.mark.slow
 def test_harder_episodes_are_replayed_with_their_own_environment(tmp_path):
     ablations, policy = ("num_distractors:6", "paraphrased_prompts"), "mine=openvima.policies:RandomPolicy"
     config = EvaluationConfig(
