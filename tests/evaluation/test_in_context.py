@@ -9,7 +9,7 @@ from openvima.errors import ConfigError, PromptError
 from openvima.evaluation import EvaluationConfig, Results
 from openvima.evaluation.ablations import ABLATIONS, EXAMPLE_PROMPTS, IN_CONTEXT, ablate
 from openvima.evaluation.config import cells
-from openvima.evaluation.in_context import HELD_OUT_TASKS, in_context_prompt
+from openvima.evaluation.in_context import IN_CONTEXT_TASKS, in_context_prompt
 from openvima.evaluation.sources import policy_sources
 from openvima.evaluation.verification import verify_results
 from openvima.tasks import task_spec
@@ -81,7 +81,7 @@ def test_all_leaves_out_prompts_with_an_example() -> None:
 
 def test_by_default_the_tasks_are_those_with_an_edited_prompt() -> None:
     config = EvaluationConfig(("untrained",), ablations=(IN_CONTEXT,))
-    assert {task for task, _ in cells(config)} == {*HELD_OUT_TASKS}
+    assert {task for task, _ in cells(config)} == {*IN_CONTEXT_TASKS}
 
 
 def test_the_command_plays_the_held_out_tasks_with_either_prompt(tmp_path) -> None:

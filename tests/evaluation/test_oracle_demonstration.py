@@ -7,7 +7,7 @@ from openvima.data.records import rollout_oracle
 from openvima.env import TabletopEnv
 from openvima.errors import OracleError
 from openvima.evaluation.ablations import ORACLE_DEMONSTRATION, ablate
-from openvima.evaluation.in_context import HELD_OUT_TASKS
+from openvima.evaluation.in_context import IN_CONTEXT_TASKS
 from openvima.evaluation.rollout import play
 from openvima.evaluation.rollout_policies import PromptedRolloutPolicy
 from openvima.policies import RandomPolicy
@@ -15,7 +15,7 @@ from openvima.policies.tokenizer import WordTokenizer
 from openvima.tasks import task_spec
 
 
-@pytest.mark.parametrize("task", HELD_OUT_TASKS)
+@pytest.mark.parametrize("task", IN_CONTEXT_TASKS)
 def test_the_prompt_is_the_motion_of_the_oracle_in_this_episode(task) -> None:
     env = TabletopEnv(task, level=task_spec(task).levels[-1], domain="eval")
     observation, _ = env.reset(seed=3)
@@ -62,7 +62,7 @@ class Noting(RandomPolicy):
         self.prompts = prompts
 
 
-def test_players_are_told_the_motion() -> None:
+def test_the_motion_is_the_prompt_of_a_policy() -> None:
     policy, env = Noting(), TabletopEnv("twist", level="L1", domain="eval")
     play([env], [0], PromptedRolloutPolicy(policy, ORACLE_DEMONSTRATION))
     assert policy.prompts[0].text.startswith("Follow this motion: {frame_0} {frame_1}")

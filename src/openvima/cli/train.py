@@ -101,8 +101,6 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
         raise ConfigError(
             f"none of the tasks in {config.data} exists at {ONLINE_EVAL_LEVEL}; leave out rollout.every."
         )
-    setup = dataset.shard(
-        dataset.shard_names()[0]
-    ).info.env_config  # of merged folders, that of the first shard
-    env_config = replace(setup, assets=config.assets)
+    first = dataset.shard(dataset.shard_names()[0])  # merged folders may have others
+    env_config = replace(first.info.env_config, assets=config.assets)
     return OnlineEval(playable, config.rollout.episodes, env_config)

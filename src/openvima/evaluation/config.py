@@ -27,7 +27,7 @@ from openvima.evaluation.ablations import (
     applies_to,
     canonical_ablation,
 )
-from openvima.evaluation.in_context import HELD_OUT_TASKS, no_edited_prompt
+from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
@@ -293,7 +293,7 @@ def cells(config: EvaluationConfig, ablation: str = "") -> list[tuple[str, str]]
             raise LevelError(unknown_name("level", level, LEVELS))
     prompts = config.env_config.prompts
     if "all" in config.tasks:
-        known = HELD_OUT_TASKS if config.uses(IN_CONTEXT) else list_tasks()
+        known = IN_CONTEXT_TASKS if config.uses(IN_CONTEXT) else list_tasks()
         tasks = [task for task in known if takes_prompts(task, prompts)]
     else:
         tasks = list(named_tasks(config.tasks))

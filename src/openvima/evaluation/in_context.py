@@ -47,9 +47,9 @@ def in_context_prompt(prompt: RenderedPrompt, task: str) -> RenderedPrompt:
 
 def no_edited_prompt(task: str) -> str:
     """Return why a task has no in-context evaluation; empty if it has one."""
-    if task in HELD_OUT_TASKS:
+    if task in IN_CONTEXT_TASKS:
         return ""
-    return unknown_name("in-context evaluation of task", task, HELD_OUT_TASKS)
+    return unknown_name("in-context evaluation of task", task, IN_CONTEXT_TASKS)
 
 
 _Edited = tuple[str, tuple[str, ...]]  # text, and names of the images in it
@@ -74,4 +74,4 @@ def _follow_order(text: str, names: tuple[str, ...]) -> _Edited:
 _EDITS: Mapping[str, Callable[[str, tuple[str, ...]], _Edited]] = MappingProxyType(
     {"twist": _twist, "follow_motion": _follow_motion, "follow_order": _follow_order}
 )
-HELD_OUT_TASKS = tuple(_EDITS)
+IN_CONTEXT_TASKS = tuple(_EDITS)

@@ -1,6 +1,6 @@
 """Can a policy solve a task that it was not trained on, from an example in the prompt?"""
 
-from openvima.evaluation.in_context import HELD_OUT_TASKS
+from openvima.evaluation.in_context import IN_CONTEXT_TASKS
 from openvima.studies.scales import NANO_PRETRAINING
 from openvima.studies.study import Run, Settings, Study, StudyInputs
 
@@ -23,7 +23,7 @@ def in_context(inputs: StudyInputs) -> Study:
     nano = inputs.scale.is_nano
     settings: Settings = {
         **(NANO_SETTINGS if nano else inputs.network("midas")),
-        "loader.exclude_tasks": ",".join(HELD_OUT_TASKS),
+        "loader.exclude_tasks": ",".join(IN_CONTEXT_TASKS),
     }
     steps = int(settings["schedule.steps"]) if nano else PRETRAINING_STEPS
     pretraining = {"augmentation.inverse_dynamics_prob": 1.0, "schedule.steps": steps}
@@ -39,7 +39,7 @@ def in_context(inputs: StudyInputs) -> Study:
             Run("pretraining, plain fine-tuning", init=pretraining),
             Run("no pretraining", settings={"schedule.steps": 2 * steps} if nano else {}),
         ),
-        evaluation=inputs.evaluation(HELD_OUT_TASKS, ("L1", "L4"), ablations=("in_context",)),
+        evaluation=inputs.evaluation(IN_CONTEXT_TASKS, ("L1", "L4"), ablations=("in_context",)),
         notes=(
             "Published for 92M, in % as a mean of the three tasks: 36.2 with pretraining and modified "
             "fine-tuning, 23.3 with plain fine-tuning, 0.7 without pretraining.",

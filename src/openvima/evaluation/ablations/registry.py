@@ -111,7 +111,7 @@ def _in_words(rewrite: Callable[[str, float, np.random.Generator], str]) -> Chan
     return change
 
 
-_SHARE = Rate(0, 1, 0.2, is_open=True)
+_PROBABILITY = Rate(0, 1, 0.2, is_open=True)
 
 # Those that one name joins are applied in this order.
 INPUT_ABLATIONS = {
@@ -187,13 +187,13 @@ INPUT_ABLATIONS = {
             "swapped_words",
             "The prompt keeps its images; neighbouring words are swapped, each pair with this probability.",
             _in_words(swapped),
-            rate=_SHARE,
+            rate=_PROBABILITY,
         ),
         InputAblation(
             "masked_words",
             "The prompt keeps its images; each word is the unknown token with this probability.",
             _in_words(masked),
-            rate=_SHARE,
+            rate=_PROBABILITY,
         ),
         InputAblation(
             "shuffled_objects",

@@ -34,7 +34,7 @@ def swapped(text: str, rate: float, rng: np.random.Generator) -> str:
     """Swap neighbouring words, from left to right, each pair with a probability.
 
     Neighbours have nothing but space between them, so no word crosses an image or a mark. A word may be
-    carried on by the next swap; on average that share of the neighbouring pairs is swapped.
+    carried on by the next swap; on average that fraction of the neighbouring pairs is swapped.
 
     Example:
         >>> swapped("Put the {a} into it.", 1, np.random.default_rng(0))
