@@ -38,7 +38,7 @@ def test_settings_keep_options_in_one_spelling_and_record_them_only_if_there_are
     [
         ("rotate.angles_deg=30+60", (30.0, 60.0)),
         ("rearrange.conflict_rate=1", 1.0),
-        ("same_shape.after_bowl=True", True),
+        ("same_shape.after_bowl=true", True),
         ("pick_in_order_then_restore.same_bases=false", False),
         ("novel_noun.nouns=dax+wug", ("dax", "wug")),
         ("rearrange.distractor_textures=pool", "pool"),
@@ -76,6 +76,7 @@ def test_text_of_another_form_is_refused(text: str, message: str) -> None:
         ("novel_adj.num_comparisons=3", "this run has no novel_adj; its tasks are rotate, twist"),
         ("num_distractors=two", "option num_distractors of task 'rotate' is 'two'; give an integer"),
         ("num_distractors=1.5", "is '1.5'; give an integer"),
+        ("num_distractors=03", "is '03'; give an integer"),
         ("angles_deg=30+x", "is '30.x'; give a number, or several with . between them"),
         ("angles_deg=nan", "give a number"),
         ("num_distractors=7", "option of 'rotate': num_distractors is 7; give an integer from 0 to 6"),

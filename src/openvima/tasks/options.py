@@ -201,11 +201,12 @@ def _scalars(declared: Any) -> Iterator[type]:  # Any: a type, or a form such as
 def _scalar(kind: type, text: str) -> bool | int | float | str | None:
     """Convert one value; None if it is not of the type."""
     if kind is bool:
-        return {"true": True, "false": False}.get(text.lower())
+        return {"true": True, "false": False}.get(text)
     if kind is str:
         return text
     try:
         number = kind(text)
     except ValueError:
         return None
-    return number if math.isfinite(number) else None
+    is_odd = kind is int and text != str(number)  # 03 is 3 in another spelling, so another setting
+    return None if is_odd or not math.isfinite(number) else number
