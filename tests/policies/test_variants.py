@@ -27,11 +27,9 @@ VARIANTS = [
     ("nano", {"width": 64, "num_layers": 3, "visual_residual": True, "conditioning": "prefix"}),
 ]
 SLOW_VARIANTS = [
-    ("nano-bins", {"conditioning": "prefix"}),
-    ("flamingo-nano", {"conditioning": "prefix"}),
     ("midas-nano", {"conditioning": "cross-attention"}),
     ("nano-bins", {"image_tokens": "object-perceiver", "head": "mixture"}),
-    ("vima-nano", {"image_tokens": "image-perceiver"}),
+    ("vima-nano", {"image_tokens": "image-perceiver", "conditioning": "prefix"}),
     ("midas-nano", {"image_tokens": "image", "visual_residual": False}),
     ("gato-nano", {"width": 64, "num_layers": 3, "head": "autoregressive", "tuned_layers": 0}),
 ]

@@ -230,8 +230,13 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
     [
         {},  # images encoded once
         {"pretraining.finetune_crop_encoder": True, "loader.num_workers": 2},
-        {"augmentation.inverse_dynamics_prob": 0.5, "optimizer.grad_accum_steps": 2},
-        {"loader.detected_prob": 0.4, "loader.rerendered_prob": 0.4, "loader.rerendered_variants": 2},
+        {
+            "augmentation.inverse_dynamics_prob": 0.5,
+            "optimizer.grad_accum_steps": 2,
+            "loader.detected_prob": 0.4,
+            "loader.rerendered_prob": 0.4,
+            "loader.rerendered_variants": 2,
+        },
     ],
 )
 @pytest.mark.slow
