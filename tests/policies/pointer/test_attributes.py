@@ -80,7 +80,7 @@ def test_words_select_attributes_beside_a_comparison(network, demo, text, names)
     assert selected(read(network, demo, text)) == names
 
 
-def test_the_word_decides_by_likeness_alone(network, demo):
+def test_the_word_decides_by_similarity_alone(network, demo):
     profile, texture = read(network, demo), read(network, demo, SAME.replace("profile", "texture"))
     assert torch.equal(profile.prompt.tokens_BLD, texture.prompt.tokens_BLD)
     assert torch.equal(profile.objects_BTND, texture.objects_BTND)
@@ -90,14 +90,14 @@ def test_the_word_decides_by_likeness_alone(network, demo):
 
 def test_crops_reach_the_decoder_only_without_attributes(network, demo):
     same, other = read(network, demo), read(network, demo, shift=0.5)
-    assert not torch.allclose(same.likeness_BTNX, other.likeness_BTNX)
+    assert not torch.allclose(same.attributes_BTNX, other.attributes_BTNX)
     # What similar appearance finds may change; here nothing is found.
     assert torch.allclose(same.prompt.masked_BLD, other.prompt.masked_BLD)
     assert torch.equal(same.prompt.features.features_VNF, torch.zeros_like(same.prompt.features.features_VNF))
     plain = SAME.replace("same ", "")
     shown, shifted = read(network, demo, plain), read(network, demo, plain, shift=0.5)
     assert not torch.allclose(shown.prompt.tokens_BLD, shifted.prompt.tokens_BLD)
-    assert not shown.likeness_BTNX.any()
+    assert not shown.attributes_BTNX.any()
 
 
 def test_other_prompts_are_decided_as_without_attributes(network, demo):
@@ -120,9 +120,9 @@ def test_other_prompts_are_decided_as_without_attributes(network, demo):
         assert torch.equal(first, second)
 
 
-def test_likeness_is_the_mean_cosine_of_the_selected_attributes(network, demo):
+def test_similarity_is_the_mean_cosine_of_the_selected_attributes(network, demo):
     inputs = read(network, demo, SAME.replace("profile", "colour and profile"))
-    parts = inputs.likeness_BTNX.unflatten(-1, (len(ATTRIBUTES), -1))
+    parts = inputs.attributes_BTNX.unflatten(-1, (len(ATTRIBUTES), -1))
     norms = parts.norm(dim=-1).square()[inputs.masks_BTN]
     expected = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0, 0.0]).double()
     torch.testing.assert_close(norms, expected.expand_as(norms))

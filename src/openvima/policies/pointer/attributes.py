@@ -27,7 +27,7 @@ _UNKNOWN_WORD = -0.04  # weight of words that no caption has
 class Attributes(nn.Module):
     """A projection for each attribute, and the words that select them.
 
-    "the same colour and shape" selects two, and the likeness is the mean of both cosines. Without a word of
+    "the same colour and shape" selects two, and the similarity is the mean of both cosines. Without a word of
     comparison, such as "same", a prompt selects none: "the shape in {scene}".
 
     Args:
@@ -47,7 +47,7 @@ class Attributes(nn.Module):
     def forward(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
     ) -> torch.Tensor:
-        """Project objects; cosines of the results are likenesses.
+        """Project objects; their cosines are similarities.
 
         Args:
             features_VNF: Crop features, shape (..., 2, N, F).
@@ -82,7 +82,7 @@ class Attributes(nn.Module):
         named_BLP = is_named_BLP[..., :-1] & compares_B1[..., None]
         return named_BLP.any(dim=1), named_BLP.any(dim=-1)
 
-    def likeness(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> torch.Tensor:
+    def embed(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> torch.Tensor:
         """Return vectors whose dot products are mean cosines of the selected attributes, (B, ..., N, X).
 
         They are zero, and cost nothing, where none is selected.
@@ -92,8 +92,8 @@ class Attributes(nn.Module):
         weights_BP = selected_BP[rows].to(projected.dtype)
         weights_BP = (weights_BP / weights_BP.sum(dim=1, keepdim=True)).sqrt()
         weights_BP1 = weights_BP.view(len(rows), *(1,) * (projected.ndim - 3), weights_BP.shape[1], 1)
-        likeness = objects.features_VNF.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
-        return likeness.index_put((rows,), (projected * weights_BP1).flatten(-2))
+        embedded = objects.features_VNF.new_zeros(*objects.exists_N.shape, projected.shape[-2:].numel())
+        return embedded.index_put((rows,), (projected * weights_BP1).flatten(-2))
 
 
 def without_crops(objects: ObjectFeatures, selected_BP: torch.Tensor) -> ObjectFeatures:

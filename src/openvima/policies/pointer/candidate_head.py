@@ -188,7 +188,7 @@ class PickPointer(ObjectPointer):
     "… then put the object that was previously at its {direction} into the same {container}." And an object
     where a scene of the prompt shows another one has to be cleared away.
 
-    Where the prompt selects attributes, likeness in them takes the place of similar appearance, which then
+    Where the prompt selects attributes, similarity in them takes the place of that of appearance, which then
     has a learned weight: nothing is more like {base} than itself, but that is not to be put "into it".
     """
 
@@ -205,15 +205,15 @@ class PickPointer(ObjectPointer):
         similarity_BTN = (
             super().similarity(inputs, scale_BTH) + scale_BTH.sum(dim=-1, keepdim=True) * described_BTN
         )
-        selected_BP, likeness_BLX = inputs.prompt.selected_BP, inputs.prompt.likeness_BLX
-        if self.appearance_weight is None or selected_BP is None or likeness_BLX is None:
+        selected_BP, attributes_BLX = inputs.prompt.selected_BP, inputs.prompt.attributes_BLX
+        if self.appearance_weight is None or selected_BP is None or attributes_BLX is None:
             return similarity_BTN
-        assert inputs.likeness_BTNX is not None
-        attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ likeness_BLX[:, None]
+        assert inputs.attributes_BTNX is not None
+        attended_BTHX = torch.softmax(self._attention_scores(inputs), dim=-1) @ attributes_BLX[:, None]
         attended_BTX = (scale_BTH[..., None] * attended_BTHX).sum(dim=2)
-        likeness_BTN = (inputs.likeness_BTNX @ attended_BTX[..., None]).squeeze(-1)
-        likeness_BTN = likeness_BTN + self.appearance_weight * similarity_BTN
-        return torch.where(selected_BP.any(dim=1)[:, None, None], likeness_BTN, similarity_BTN)
+        attribute_similarity_BTN = (inputs.attributes_BTNX @ attended_BTX[..., None]).squeeze(-1)
+        attribute_similarity_BTN = attribute_similarity_BTN + self.appearance_weight * similarity_BTN
+        return torch.where(selected_BP.any(dim=1)[:, None, None], attribute_similarity_BTN, similarity_BTN)
 
     def prompt_weights(self, inputs: HeadInputs) -> torch.Tensor:
         """Return how much of the appearance that is looked for comes from each prompt position, (B, T, L)."""

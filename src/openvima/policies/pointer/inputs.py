@@ -62,8 +62,8 @@ class PointerPrompt(TensorRecord):
         features: Objects of the images, shapes (B, M, ...).
         objects: The same as place candidates.
         selected_BP: Which attributes the prompt asks to compare; None without attributes.
-        likeness_BLX: Projections of the objects of images, by which likeness in the selected attributes is a
-            dot product; zero elsewhere.
+        attributes_BLX: Projections of the objects of images, whose dot products are similarities in the
+            selected attributes; zero elsewhere.
     """
 
     tokens_BLD: torch.Tensor
@@ -75,7 +75,7 @@ class PointerPrompt(TensorRecord):
     features: ObjectFeatures
     objects: ObjectSet
     selected_BP: torch.Tensor | None = None
-    likeness_BLX: torch.Tensor | None = None
+    attributes_BLX: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +95,7 @@ class HeadInputs:
         steps_T: Indices of the steps, from 0.
         first_step: Objects in view at the first step of the episode.
         prompt: Encoded prompts.
-        likeness_BTNX: Projections of the objects in view, as `PointerPrompt.likeness_BLX`.
+        attributes_BTNX: Projections of the objects in view, as `PointerPrompt.attributes_BLX`.
     """
 
     query_BTD: torch.Tensor
@@ -109,7 +109,7 @@ class HeadInputs:
     steps_T: torch.Tensor
     first_step: ObjectSet
     prompt: PointerPrompt
-    likeness_BTNX: torch.Tensor | None = None
+    attributes_BTNX: torch.Tensor | None = None
 
 
 def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:

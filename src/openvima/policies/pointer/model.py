@@ -117,11 +117,11 @@ class Pointer(PolicyNetwork):
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
         objects = _prompt_objects(prompts, row_BM, exists_BM, features_VSF, appearance_SA)
         weights_BLL = coreference(prompts).to(features_VSF.dtype)
-        selected_BP = likeness_BMX = None
+        selected_BP = attributes_BMX = None
         if self.attributes is not None:
             # Likeness alone is to decide: neither the name of the attribute nor what else the objects share.
             selected_BP, names_attribute_BL = self.attributes.selected(prompts)
-            likeness_BMX = self.attributes.likeness(objects, selected_BP) * exists_BM[..., None]
+            attributes_BMX = self.attributes.embed(objects, selected_BP) * exists_BM[..., None]
             word_ids_BL = prompts.word_ids_BL.masked_fill(names_attribute_BL, PADDING_ID)
             prompts = replace(prompts, word_ids_BL=word_ids_BL)
             objects = without_crops(objects, selected_BP)
@@ -143,12 +143,14 @@ class Pointer(PolicyNetwork):
         if self.coreference is not None:
             appearance_BLA = appearance_BLA + weights_BLL @ appearance_BLA
             object_mask_BL = is_image_BL | (weights_BLL > 0).any(dim=-1)
-        likeness_BLX = None
-        if likeness_BMX is not None:
-            likeness_BLX = likeness_BMX.new_zeros(*is_image_BL.shape, likeness_BMX.shape[-1])
-            likeness_BLX = likeness_BLX.scatter(1, order_BM[..., None].expand_as(likeness_BMX), likeness_BMX)
+        attributes_BLX = None
+        if attributes_BMX is not None:
+            attributes_BLX = attributes_BMX.new_zeros(*is_image_BL.shape, attributes_BMX.shape[-1])
+            attributes_BLX = attributes_BLX.scatter(
+                1, order_BM[..., None].expand_as(attributes_BMX), attributes_BMX
+            )
             if self.coreference is not None:
-                likeness_BLX = likeness_BLX + weights_BLL @ likeness_BLX
+                attributes_BLX = attributes_BLX + weights_BLL @ attributes_BLX
         index_BMD = order_BM[..., None].expand(-1, -1, tokens_BLD.shape[-1])
         object_set = ObjectSet.of(tokens_BLD.gather(1, index_BMD), objects, rotations_BMR)
         return PointerPrompt(
@@ -161,7 +163,7 @@ class Pointer(PolicyNetwork):
             objects,
             replace(object_set, image_index_BK=_scene_index(objects)),
             selected_BP,
-            likeness_BLX,
+            attributes_BLX,
         )
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
@@ -217,9 +219,9 @@ class Pointer(PolicyNetwork):
         features_BTVNF = features_KF[history.crop_index_BTVN]
         appearance_BTNA = self.images.embed_appearance(features_BTVNF, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
-        likeness_BTNX = None
+        attributes_BTNX = None
         if self.attributes is not None and prompt.selected_BP is not None:
-            likeness_BTNX = self.attributes.likeness(objects, prompt.selected_BP)
+            attributes_BTNX = self.attributes.embed(objects, prompt.selected_BP)
             objects = without_crops(objects, prompt.selected_BP)
         changes_BTND = self._changes_in_view(objects, prompt)
         tokens = self._observation_tokens(history, objects.features_VNF, changes_BTND)
@@ -244,7 +246,7 @@ class Pointer(PolicyNetwork):
             steps_T=steps_T,
             first_step=first_step,
             prompt=prompt,
-            likeness_BTNX=likeness_BTNX,
+            attributes_BTNX=attributes_BTNX,
         )
         return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
 
