@@ -112,3 +112,12 @@ def test_options_that_a_study_needs_or_does_not_take_are_one_line() -> None:
 def test_a_mistyped_study_gets_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="data-scaling"):
         make_study("data-scalin", INPUTS)
+
+
+def test_the_example_of_the_documentation_can_be_planned(tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / "docs/studies.md"
+    example = page.read_text().split("```python\n")[1].split("```")[0]
+    (tmp_path / "learning_rates.py").write_text(example)
+    study = make_study(f"{tmp_path / 'learning_rates.py'}:learning_rates", INPUTS)
+    plan = plan_study(study, INPUTS, OUT, seeds=2)
+    assert [training.config.preset for training in plan.trainings] == ["vima-nano"] * 4
