@@ -16,13 +16,14 @@ from openvima.perception.objects import observe  # noqa: E402
 from openvima.policies.own_code import held_out_data  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import WordTokenizer  # noqa: E402
-from openvima.tasks.registry import held_out_tasks  # noqa: E402
+from openvima.tasks.registry import held_out_tasks, list_tasks  # noqa: E402
 from openvima.training import TrainingConfig  # noqa: E402
 from openvima.training.augmentation.false_positives import augmented  # noqa: E402
 from openvima.training.building import resolved  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import StoredEpisode  # noqa: E402
 from openvima.training.learner import PolicyCollate  # noqa: E402
+from openvima.training.policy import scene_tasks  # noqa: E402
 from openvima.training.provenance import held_out_demonstrations  # noqa: E402
 from openvima.training.source import (  # noqa: E402
     ExampleSource,
@@ -87,6 +88,10 @@ def test_demonstrations_of_evaluation_levels_are_refused_also_in_merged_folders(
     assert len(held_out_demonstrations(open_demonstrations(both, allow_heldout=True))) == 4
     assert len(open_demonstrations(both, held_out_tasks())) == 24
     assert held_out_demonstrations(Dataset(data)) == []
+    # Contrastive scenes are of the training partition, whatever the demonstrations are.
+    trained = [task for task in list_tasks() if task not in held_out_tasks()]
+    assert scene_tasks(Dataset(tmp_path / "L4")) == trained
+    assert scene_tasks(Dataset(both)) == scene_tasks(Dataset(data))
 
 
 def test_a_run_says_which_held_out_demonstrations_it_saw(tmp_path):

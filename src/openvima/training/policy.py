@@ -13,6 +13,7 @@ from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.policies.own_code import held_out_data
+from openvima.tasks.registry import list_tasks, task_spec
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
@@ -130,7 +131,7 @@ class _Stages:
         network, config = self.learner.network, self.config.pretraining
         with_attributes = config.attribute_loss_weight > 0
         pairs = render_pairs(
-            sorted(set(self.dataset.index.column("task").to_pylist())),
+            scene_tasks(self.dataset),
             num_scenes=config.num_scenes,
             seed=self.config.seed,
             assets=self.config.assets,
@@ -226,3 +227,10 @@ class _Stages:
 
     def _say(self, done: int, total: int, note: str) -> None:
         self.trainer.report(f"{note or 'extracting objects'}, {done} of {total}")
+
+
+def scene_tasks(dataset: Dataset) -> list[str]:
+    """Return the tasks of the data that are defined at level train, or all such tasks if none of them is."""
+    tasks = sorted(set(dataset.index.column("task").to_pylist()))
+    of_training = [task for task in tasks if "train" in task_spec(task).levels]
+    return of_training or [task for task in list_tasks() if "train" in task_spec(task).levels]
