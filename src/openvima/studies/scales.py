@@ -58,10 +58,9 @@ class Scale:
 
 
 # Contrastive pretraining takes most of a training: it is shorter than in the recipe, and equal for all runs.
-NANO_PRETRAINING: Mapping[str, Any] = MappingProxyType(  # Any: values of any setting
-    {"pretraining.steps": 150, "pretraining.num_scenes": 1200}
+NANO_POINTER: Mapping[str, Any] = MappingProxyType(  # Any: values of any setting
+    {"preset": NANO, "pretraining.steps": 150, "pretraining.num_scenes": 1200}
 )
-NANO_POINTER: Mapping[str, Any] = MappingProxyType({"preset": NANO, **NANO_PRETRAINING})
 # Two cores: one training takes minutes.
 _NANO = Scale(
     name=NANO,
