@@ -23,7 +23,8 @@ CODE = "import beside_it\n\ndef make(size=3):\n    return beside_it.NAME, size\n
 @pytest.fixture(autouse=True)
 def _restored(monkeypatch):
     """Leave the search path and the loaded modules as they were."""
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    # Without folders that other tests loaded a file of the same name from.
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if not Path(path, "mine.py").exists()])
     monkeypatch.setattr(user_code, "_loaded", {})
     for name in ("mine", "beside_it"):  # of files that other tests loaded
         monkeypatch.delitem(sys.modules, name, raising=False)
