@@ -217,10 +217,7 @@ def _pair(a: Row, b: Row) -> PairCounts | None:
         return None
     solved_b: Mapping[int, bool] = {outcome.seed: outcome.success for outcome in b.outcomes}
     outcomes = [(o.success, solved_b[o.seed]) for o in a.outcomes if o.seed in solved_b]
-    if not outcomes:
-        return None
-    possible = ((True, True), (True, False), (False, True), (False, False))
-    return PairCounts(*(outcomes.count(pair) for pair in possible))
+    return PairCounts.of(outcomes) if outcomes else None
 
 
 def _difference(level: str, task: str, pairs: tuple[PairCounts, ...]) -> Difference:

@@ -1,9 +1,7 @@
 """How does success fall when words of the prompt are masked, swapped or replaced?"""
 
-from openvima.policies.bundled import SMALL
-from openvima.studies.distractors import run_label
 from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
-from openvima.studies.study import Run, Study, StudyInputs
+from openvima.studies.study import Study, StudyInputs
 
 ABLATIONS = (
     "masked_words:0.1",
@@ -25,7 +23,7 @@ def corrupted_prompts(inputs: StudyInputs) -> Study:
         name="corrupted-prompts",
         question="How does success fall when the prompt is corrupted?",
         quantity="corruption of the prompt",
-        runs=tuple(Run(run_label(policy), policy=policy) for policy in inputs.policies or (SMALL,)),
+        runs=inputs.policy_runs(),
         # At nano two levels: all training tasks, and the new ones.
         evaluation=inputs.evaluation(
             (*TRAINING_TASKS, *L4_TASKS), ("L1", "L4") if inputs.scale.is_nano else (), ablations=ABLATIONS

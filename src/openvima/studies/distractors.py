@@ -1,8 +1,7 @@
 """How does success fall with the number of distractors on the table?"""
 
-from openvima.policies.bundled import SMALL
 from openvima.studies.scales import L4_TASKS, TRAINING_TASKS
-from openvima.studies.study import Run, Study, StudyInputs
+from openvima.studies.study import Study, StudyInputs
 
 COUNTS = (0, 1, 2, 4, 6)
 WITHOUT_OPTION = "pick_in_order_then_restore"
@@ -15,7 +14,7 @@ def distractors(inputs: StudyInputs) -> Study:
         name="distractors",
         question="How does success fall with the number of distractors?",
         quantity="distractors on the table",
-        runs=tuple(Run(run_label(policy), policy=policy) for policy in inputs.policies or (SMALL,)),
+        runs=inputs.policy_runs(),
         evaluation=inputs.evaluation(
             tasks, plain=False, ablations=tuple(f"num_distractors:{count}" for count in COUNTS)
         ),
@@ -25,9 +24,3 @@ def distractors(inputs: StudyInputs) -> Study:
             f"All tasks but {WITHOUT_OPTION}, which has no distractors.",
         ),
     )
-
-
-def run_label(policy: str) -> str:
-    """Name of a policy given as NAME=SOURCE or SOURCE."""
-    name, equals, _ = policy.partition("=")
-    return name if equals else policy.rstrip("/").rpartition("/")[2]

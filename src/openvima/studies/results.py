@@ -115,13 +115,8 @@ def _difference(outcomes: Sequence[_Outcomes], others: Sequence[_Outcomes]) -> t
     if not tasks:
         return None
     pairs = zip(outcomes, others, strict=True)
-    return difference_over_seeds([[_pair_counts(a[task], b[task]) for task in tasks] for a, b in pairs])
-
-
-def _pair_counts(a: Mapping[int, bool], b: Mapping[int, bool]) -> PairCounts:
-    pairs = [(a[seed], b[seed]) for seed in a]
-    return PairCounts(
-        *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
+    return difference_over_seeds(
+        [[PairCounts.of((a[t][seed], b[t][seed]) for seed in a[t]) for t in tasks] for a, b in pairs]
     )
 
 

@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError
+from openvima.evaluation.sources import policy_sources
+from openvima.policies.bundled import SMALL
 from openvima.report.rate_curves import RateCurve
 from openvima.studies.scales import Scale
 
@@ -92,6 +94,18 @@ class StudyInputs:
         """Return the demonstrations of the scale; of its tasks if none are named."""
         scale = self.scale
         return Demonstrations(tasks or scale.tasks, scale.demonstrations, EnvConfig(self.assets))
+
+    def policy_runs(self) -> "tuple[Run, ...]":
+        """Return a run for each policy to evaluate as it is; by default the bundled one.
+
+        Raises:
+            ConfigError: As for `policy_sources`.
+        """
+        policies = self.policies or (SMALL,)
+        return tuple(
+            Run(source.name, policy=given)
+            for source, given in zip(policy_sources(policies), policies, strict=True)
+        )
 
     def evaluation(
         self, tasks: tuple[str, ...] = (), levels: tuple[str, ...] = (), **values: Any

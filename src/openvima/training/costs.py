@@ -1,10 +1,9 @@
 """Costs of a finished or interrupted training, from the logs of its folder."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE
+from openvima.training.run_folder import METRICS_FILE, TIMINGS_FILE, whole_lines
 
 _TIMES = ("seconds_since_start", "cpu_seconds_since_start")
 
@@ -38,11 +37,5 @@ def logged_costs(run: Path) -> dict[str, Any]:  # Any: JSON
 
 
 def _records(file: Path) -> list[dict[str, Any]]:  # Any: JSON
-    """Read the whole lines of a log; the last one may have been cut."""
-    found = []
-    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return found
+    """Read a log; empty without one."""
+    return [values for _, values in whole_lines(file)] if file.is_file() else []

@@ -13,7 +13,7 @@ from openvima.detector.plugins import detected_object_cache, plugged_boxes
 from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.policies.own_code import held_out_data
-from openvima.tasks.registry import list_tasks, task_spec
+from openvima.tasks.registry import held_out_tasks, list_tasks
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
@@ -232,5 +232,5 @@ class _Stages:
 def scene_tasks(dataset: Dataset) -> list[str]:
     """Return the tasks of the data that are defined at level train, or all such tasks if none of them is."""
     tasks = sorted(set(dataset.index.column("task").to_pylist()))
-    of_training = [task for task in tasks if "train" in task_spec(task).levels]
-    return of_training or [task for task in list_tasks() if "train" in task_spec(task).levels]
+    held_out = held_out_tasks()
+    return [t for t in tasks if t not in held_out] or [t for t in list_tasks() if t not in held_out]

@@ -13,7 +13,7 @@ Files and checkpoints are written under a temporary name and renamed when comple
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -197,14 +197,11 @@ class RunFolder:
         file = self.path / METRICS_FILE
         if not file.is_file():
             return
-        kept = []
-        for line in file.read_text(encoding="utf-8").splitlines():
-            try:
-                values = json.loads(line)
-            except json.JSONDecodeError:  # the last line of an interrupted run
-                continue
-            if (values["stage"], values["step"]) <= (progress.stage, progress.step):
-                kept.append(line + "\n")
+        kept = [
+            line + "\n"
+            for line, values in whole_lines(file)
+            if (values["stage"], values["step"]) <= (progress.stage, progress.step)
+        ]
         atomic_write_file(file, "".join(kept))
 
     def _note_best(self, progress: Progress) -> None:
@@ -244,3 +241,15 @@ def _read_progress(checkpoint: Path) -> Progress:
         return Progress(**read_json(file))
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(f"{file} cannot be read ({error}); delete {checkpoint}.") from error
+
+
+def whole_lines(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the lines of `METRICS_FILE` or `TIMINGS_FILE`, each as text and as values.
+
+    An interruption may have cut the last line, also of an earlier session; such lines are left out.
+    """
+    for line in file.read_text(encoding="utf-8").splitlines():
+        try:
+            yield line, json.loads(line)
+        except json.JSONDecodeError:
+            continue

@@ -1,6 +1,6 @@
 """Paired comparison of two policies: difference of success rates, and McNemar's test."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from openvima.errors import ConfigError
@@ -34,6 +34,14 @@ class PairCounts:
             raise ConfigError(
                 f"{self} cannot be compared; counts are at least 0, and one episode must have been played."
             )
+
+    @classmethod
+    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> "PairCounts":
+        """Count the outcomes of a and b, success or not, of each episode."""
+        pairs = list(outcomes)
+        return cls(
+            *(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False)))
+        )
 
     @property
     def episodes(self) -> int:
