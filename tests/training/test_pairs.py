@@ -11,7 +11,7 @@ from openvima.catalog.random_pack import RandomAppearanceAssets  # noqa: E402
 from openvima.policies.nn.conv_encoder import ConvConfig  # noqa: E402
 from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConfig  # noqa: E402
 from openvima.tasks import sample_episode  # noqa: E402
-from openvima.training.augmentation.appearance_randomization import with_random_appearance  # noqa: E402
+from openvima.training.augmentation.appearance_randomization import ShapeKinds, with_random_appearance  # noqa: E402
 from openvima.training.augmentation.channel_mixing import channel_mixing  # noqa: E402
 from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
 from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy  # noqa: E402
@@ -91,7 +91,7 @@ def test_random_containers_are_gratings_as_often_as_asked():
             placement.object.rpartition(" ")[0]
             for seed in range(20)
             for placement in with_random_appearance(
-                scene, 1.0, assets, np.random.default_rng(seed), prob
+                scene, 1.0, assets, np.random.default_rng(seed), ShapeKinds(prob)
             ).placements
             if placement.object.startswith(("random container", "random grating"))
         }

@@ -10,10 +10,12 @@ from openvima.catalog.meshes import scaled_geometry
 from openvima.catalog.objects import NO_SYMMETRY, object_spec
 from openvima.catalog.random_shapes import (
     has_heading,
+    random_block,
     random_container,
     random_eared_container,
     random_grating,
     random_outline,
+    random_ring,
     random_round_container,
     random_shape,
     random_square_container,
@@ -22,6 +24,8 @@ from openvima.catalog.random_textures import darkened_texture, random_texture
 
 _SHAPES = {
     "shape": random_shape,
+    "ring": random_ring,
+    "block": random_block,
     "container": random_container,
     "grating": random_grating,
     "eared container": random_eared_container,

@@ -25,6 +25,22 @@ def random_shape(rng: np.random.Generator) -> Geometry:
     return Geometry(prism(random_outline(rng), 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
 
 
+def random_ring(rng: np.random.Generator) -> Geometry:
+    """Sample a flat prism, round outside and with a hole of any form, without collision."""
+    radius = rng.uniform(*_WIDTHS_M) / 2
+    outer = radius * _circle(36)
+    hole = (_blob if rng.random() < 0.5 else _polygon)(rng)[0]
+    hole = hole * radius * rng.uniform(0.35, 0.75) / np.linalg.norm(hole, axis=1).max()
+    return Geometry(prism([outer, hole[::-1]], 0.0, rng.uniform(*_HEIGHTS_M)), (), 0.0)
+
+
+def random_block(rng: np.random.Generator) -> Geometry:
+    """Sample a block whose sides are at most as 1 to 1.2, without collision."""
+    side, ratio = rng.uniform(0.045, 0.11), rng.uniform(1 / 1.2, 1.0)
+    outline = np.array(rectangle((0.0, 0.0), (float(side / 2), float(side / 2 * ratio))))
+    return Geometry(prism([outline], 0.0, rng.uniform(0.02, 0.06)), (), 0.0)
+
+
 def random_container(rng: np.random.Generator) -> Geometry:
     """Sample an open box, a tray, a bowl, a frame or a flat square, without collision."""
     return _CONTAINERS[int(rng.integers(len(_CONTAINERS)))](rng)
@@ -146,6 +162,10 @@ def _inside(points: np.ndarray, loops: tuple[np.ndarray, ...]) -> np.ndarray:
 
 def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+
+
+def _circle(sides: int) -> np.ndarray:
+    return _polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides)
 
 
 def _jittered_angles(rng: np.random.Generator, count: int) -> np.ndarray:

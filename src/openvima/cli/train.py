@@ -33,7 +33,8 @@ of recipe and file; set --pretraining.steps to pretrain anyway.
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.
 
-Several GPUs or machines: torchrun --nproc-per-node 8 -m openvima train --data demos --out run ...
+Several GPUs or processes: --runtime.processes 8. Several machines: torchrun --nnodes 2 --nproc-per-node 8
+-m openvima train --data demos --out run ...
 """
 
 
@@ -49,6 +50,7 @@ def run(words: Sequence[str]) -> int:
     import tyro
 
     from openvima.training import TrainingConfig, train
+    from openvima.training.processes import joined_by
     from openvima.training.recipes import default_recipe, overridden, read_settings, recipe_settings
 
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -76,8 +78,12 @@ def run(words: Sequence[str]) -> int:
         args=rest,
         default=TrainingConfig.of({"data": tyro.MISSING, "out": tyro.MISSING, **settings}),
     )
-    is_first = os.environ.get("RANK", "0") == "0"  # of the processes of torchrun
-    with progress_bar("training") if is_first else nullcontext() as report:
+    is_first = os.environ.get("RANK", "0") == "0"
+    others = config.runtime.processes - 1 if "WORLD_SIZE" not in os.environ else 0
+    with (
+        joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
+        progress_bar("training") if is_first else nullcontext() as report,
+    ):
         folder = train(config, report, _rollout(config) if config.rollout.every else None)
     if not is_first:
         return 0

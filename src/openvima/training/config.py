@@ -169,6 +169,9 @@ class PretrainingConfig:
         grayscale_prob: Probability for each object of a prompt image in neutral grey, which matches by shape.
         occlusion_prob: Probability for each object that bars of the background are painted over it.
         grating_prob: Probability that a random container is a grating, whose gaps are real.
+        eared_prob: Probability that another random container has two ears, which its profile does without.
+        ring_and_block_prob: Probability that a random movable shape is a ring or a block, round or square as
+            containers are.
         attribute_loss_weight: Weight of the loss of attributes ("the same texture") on labelled pairs. Above
             0 it needs `model.attributes`, and captions of the pairs teach the words.
         finetune_crop_encoder: Also train the crop encoder in behaviour cloning. Slower: each step encodes its
@@ -186,6 +189,8 @@ class PretrainingConfig:
     grayscale_prob: Probability = 0.0
     occlusion_prob: Probability = 0.0
     grating_prob: Probability = 0.0
+    eared_prob: Probability = 0.0
+    ring_and_block_prob: Probability = 0.0
     attribute_loss_weight: Annotated[float, Range(0, 100)] = 0.0
     finetune_crop_encoder: bool = False
 
@@ -234,6 +239,7 @@ class RuntimeConfig:
         device: "auto" takes a GPU where there is one; or "cpu", "cuda", "cuda:1".
         precision: "float32", or "bfloat16" for matrix products, with weights in float32.
         compile: Compile the layers of the network with torch.compile.
+        processes: Processes that share each batch, on this machine; for several, see `torchrun`.
         sharding: Several processes replicate the network ("ddp") or shard it ("fsdp").
         threads: CPU threads; equal numbers give equal weights.
         tensorboard: Also write TensorBoard events, if it is installed.
@@ -242,6 +248,7 @@ class RuntimeConfig:
     device: str = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"
     compile: bool = False
+    processes: Annotated[int, Range(1, 64)] = 1
     sharding: Literal["ddp", "fsdp"] = "ddp"
     threads: Annotated[int, Range(1, 1024)] = 1
     tensorboard: bool = True

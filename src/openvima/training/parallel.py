@@ -6,7 +6,7 @@ DDP replicates the network in every process. FSDP2 shards weights, gradients and
 import contextlib
 import datetime
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -91,10 +91,38 @@ class Parallel:
         names = {name: None for part in everywhere for name in part}
         return {name: sum(part.get(name, 0.0) for part in everywhere) / self.num_ranks for name in names}
 
+    def in_parts(
+        self, function: Callable[[torch.Tensor], torch.Tensor], rows_N: torch.Tensor
+    ) -> torch.Tensor:
+        """Apply a function of rows to those of this process, and gather the results of all processes.
+
+        Every process passes equal rows, and goes on with equal results; `average_gradients` is then due.
+        """
+        if self.num_ranks == 1:
+            return function(rows_N)
+        from torch.distributed.nn.functional import all_gather
+
+        size = -(-len(rows_N) // self.num_ranks)
+        missing = rows_N.new_zeros(size * self.num_ranks - len(rows_N), *rows_N.shape[1:])
+        part = torch.cat([rows_N, missing])[self.rank * size : (self.rank + 1) * size]
+        return torch.cat(all_gather(function(part)))[: len(rows_N)]
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Average gradients over all processes."""
+        if self.num_ranks == 1:
+            return
+        for parameter in parameters:
+            if parameter.grad is not None:
+                dist.all_reduce(parameter.grad)
+                parameter.grad /= self.num_ranks
+
     def wait(self) -> None:
         """Wait for all processes."""
         if self.num_ranks > 1:
             dist.barrier()
+
+
+ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.policies.own_code import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
+from openvima.training.augmentation.appearance_randomization import ShapeKinds
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
@@ -140,14 +141,14 @@ class _Stages:
                 config.hard_negative_prob,
                 second_view=(compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes),
                 grayscale_prob=config.grayscale_prob,
-                grating_prob=config.grating_prob,
+                kinds=ShapeKinds(config.grating_prob, config.eared_prob, config.ring_and_block_prob),
             ),
             with_attributes=with_attributes,
             report=self._say,
         )
         encode = self.learner.processor.tokenizer.encode
         return ContrastivePretraining(
-            network, config, self.config.seed, pairs.to(self.parallel.device), encode
+            network, config, self.config.seed, pairs.to(self.parallel.device), self.parallel, encode
         )
 
     def _behaviour_cloning(self) -> Stage:

@@ -51,6 +51,7 @@ _SMALL: Mapping[str, Any] = {
     "loader.validation_fraction": 0.02,
     "loader.validation_episodes": 500,
     "schedule.checkpoint_every": 250,
+    "runtime.processes": 2,
 }
 # What differs from the defaults of `TrainingConfig`, which are those of "nano".
 RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
@@ -94,10 +95,14 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "small-2": {
             **_SMALL,
             "model.attributes": True,
-            "pretraining.attribute_loss_weight": 1.0,
+            "pretraining.attribute_loss_weight": 0.5,
             "pretraining.grating_prob": 0.4,
+            "pretraining.eared_prob": 0.3,
+            "pretraining.ring_and_block_prob": 0.3,
             "loader.rerendered_prob": 0.4,
-            "augmentation.text_description_prob": 0.3,
+            "augmentation.inverse_dynamics_prob": 0.0,
+            "augmentation.drop_unused_objects_prob": 0.0,
+            "augmentation.text_description_prob": 0.4,
             "augmentation.paraphrase_prob": 0.4,
             "augmentation.unknown_word_prob": 0.03,
         },

@@ -77,7 +77,7 @@ def profile(object_name: str, vertices: np.ndarray) -> str:
     """Return "circle", "square", or the object's name, since any other outline is a class of its own.
 
     Args:
-        object_name: Of the catalogue, or random; of those only containers can be round or square.
+        object_name: Of the catalogue, or random; a random shape is a class of its own.
         vertices: Shape (N, 3), metres.
     """
     if not is_random(object_name):

@@ -6,6 +6,7 @@ from torch.nn import functional as F
 from openvima.policies.nn.object_encoder import ObjectEncoder
 from openvima.policies.pointer.attributes import Attributes
 from openvima.training.augmentation.channel_mixing import channel_mixing
+from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.attribute_loss import attribute_loss
 from openvima.training.pretraining.pairs import Pairs
 from openvima.training.pretraining.rotation import is_rotation_correct, rotation_loss
@@ -21,6 +22,7 @@ def contrastive_loss(
     generator: torch.Generator,
     attributes: Attributes | None = None,
     attribute_weight: float = 1.0,
+    parallel: Parallel = ONE_PROCESS,
 ) -> LossAndMetrics:
     """InfoNCE loss between prompt images and scenes; with second views also theirs, and that of rotations.
 
@@ -34,6 +36,7 @@ def contrastive_loss(
         generator: Draws the mixing of channels.
         attributes: Also gets the gradient of its own loss, on labelled pairs; None for none.
         attribute_weight: Weight of that loss.
+        parallel: Processes that share the encoding of crops.
 
     Returns:
         The loss, and its parts and accuracies within the batch.
@@ -42,9 +45,10 @@ def contrastive_loss(
     """
     mixing = channel_mixing(generator).to(pairs.scene_crops.device)
     if pairs.second_view is not None:
-        return _two_view_loss(encoder, pairs, mixing, temperature, attributes, attribute_weight)
-    prompt = embedded(encoder, pairs.prompt_crops, pairs.prompt_masks, mixing)
-    scene = embedded(encoder, pairs.scene_crops, pairs.scene_masks, mixing)
+        return _two_view_loss(encoder, pairs, mixing, temperature, attributes, attribute_weight, parallel)
+    features = _encoded(encoder, torch.stack([pairs.prompt_crops, pairs.scene_crops]), mixing, parallel)
+    masks = torch.stack([pairs.prompt_masks, pairs.scene_masks]).transpose(1, 2)
+    prompt, scene = encoder.embed_appearance(features, masks)
     loss, accuracy = info_nce(prompt, scene, matches(pairs), temperature=temperature)
     return loss, {"loss/contrastive": loss.detach(), "contrastive_accuracy": accuracy}
 
@@ -56,12 +60,12 @@ def _two_view_loss(
     temperature: float,
     attributes: Attributes | None,
     attribute_weight: float,
+    parallel: Parallel,
 ) -> LossAndMetrics:
     view = pairs.second_view
     assert view is not None
     crops = torch.stack([pairs.prompt_crops, pairs.scene_crops, view.crops])
-    crops = torch.einsum("cd,skvdyx->skvcyx", mixing, crops.to(mixing.dtype))
-    features = encoder.encode_images(crops).transpose(1, 2)
+    features = _encoded(encoder, crops, mixing, parallel)
     masks = torch.stack([pairs.prompt_masks, pairs.scene_masks, view.masks]).transpose(1, 2)
     prompt, scene, second = encoder.embed_appearance(features, masks)
     rows = view.masks.any(dim=1)
@@ -84,6 +88,15 @@ def _two_view_loss(
         of_attributes = attribute_loss(attributes, features, masks, pairs.attributes, temperature=temperature)
         loss, metrics["loss/attributes"] = loss + attribute_weight * of_attributes, of_attributes.detach()
     return loss, metrics
+
+
+def _encoded(
+    encoder: ObjectEncoder, crops_SKVCYX: torch.Tensor, mixing: torch.Tensor, parallel: Parallel
+) -> torch.Tensor:
+    """Encode crops of S images of K objects, with mixed channels, to features (S, V, K, F)."""
+    mixed = torch.einsum("cd,skvdyx->skvcyx", mixing, crops_SKVCYX.to(mixing.dtype))
+    features_NF = parallel.in_parts(encoder.encode_images, mixed.flatten(0, 2))
+    return features_NF.unflatten(0, crops_SKVCYX.shape[:3]).transpose(1, 2)
 
 
 def matches(pairs: Pairs) -> torch.Tensor:
@@ -131,11 +144,6 @@ def retrieval_accuracy(encoder: ObjectEncoder, pairs: Pairs, *, chunk: int = 256
     return float(is_correct.double().mean())
 
 
-def embedded(
-    encoder: ObjectEncoder, crops: torch.Tensor, masks: torch.Tensor, mixing: torch.Tensor | None = None
-) -> torch.Tensor:
-    """Embed K objects; crops (K, 2, 3, 32, 32), masks (K, 2), optional mixing of channels (3, 3)."""
-    if mixing is not None:
-        crops = torch.einsum("cd,kvdyx->kvcyx", mixing, crops.to(mixing.dtype))
-    features = encoder.encode_images(crops)
-    return encoder.embed_appearance(features.transpose(0, 1), masks.T)
+def embedded(encoder: ObjectEncoder, crops: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
+    """Embed K objects; crops (K, 2, 3, 32, 32), masks (K, 2)."""
+    return encoder.embed_appearance(encoder.encode_images(crops).transpose(0, 1), masks.T)

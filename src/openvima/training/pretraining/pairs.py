@@ -20,7 +20,7 @@ from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
-from openvima.training.augmentation.appearance_randomization import with_random_appearance
+from openvima.training.augmentation.appearance_randomization import ShapeKinds, with_random_appearance
 from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
 from openvima.training.augmentation.hard_negatives import with_hard_negatives
 from openvima.training.augmentation.rearranged_view import rearranged
@@ -94,21 +94,21 @@ class SceneAugmentation:
         hard_negative_prob: Probability for each movable object of a hard negative.
         second_view: Add a rearranged view of each scene.
         grayscale_prob: Probability for each object of a grayscale prompt image.
-        grating_prob: Probability that a random container is a grating.
+        kinds: How often which kinds of random shapes.
     """
 
     appearance_randomization_prob: float = 0.0
     hard_negative_prob: float = 0.0
     second_view: bool = False
     grayscale_prob: float = 0.0
-    grating_prob: float = 0.0
+    kinds: ShapeKinds | None = None
 
     def __call__(
         self, scene: Scene, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
     ) -> Scene:
         """Augment a scene; `shades` are the textures that movable objects may have."""
         if prob := self.appearance_randomization_prob:
-            scene = with_random_appearance(scene, prob, assets, rng, self.grating_prob)
+            scene = with_random_appearance(scene, prob, assets, rng, self.kinds)
         if self.hard_negative_prob:
             scene = with_hard_negatives(scene, self.hard_negative_prob, shades, assets, rng)
         return scene

@@ -13,6 +13,7 @@ from openvima.training.augmentation.horizontal_flip import with_horizontal_flips
 from openvima.training.augmentation.occlusion import with_occlusion
 from openvima.training.config import PretrainingConfig
 from openvima.training.loop import Metrics
+from openvima.training.parallel import Parallel
 from openvima.training.pretraining.attribute_loss import attribute_accuracy, caption_loss
 from openvima.training.pretraining.captions import sample_captions
 from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy
@@ -28,13 +29,14 @@ _PURPOSE = "1-matching"  # hashed into the seed of every batch; changing it woul
 class ContrastivePretraining:
     """Trains the crop encoder, appearance embedding and relative rotation on rendered pairs.
 
-    Every process does the same.
+    Processes share the encoding of crops, and do the rest alike.
 
     Args:
         network: Its object encoder is trained.
         config: Settings of the stage.
         seed: Of the run.
         pairs: Objects in prompt images and scenes, on the device of the network.
+        parallel: The processes of the run.
         encode: Encodes the captions of attributes, if they are trained.
     """
 
@@ -46,6 +48,7 @@ class ContrastivePretraining:
         config: PretrainingConfig,
         seed: int,
         pairs: Pairs,
+        parallel: Parallel,
         encode: Callable[[str], list[int]] | None = None,
     ) -> None:
         assert network.object_encoder is not None  # `resolved` has checked it
@@ -55,7 +58,7 @@ class ContrastivePretraining:
         held_out = pairs.scenes >= int(pairs.scenes.max()) * (1 - _VALIDATION_SCENES)
         self._training = pairs.select(torch.nonzero(~held_out)[:, 0])
         self._validation = pairs.select(torch.nonzero(held_out)[:, 0])
-        self._config, self._seed = config, seed
+        self._config, self._seed, self._parallel = config, seed, parallel
         self._attributes = attributes_of(network) if config.attribute_loss_weight else None
         if self._attributes:
             assert encode is not None
@@ -80,12 +83,14 @@ class ContrastivePretraining:
             generator=generator,
             attributes=self._attributes,
             attribute_weight=config.attribute_loss_weight,
+            parallel=self._parallel,
         )
         if self._attributes:
             rows = torch.randint(len(self._captions.targets), (_CAPTION_BATCH,), generator=generator)
             metrics["loss/captions"] = caption_loss(self._attributes, self._captions.select(rows))
             loss = loss + metrics["loss/captions"]
         loss.backward()
+        self._parallel.average_gradients(self.parameters)
         return {"loss": loss.item(), **{name: value.item() for name, value in metrics.items()}}
 
     def validate(self) -> Metrics:
