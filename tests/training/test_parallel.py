@@ -17,6 +17,7 @@ from openvima.policies import load_policy, presets  # noqa: E402
 from openvima.policies.config import config_to_dict  # noqa: E402
 from openvima.training import TrainingConfig, train  # noqa: E402
 from openvima.training.parallel import joined  # noqa: E402
+from openvima.training.processes import joined_by  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +29,7 @@ from openvima.policies.config import config_from_dict
 from openvima.training import TrainingConfig, train
 
 sizes, settings = json.loads(sys.argv[1])
-presets.PRESETS["tiny-bins"] = lambda: config_from_dict(sizes)
+presets.PRESETS[settings["preset"]] = lambda: config_from_dict(sizes)
 kill_at = settings.pop("kill_at", None)
 settings["data"], settings["out"] = Path(settings["data"]), Path(settings["out"])
 train(TrainingConfig.of(settings), lambda done, total, note: done == kill_at and os._exit(9))
@@ -59,12 +60,11 @@ def bins(settings, monkeypatch) -> dict:
 
 def run_in_processes(count: int, settings: dict) -> Path:
     """Train in so many processes, as `torchrun` starts them; with "kill_at" the first one dies then."""
-    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
-    argument = json.dumps([config_to_dict(presets.PRESETS["tiny-bins"]()), plain])
+    arguments = script_arguments(settings)
     port = str(29_000 + os.getpid() % 5000)
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", TRAIN, argument],
+            [sys.executable, *arguments],
             env={
                 **os.environ,
                 "RANK": str(rank),
@@ -87,6 +87,12 @@ def run_in_processes(count: int, settings: dict) -> Path:
     codes = [process.returncode for process in processes]
     assert all(codes) if "kill_at" in settings else not any(codes), errors
     return Path(settings["out"])
+
+
+def script_arguments(settings: dict) -> list[str]:
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
+    sizes = config_to_dict(presets.PRESETS[settings["preset"]]())
+    return ["-c", TRAIN, json.dumps([sizes, plain])]
 
 
 def losses(run: Path) -> list[dict]:
@@ -125,6 +131,20 @@ def test_a_run_of_two_processes_resumes_with_one(bins, tmp_path, sharding) -> No
     run_in_processes(2, {**torn, "kill_at": 4})
     assert sorted(path.name for path in (tmp_path / "torn/checkpoints").glob("2-*"))[-1].endswith("000003")
     assert_alike(whole, train(TrainingConfig.of(torn)))
+
+
+def test_processes_share_contrastive_pretraining(settings, tmp_path) -> None:
+    settings |= {"pretraining.hard_negative_prob": 0.5, "schedule.steps": 1}
+    one = train(TrainingConfig.of({**settings, "out": tmp_path / "one"}))
+    shared = {**settings, "out": tmp_path / "two"}
+    with joined_by(1, script_arguments(shared)):
+        two = train(TrainingConfig.of(shared))
+    assert "WORLD_SIZE" not in os.environ
+    pairs = [(a, b) for a, b in zip(losses(one), losses(two), strict=True) if a["name"] == "1-pretraining"]
+    assert len(pairs) == 4  # two checkpoints
+    for a, b in pairs:
+        assert a.pop("name") == b.pop("name")
+        assert a == pytest.approx(b, rel=1e-3)
 
 
 def test_loader_workers_and_gradient_accumulation_change_only_the_last_bits(bins, tmp_path) -> None:

@@ -6,6 +6,7 @@ DDP replicates the network in every process. FSDP2 shards weights, gradients and
 import contextlib
 import datetime
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -56,7 +57,10 @@ class Parallel:
             return _sharded(module, self.device)
         ids = [self.device.index] if self.device.type == "cuda" else None
         # Processes may call it different numbers of times; no buffer changes in training.
-        return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
+        with warnings.catch_warnings():
+            # Its successor does not exist in the oldest torch that is allowed.
+            warnings.filterwarnings("ignore", "`broadcast_buffers` is deprecated", FutureWarning)
+            return nn.parallel.DistributedDataParallel(module, device_ids=ids, broadcast_buffers=False)
 
     @contextlib.contextmanager
     def synchronized(self, module: nn.Module, *, last: bool) -> Iterator[None]:
@@ -100,12 +104,10 @@ class Parallel:
         """
         if self.num_ranks == 1:
             return function(rows_N)
-        from torch.distributed.nn.functional import all_gather
-
         size = -(-len(rows_N) // self.num_ranks)
         missing = rows_N.new_zeros(size * self.num_ranks - len(rows_N), *rows_N.shape[1:])
         part = torch.cat([rows_N, missing])[self.rank * size : (self.rank + 1) * size]
-        return torch.cat(all_gather(function(part)))[: len(rows_N)]
+        return _Gathered.apply(function(part), self)[: len(rows_N)]
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
         """Average gradients over all processes."""
@@ -120,6 +122,23 @@ class Parallel:
         """Wait for all processes."""
         if self.num_ranks > 1:
             dist.barrier()
+
+
+class _Gathered(torch.autograd.Function):
+    """Concatenates the rows of all processes, each of which goes on to the same loss."""
+
+    @staticmethod
+    def forward(ctx: Any, part_NX: torch.Tensor, parallel: Parallel) -> torch.Tensor:
+        ctx.parallel, ctx.size = parallel, len(part_NX)
+        parts = [torch.empty_like(part_NX) for _ in range(parallel.num_ranks)]
+        dist.all_gather(parts, part_NX.contiguous())
+        return torch.cat(parts)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
+        # All processes have the same gradient of the whole; their parts are averaged afterwards.
+        own = gradients[0][ctx.parallel.rank * ctx.size :][: ctx.size]
+        return own * ctx.parallel.num_ranks, None
 
 
 ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))
