@@ -97,6 +97,17 @@ def test_descriptions_in_text_prompts_are_words():
     assert set(words(changed.text)) == {UNKNOWN}
 
 
+def test_the_attribute_of_a_comparison_is_swapped_and_nothing_else():
+    for task, level, other in (("same_texture", "L4", "profile"), ("same_shape", "L1", "texture")):
+        env = TabletopEnv(task, level=level, domain="user", prompts="text")
+        env.reset(seed=0)
+        own, text = env.prompt.text.split(), ablate(env, "swapped_attribute").prompt.text.split()
+        assert [(a, b) for a, b in zip(own, text, strict=True) if a != b] == [(own[6], other)]
+    config = EvaluationConfig(("untrained",), episodes=1)
+    of = {task for task, _ in cells(config, "swapped_attribute")}
+    assert of == {"same_texture", "same_shape"}
+
+
 class Noting(RandomPolicy):
     """Notes the prompts; its actions depend on nothing."""
 
@@ -163,6 +174,7 @@ def test_moved_boxes_follow_from_the_episode_and_change_the_actions_of_networks_
         ("text_prompts+paraphrased_prompts", "exclude each other"),
         ("detected_boxes+noisy_boxes:3", "exclude each other"),
         ("masked_words:0.2+masked_words:0.4", "exclude each other"),
+        ("swapped_attribute+held_out_phrasings", "exclude each other"),
         ("+".join(["no_prompt"] * 50), "at most 200 are allowed"),
         ("", "empty"),
     ],

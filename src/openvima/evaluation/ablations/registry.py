@@ -20,7 +20,14 @@ from openvima.evaluation.ablations.environments import (
 from openvima.evaluation.ablations.images import NEUTRAL_PROMPT, with_images_of_another
 from openvima.evaluation.ablations.inputs import AblatedInput
 from openvima.evaluation.ablations.objects import jittered, shuffled
-from openvima.evaluation.ablations.words import gibberish, masked, scrambled, swapped
+from openvima.evaluation.ablations.words import (
+    gibberish,
+    masked,
+    names_attribute,
+    scrambled,
+    swapped,
+    with_other_attribute,
+)
 from openvima.evaluation.in_context import in_context_prompt
 from openvima.evaluation.oracle_demonstration import demonstrated
 from openvima.evaluation.phrasings import has_phrasings, in_held_out_phrasing
@@ -76,7 +83,7 @@ class InputAblation:
         environment: Changes the settings of the environment.
         takes: Whether it applies to a task, given the changed settings; None for all tasks.
         rate: The rate it takes; None for none.
-        exclusive: What only one ablation of several can set: "prompts" (their form) or "boxes".
+        exclusive: What only one ablation of several can set: "prompts" (their form), "words" or "boxes".
         changes_scenes: Whether a seed stands for another scene.
     """
 
@@ -172,6 +179,14 @@ INPUT_ABLATIONS = {
                 ),
             ),
             takes=lambda task, env_config: has_phrasings(task),
+            exclusive="words",
+        ),
+        InputAblation(
+            "swapped_attribute",
+            'The prompt asks for the same profile in place of "the same texture", and the other way round.',
+            _in_words(lambda text, rate, rng: with_other_attribute(text)),
+            takes=lambda task, env_config: names_attribute(task),
+            exclusive="words",
         ),
         InputAblation(
             "scrambled_words",

@@ -13,9 +13,11 @@ from functools import cache
 import numpy as np
 
 from openvima.policies.tokenizer import UNKNOWN, benchmark_vocabulary
+from openvima.tasks.registry import task_spec
 
 _SLOT_OR_WORD = re.compile(rf"\{{\w+\}}|{UNKNOWN}|[^\W\d_]+(?:-[^\W\d_]+)*|[0-9]+")
 _SLOT_OR_PIECE = re.compile(r"\{\w+\}|[A-Za-z]+(?:-[A-Za-z]+)*|\d+|\S")
+_COMPARED = re.compile(r"(?<=\bsame )(texture|profile)\b")
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 
@@ -70,6 +72,21 @@ def scrambled(text: str, rng: np.random.Generator) -> str:
     pieces = _SLOT_OR_PIECE.findall(text)
     drawn = rng.choice(_benchmark_words(), len(pieces)).tolist()
     return " ".join(piece if piece[0] == "{" else word for piece, word in zip(pieces, drawn, strict=True))
+
+
+def with_other_attribute(text: str) -> str:
+    """Compare objects by the other attribute: by profile in place of texture, by texture in place of profile.
+
+    Example:
+        >>> with_other_attribute("Put all objects with the same texture as {a} into it.")
+        'Put all objects with the same profile as {a} into it.'
+    """
+    return _COMPARED.sub(lambda found: "profile" if found[0] == "texture" else "texture", text)
+
+
+def names_attribute(task: str) -> bool:
+    """Whether the prompt of a task says by which attribute objects are compared."""
+    return _COMPARED.search(task_spec(task).template) is not None
 
 
 def _words(text: str) -> list[re.Match[str]]:
