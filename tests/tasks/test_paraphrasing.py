@@ -8,7 +8,7 @@ from openvima.env import TabletopEnv
 from openvima.evaluation.ablations import ablate
 from openvima.evaluation.phrasings import held_out_phrasings
 from openvima.scene.prompt import PLACEHOLDER
-from openvima.tasks import task_spec
+from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.paraphrasing import rephrased, training_paraphrases
 
 TASKS = ("visual_manipulation", "rotate", "scene_understanding", "same_shape", "rearrange")
@@ -26,7 +26,7 @@ def test_phrasings_have_the_slots_of_their_task():
     for phrasings in (held_out, training_paraphrases()):
         for task, templates in phrasings.items():
             slots = set(PLACEHOLDER.findall(task_spec(task).template))
-            assert all(sorted(PLACEHOLDER.findall(each)) == sorted(slots) for each in templates)
+            assert all(set(PLACEHOLDER.findall(each)) == slots for each in templates)
 
 
 def test_no_held_out_phrasing_is_trained_on():
@@ -59,6 +59,25 @@ def test_each_prompt_of_the_task_can_be_put_in_other_words(task, prompts):
         )
         seen.add(text)
     assert len(seen) > 1
+
+
+@pytest.mark.parametrize("task", sorted(training_paraphrases()))
+def test_prompts_of_training_tasks_follow_their_template(task):
+    (phrasing, *_), template = training_paraphrases()[task], task_spec(task).template
+    prompts = [
+        sample_episode(task, level="train", domain="user", seed=seed).problem.prompt for seed in range(4)
+    ]
+    said = [rephrased(prompt.text, template, phrasing) for prompt in prompts]
+    assert any(said)  # the definitions of novel_noun come in either order, and the template has one
+    for prompt, text in zip(prompts, said, strict=True):
+        assert text is None or set(PLACEHOLDER.findall(text)) == {name for name, _ in prompt.images}
+
+
+def test_a_slot_that_occurs_twice_has_one_value_and_an_adverb_may_be_empty():
+    template = "This is a {n} {a}. Put the {adv}{n} {a} here."
+    assert rephrased("This is a wug {a}. Put the wug {a} here.", template, "{adv}|{n}") == "|wug"
+    assert rephrased("This is a wug {a}. Put the less wug {a} here.", template, "{adv}|{n}") == "less |wug"
+    assert rephrased("This is a wug {a}. Put the dax {a} here.", template, "{n}") is None
 
 
 def test_text_of_another_form_has_no_phrasing():

@@ -17,10 +17,10 @@ from openvima.perception.preprocessing import split_prompt  # noqa: E402
 from openvima.policies.processor import Processor  # noqa: E402
 from openvima.policies.tokenizer import Vocabulary, WordTokenizer  # noqa: E402
 from openvima.scene import ObjectRecord  # noqa: E402
-from openvima.tasks.prompts import described, description_of, image_descriptions  # noqa: E402
+from openvima.tasks.prompts import described, description_of, image_descriptions, synonyms  # noqa: E402
 from openvima.training import sequence_lengths  # noqa: E402
 from openvima.training.augmentation.demonstrations import demonstration_augmentation  # noqa: E402
-from openvima.training.augmentation.describe_objects import text_of, with_descriptions  # noqa: E402
+from openvima.training.augmentation.describe_objects import text_of, with_descriptions, with_synonyms  # noqa: E402
 from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
 from openvima.training.dataset import Example  # noqa: E402
@@ -73,6 +73,18 @@ def test_each_image_is_replaced_with_that_probability_and_the_others_stay(demos)
     for name in rows:
         assert 0.65 < np.mean([name in names for names in shown]) < 0.85
     assert len(set(shown)) == 4  # independently
+
+
+def test_synonyms_are_aliases_of_the_catalogue(demos) -> None:
+    assert synonyms("red shorter block") == synonyms("red block") == ("red cube",)
+    assert synonyms("red L-shaped block") == ("red L-shape",)
+    assert synonyms("red small block") == synonyms("cyan thing") == ()
+    episode = replace(
+        preprocess(demos["visual_manipulation"], "objects"), descriptions={"a": "block", "b": "pan"}
+    )
+    said = [with_synonyms(episode, 0.5, np.random.default_rng(seed)).descriptions for seed in range(60)]
+    assert {each["b"] for each in said} == {"pan"}
+    assert 0.3 < np.mean([each["a"] == "cube" for each in said]) < 0.7
 
 
 def test_names_that_no_prompt_can_hold_keep_their_image(demos) -> None:

@@ -28,7 +28,8 @@ def rephrased(text: str, template: str, phrasing: str) -> str | None:
 
     Args:
         text: The text; images keep their placeholders, or descriptions are in place of them.
-        template: The template that it follows, such as "Rotate the {dragged_obj} {angle} degrees.".
+        template: The template that it follows, such as "Rotate the {dragged_obj} {angle} degrees."; a slot
+            that occurs twice has one value.
         phrasing: Another template with the same slots.
 
     Returns:
@@ -44,7 +45,15 @@ def rephrased(text: str, template: str, phrasing: str) -> str | None:
 
 @lru_cache
 def _pattern(template: str) -> re.Pattern[str]:
-    pieces = PLACEHOLDER.split(template)
-    # Greedy: of "the red letter A 30 degrees" the first slot takes all words but the last.
-    parts = (f"(?P<{piece}>.+)" if place % 2 else re.escape(piece) for place, piece in enumerate(pieces))
-    return re.compile("".join(parts))
+    pattern, known = "", set[str]()
+    for place, piece in enumerate(PLACEHOLDER.split(template)):
+        if not place % 2:
+            pattern += re.escape(piece)
+        elif piece in known:
+            pattern += f"(?P={piece})"
+        else:
+            # Greedy: of "the red letter A 30 degrees" the first slot takes all words but the last. An adverb
+            # may be empty: "the {adv}{novel_adj} {dragged_obj}".
+            pattern += f"(?P<{piece}>.*)"
+            known.add(piece)
+    return re.compile(pattern)

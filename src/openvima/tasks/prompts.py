@@ -113,6 +113,19 @@ def description_of(record: ObjectRecord) -> str:
     return text if len(text) <= _MAX_NAMES and not {"{", "}"} & set(text) else ""
 
 
+def synonyms(description: str) -> tuple[str, ...]:
+    """Return the other descriptions of an object, by the aliases of its name.
+
+    Example:
+        >>> synonyms("red L-shaped block")
+        ('red L-shape',)
+    """
+    specs = {**REGISTERED_OBJECTS, **OBJECTS}
+    # The longest name that fits: "L-shaped block", not "block".
+    noun = max((name for name in specs if f" {description}".endswith(f" {name}")), key=len, default="")
+    return tuple(description.removesuffix(noun) + alias for alias in specs[noun].aliases) if noun else ()
+
+
 def _nouns(
     shown: Mapping[str, Placement | ObjectRecord | None], prompts: str, rng: np.random.Generator
 ) -> dict[str, str]:

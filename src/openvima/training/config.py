@@ -214,6 +214,7 @@ class AugmentationConfig:
             whose prompts allow it.
         text_description_prob: Probability for each object image of a task's prompt of the text "red swirl
             letter A" in its place.
+        synonym_prob: Probability that such a text names the object by an alias of the catalogue ("cube").
         paraphrase_prob: Probability of another phrasing of a task's prompt, of those in
             `tasks/paraphrases.yaml`.
         unknown_word_prob: Probability for each word of a task's prompt of the unknown token in its place, so
@@ -227,6 +228,7 @@ class AugmentationConfig:
     shuffle_sentences_prob: Probability = 0.0
     distractor_prob: Probability = 0.0
     text_description_prob: Probability = 0.0
+    synonym_prob: Probability = 0.0
     paraphrase_prob: Probability = 0.0
     unknown_word_prob: Probability = 0.0
 

@@ -10,7 +10,7 @@ from openvima.perception.preprocessing import split_prompt
 from openvima.scene import ObjectRecord
 from openvima.tasks.novel_words import NOUNS
 from openvima.tasks.paraphrasing import training_paraphrases
-from openvima.tasks.prompts import description_of
+from openvima.tasks.prompts import description_of, synonyms
 from openvima.training.augmentation.describe_objects import text_of
 from openvima.training.augmentation.inverse_dynamics import motion_text
 from openvima.training.augmentation.prompt_images import DEFINITION
@@ -37,7 +37,10 @@ def training_texts(
     if augmentation.inverse_dynamics_prob:
         prompts.add(motion_text(1))
     if augmentation.text_description_prob:
-        prompts.update(map(text_of, _descriptions(dataset)))
+        descriptions = _descriptions(dataset)
+        prompts.update(map(text_of, descriptions))
+        if augmentation.synonym_prob:
+            prompts.update(text_of(other) for each in descriptions for other in synonyms(each))
     if augmentation.paraphrase_prob:
         tasks = set(dataset.index.column("task").to_pylist())
         prompts.update(text for task in tasks for text in training_paraphrases().get(task, ()))

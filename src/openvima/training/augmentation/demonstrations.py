@@ -88,7 +88,8 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             Randomly(config.paraphrase_prob, paraphrased),  # before others change the text
             Randomly(config.rename_objects_prob, renamed),
             Randomly(config.shuffle_sentences_prob, shuffled),
-            DescribeObjects(config.text_description_prob),  # after those that look for images
+            # after those that look for images
+            DescribeObjects(config.text_description_prob, config.synonym_prob),
             UnknownWords(config.unknown_word_prob),
         ),
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openvima.data.object_cache.episode import PreprocessedEpisode
-from openvima.tasks.prompts import with_phrases
+from openvima.tasks.prompts import synonyms, with_phrases
 from openvima.training.augmentation.prompt_images import images_by_name, with_prompt
 from openvima.training.dataset import Example
 
@@ -23,15 +23,20 @@ class DescribeObjects:
 
     Args:
         prob: Probability for each image.
+        synonym_prob: Probability that a description names the object by an alias of the catalogue.
     """
 
     prob: float
+    synonym_prob: float = 0.0
 
     def __call__(self, example: Example, rng: np.random.Generator) -> Example:
         """Augment a demonstration."""
         if not self.prob:
             return example
-        return replace(example, content=with_descriptions(example.episode, self.prob, rng))
+        episode = example.episode
+        if self.synonym_prob:
+            episode = with_synonyms(episode, self.synonym_prob, rng)
+        return replace(example, content=with_descriptions(episode, self.prob, rng))
 
 
 def with_descriptions(
@@ -50,6 +55,21 @@ def with_descriptions(
         return episode
     text = with_phrases(episode.prompt.text, {name: episode.descriptions[name] for name in chosen})
     return with_prompt(episode, text, images_by_name(episode.prompt))
+
+
+def with_synonyms(episode: PreprocessedEpisode, prob: float, rng: np.random.Generator) -> PreprocessedEpisode:
+    """Replace the names in some descriptions by aliases; those of objects without any stay.
+
+    Args:
+        episode: The demonstration.
+        prob: Probability for each description.
+        rng: Draws descriptions and aliases.
+    """
+    said = dict(episode.descriptions)
+    for name, draw, choice in zip(said, rng.random(len(said)), rng.random(len(said)), strict=True):
+        if draw < prob and (others := synonyms(said[name])):
+            said[name] = others[int(choice * len(others))]
+    return replace(episode, descriptions=said)
 
 
 def text_of(description: str) -> str:
