@@ -51,7 +51,6 @@ def scenes_of(shape: str, num_scenes: int) -> Pairs:
     rng = np.random.default_rng([SEED, *shape.encode()])
     rasteriser = Rasteriser(load_assets("procedural"))
     rows: list[tuple] = []
-    indices: dict[tuple, int] = {}
     for number in range(num_scenes):
         textures = rng.choice(TEXTURE_SETS["T"], size=len(POSITIONS_Y), replace=False)
         scene = Scene(
@@ -60,7 +59,7 @@ def scenes_of(shape: str, num_scenes: int) -> Pairs:
                 for k, y in enumerate(POSITIONS_Y)
             )
         )
-        rows += pairs_of_scene(scene, {}, rasteriser, indices, number, rearranged(scene, rng))
+        rows += pairs_of_scene(scene, {}, rasteriser, number, rearranged(scene, rng))
     return stacked(rows)
 
 

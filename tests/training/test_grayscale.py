@@ -40,7 +40,7 @@ def rasteriser() -> Rasteriser:
 
 
 def pairs_of(rasteriser: Rasteriser, *placements: Placement, is_grayscale=()) -> Pairs:
-    return stacked(pairs_of_scene(Scene(placements), {}, rasteriser, {}, 0, is_grayscale=is_grayscale))
+    return stacked(pairs_of_scene(Scene(placements), {}, rasteriser, 0, is_grayscale=is_grayscale))
 
 
 def drawn(augmentation: SceneAugmentation, seed: int = 0) -> Pairs:

@@ -13,9 +13,10 @@ from openvima.policies.nn.object_encoder import ObjectEncoder, ObjectEncoderConf
 from openvima.tasks import sample_episode  # noqa: E402
 from openvima.training.augmentation.appearance_randomization import ShapeKinds, with_random_appearance  # noqa: E402
 from openvima.training.augmentation.channel_mixing import channel_mixing  # noqa: E402
+from openvima.training.parallel import Parallel  # noqa: E402
 from openvima.training.pretraining import pairs as pairs_module  # noqa: E402
 from openvima.training.pretraining.contrastive import contrastive_loss, retrieval_accuracy  # noqa: E402
-from openvima.training.pretraining.pairs import render_pairs  # noqa: E402
+from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs  # noqa: E402
 from openvima.training.schedule import step_generator  # noqa: E402
 
 TASKS = ("rotate", "sweep_without_exceeding", "visual_manipulation")
@@ -53,6 +54,28 @@ def test_pairs_follow_from_the_seed():
     assert first.scene_crops.shape != other.scene_crops.shape or not torch.equal(
         first.scene_crops, other.scene_crops
     )
+
+
+def test_processes_share_the_scenes(monkeypatch):
+    """Gathering their rows is tested in `test_parallel.py`."""
+    monkeypatch.setattr(Parallel, "rows_of_all", lambda self, rows: rows)
+    one, *parts = (
+        render_pairs(
+            TASKS,
+            num_scenes=5,
+            seed=0,
+            assets="procedural",
+            augmentation=SceneAugmentation(second_view=True),
+            with_attributes=True,
+            parallel=Parallel(rank, count, torch.device("cpu")),
+        )
+        for rank, count in ((0, 1), (0, 2), (1, 2))
+    )
+    assert one.scenes.unique().tolist() == list(range(5))
+    for name in ("scene_crops", "appearances", "scenes", "shapes"):
+        assert torch.equal(getattr(one, name), torch.cat([getattr(part, name) for part in parts]))
+    categories = [part.attributes.categories for part in (one, *parts)]
+    assert torch.equal(categories[0], torch.cat(categories[1:]))
 
 
 def test_channel_mixing_keeps_grey():

@@ -136,7 +136,7 @@ def test_rotations_are_those_between_the_headings():
 def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, math.pi / 2)),))
     rasteriser = Rasteriser(load_assets("procedural"))
-    rows = pairs_of_scene(scene, {}, rasteriser, {}, 0, (scene, {5: 0.0}))
+    rows = pairs_of_scene(scene, {}, rasteriser, 0, (scene, {5: 0.0}))
     drawn = stacked(rows)
     assert drawn.second_view.rotations.tolist() == [[0.0, 0.0]]
     red = (drawn.prompt_crops[0, 1, 0] == 255) & (drawn.prompt_crops[0, 1, 1] == 87)
@@ -146,7 +146,7 @@ def test_without_rotation_prompt_image_and_scene_have_the_same_crop():
 
 def test_rotations_from_prompt_images_follow_from_the_heading():
     scene = Scene((Placement(5, "letter A", "red", (0, 0, 0), Pose.planar(0.5, 0.0, 2.0)),))
-    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.5}))
+    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.5}))
     np.testing.assert_allclose(stacked(rows).second_view.rotations[0], [2.0 - math.pi / 2, 0.5], rtol=1e-6)
 
 
@@ -157,7 +157,7 @@ def test_a_mirrored_image_is_that_of_a_mirrored_heading(yaw):
     crops = []
     for heading in (yaw, -yaw - math.pi):
         scene = Scene((Placement(5, "letter T", "red", (0, 0, 0), Pose.planar(0.5, 0.0, heading)),))
-        rows = pairs_of_scene(scene, {}, rasteriser, {}, 0)
+        rows = pairs_of_scene(scene, {}, rasteriser, 0)
         crops.append(stacked(rows).scene_crops[0, :, 0].float())
     difference = (crops[0].flip(-1) - crops[1]).abs()
     assert difference.mean() < 0.35 * (crops[0] - crops[1]).abs().mean()
@@ -167,7 +167,7 @@ def test_objects_of_other_height_are_other_appearances():
     low = Placement(5, "heart", "red", (0, 0, 0), Pose.planar(0.5, 0.1))
     high = replace(low, id=6, scale=(1.0, 1.0, 2.0), pose=Pose.planar(0.5, -0.1))
     scene = Scene((low, high))
-    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), {}, 0, (scene, {5: 0.0, 6: 0.0}))
+    rows = pairs_of_scene(scene, {}, Rasteriser(load_assets("procedural")), 0, (scene, {5: 0.0, 6: 0.0}))
     first, second = stacked(rows).appearances.tolist()
     assert first != second
     assert len(set(stacked(rows).shapes.tolist())) == 1

@@ -95,6 +95,23 @@ class Parallel:
         names = {name: None for part in everywhere for name in part}
         return {name: sum(part.get(name, 0.0) for part in everywhere) / self.num_ranks for name in names}
 
+    def part_of(self, count: int) -> range:
+        """Return which of so many numbers are this process's; those of the next process follow."""
+        return range(self.rank * count // self.num_ranks, (self.rank + 1) * count // self.num_ranks)
+
+    def rows_of_all(self, rows_N: torch.Tensor) -> torch.Tensor:
+        """Concatenate the rows of all processes, on their device."""
+        if self.num_ranks == 1:
+            return rows_N
+        counts = [torch.tensor(0, device=self.device) for _ in range(self.num_ranks)]
+        dist.all_gather(counts, torch.tensor(len(rows_N), device=self.device))
+        lengths = [int(count) for count in counts]
+        longest = rows_N.new_zeros(max(lengths), *rows_N.shape[1:])
+        longest[: len(rows_N)] = rows_N
+        parts = [torch.empty_like(longest) for _ in lengths]
+        dist.all_gather(parts, longest)
+        return torch.cat([part[:length] for part, length in zip(parts, lengths, strict=True)])
+
     def in_parts(
         self, function: Callable[[torch.Tensor], torch.Tensor], rows_N: torch.Tensor
     ) -> torch.Tensor:

@@ -145,11 +145,10 @@ class _Stages:
             ),
             with_attributes=with_attributes,
             report=self._say,
+            parallel=self.parallel,
         )
         encode = self.learner.processor.tokenizer.encode
-        return ContrastivePretraining(
-            network, config, self.config.seed, pairs.to(self.parallel.device), self.parallel, encode
-        )
+        return ContrastivePretraining(network, config, self.config.seed, pairs, self.parallel, encode)
 
     def _behaviour_cloning(self) -> Stage:
         self.trainer.report(f"reading {len(self.dataset)} demonstrations")

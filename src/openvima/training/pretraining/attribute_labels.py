@@ -1,5 +1,6 @@
 """What rendered objects are like: labels of the attributes in which contrastive pretraining compares them."""
 
+import hashlib
 import math
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,6 @@ from openvima.catalog.random_pack import is_random
 from openvima.policies.nn.tensor_record import TensorRecord
 from openvima.scene import Placement
 
-_CATEGORIES = ("texture", "shape", "profile")
 _NUM_LEVELS = 4  # of each channel of a colour histogram
 _NUM_DIRECTIONS = 72
 _CORNERS = slice(_NUM_DIRECTIONS // 8, None, _NUM_DIRECTIONS // 4)  # the four diagonals
@@ -26,7 +26,7 @@ class AttributeLabels(TensorRecord):
     """What K objects are like in their prompt image and in their scene.
 
     Args:
-        categories: Index of texture, shape and profile, shape (K, 2, 3), int64.
+        categories: `name_id` of texture, shape and profile, shape (K, 2, 3), int64.
         colours: Histograms of colours, shape (K, 2, 64), float32.
         lengths: Height, and mean width of the footprint, in metres; NaN if magnified. Shape (K, 2, 2),
             float32.
@@ -40,7 +40,7 @@ class AttributeLabels(TensorRecord):
 
 
 class AttributeLabeller:
-    """Labels placements; indices of categories count through all calls.
+    """Labels placements.
 
     Args:
         assets: Source of shapes and textures.
@@ -48,7 +48,6 @@ class AttributeLabeller:
 
     def __init__(self, assets: Assets) -> None:
         self._assets = assets
-        self._indices: dict[tuple[str, str], int] = {}
         self._colours: dict[str, np.ndarray] = {}
 
     def __call__(
@@ -59,18 +58,22 @@ class AttributeLabeller:
         # Ears are drawn after the container of the same seed; they change its outline, and not its profile.
         body = replace(placement, object=placement.object.replace("random eared", "random"))
         names = (placement.texture, placement.object, profile(body.object, self._vertices(body)))
-        keys = zip(_CATEGORIES, names, strict=True)
-        categories = [self._indices.setdefault(key, len(self._indices)) for key in keys]
         if placement.texture not in self._colours:
             self._colours[placement.texture] = _histogram(self._assets.texture(placement.texture))
         # The mean width of a footprint is twice its mean reach, whatever the middle.
         lengths = [np.ptp(vertices[:, 2]), 2 * _reach(vertices[:, :2]).mean()]
         known = np.array(lengths, np.float32) if not is_magnified else np.full(2, np.nan, np.float32)
-        return np.array(categories), self._colours[placement.texture], known
+        return np.array([name_id(name) for name in names]), self._colours[placement.texture], known
 
     def _vertices(self, placement: Placement) -> np.ndarray:
         mesh = self._assets.geometry(placement.object, placement.size, placement.scale).visual
         return mesh.vertices.reshape(-1, 3)
+
+
+def name_id(*names: str) -> np.int64:
+    """Return a number for names, the same in every process; different names have different ones."""
+    digest = hashlib.blake2b("/".join(names).encode(), digest_size=8).digest()
+    return np.int64(int.from_bytes(digest, "little") >> 1)
 
 
 def profile(object_name: str, vertices: np.ndarray) -> str:

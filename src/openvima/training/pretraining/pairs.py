@@ -16,7 +16,7 @@ from openvima.catalog.packs import load_assets
 from openvima.catalog.partitions import Pool
 from openvima.catalog.random_pack import RandomAppearanceAssets, has_visible_heading
 from openvima.perception.objects import ObjectViews, extract_objects, observe_prompt_image
-from openvima.policies.nn.tensor_record import TensorRecord
+from openvima.policies.nn.tensor_record import TensorRecord, map_tensors
 from openvima.render.rasteriser import PROMPT_POSE, Rasteriser
 from openvima.scene import Episode, ObjectImage, Placement, Prompt, Scene
 from openvima.tasks import sample_episode, task_spec
@@ -24,7 +24,8 @@ from openvima.training.augmentation.appearance_randomization import ShapeKinds, 
 from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
 from openvima.training.augmentation.hard_negatives import with_hard_negatives
 from openvima.training.augmentation.rearranged_view import rearranged
-from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels
+from openvima.training.parallel import ONE_PROCESS, Parallel
+from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels, name_id
 from openvima.training.schedule import step_seed
 
 _NUM_COLUMNS, _NUM_VIEW_COLUMNS = 8, 3  # of `Pairs` without its other records, and of `SecondView`
@@ -56,9 +57,9 @@ class Pairs(TensorRecord):
         prompt_masks: Whether it is visible in the view, shape (K, 2), bool.
         scene_crops: Shape (K, 2, 3, 32, 32), uint8.
         scene_masks: Shape (K, 2), bool.
-        appearances: Index of its pair of shape and texture, shape (K,), int64.
+        appearances: `name_id` of its pair of shape and texture, shape (K,), int64.
         scenes: Index of its scene, shape (K,), int64.
-        shapes: Index of its shape, shape (K,), int64.
+        shapes: `name_id` of its shape, shape (K,), int64.
         is_grayscale: Whether its prompt image is grayscale and matches by shape, shape (K,), bool.
         second_view: The objects in the rearranged view; None if there is none.
         attributes: What the objects are like; None if they are not labelled.
@@ -126,8 +127,11 @@ def render_pairs(
     augmentation: SceneAugmentation = NO_AUGMENTATION,
     with_attributes: bool = False,
     report: Callable[[int, int, str], None] | None = None,
+    parallel: Parallel = ONE_PROCESS,
 ) -> Pairs:
     """Sample and render scenes, and prompt images of all objects in them.
+
+    The pairs do not depend on the number of processes.
 
     Args:
         tasks: Tasks whose training partition and layouts are used, in turn.
@@ -137,15 +141,16 @@ def render_pairs(
         augmentation: Augmentation of the scenes.
         with_attributes: Label what objects are like; needs a second view.
         report: Called with scenes done, scenes in all, and a note.
+        parallel: Processes that share the scenes; each returns all pairs, on its device.
     """
     pack = load_assets(assets)
     rasteriser = Rasteriser(RandomAppearanceAssets(pack))
     labeller = AttributeLabeller(rasteriser.assets) if with_attributes else None
     pools = {task: task_spec(task).pool("train") for task in tasks}
     shades = {name for names in pools.values() for name in names.dragged_textures}
-    indices: dict[tuple, int] = {}
     rows: list[tuple] = []
-    for number in range(num_scenes):
+    numbers = parallel.part_of(num_scenes)
+    for number in numbers:
         task = tasks[number % len(tasks)]
         episode_seed = step_seed(seed, "pretraining scene", number)
         episode = sample_episode(task, level="train", seed=episode_seed, domain=_DOMAIN, assets=pack)
@@ -157,18 +162,11 @@ def render_pairs(
         is_grayscale = draw_grayscale(len(scene.placements), augmentation.grayscale_prob, rng)
         magnifications = _magnifications(episode)
         rows += pairs_of_scene(
-            scene,
-            magnifications,
-            rasteriser,
-            indices,
-            number,
-            view,
-            is_grayscale=is_grayscale,
-            labeller=labeller,
+            scene, magnifications, rasteriser, number, view, is_grayscale=is_grayscale, labeller=labeller
         )
         if report and number % 50 == 0:
-            report(number, num_scenes, "rendering scenes")
-    return stacked(rows)
+            report(number - numbers.start, len(numbers), "rendering scenes")
+    return map_tensors(stacked(rows).to(parallel.device), parallel.rows_of_all)
 
 
 def stacked(rows: Sequence[tuple]) -> Pairs:
@@ -187,7 +185,6 @@ def pairs_of_scene(
     scene: Scene,
     magnifications: Mapping[str, float],
     rasteriser: Rasteriser,
-    indices: dict[tuple, int],
     number: int,
     second_view: tuple[Scene, dict[int, float]] | None = None,
     *,
@@ -200,8 +197,6 @@ def pairs_of_scene(
         scene: The scene.
         magnifications: Magnification of prompt images by object name; 1 for others.
         rasteriser: Renders.
-        indices: Indices of appearances, by object and texture (with a second view also by scale, since hard
-            negatives may be stretched), and of shapes, by object. New ones are added.
         number: Index of the scene.
         second_view: The rearranged scene, and rotations by object id.
         is_grayscale: For each object of the scene whether its prompt image is grayscale; none by default.
@@ -223,17 +218,16 @@ def pairs_of_scene(
             magnifications.get(placement.object, 1.0),
         )
         prompt = _prompt_image(shown, magnification, rasteriser)
-        key = (placement.object, placement.texture, *(placement.scale if second_view else ()))
-        appearance = indices.setdefault(key, len(indices))
-        shape = indices.setdefault((placement.object,), len(indices))
+        # Hard negatives, which come with a second view, may be stretched.
+        scale = placement.scale if second_view else ()
         pair = (
             prompt.crops[:, 0],
             prompt.masks[:, 0],
             seen.crops[:, slot],
             seen.masks[:, slot],
-            np.int64(appearance),
+            name_id(placement.object, placement.texture, *map(str, scale)),
             np.int64(number),
-            np.int64(shape),
+            name_id(placement.object),
             np.bool_(is_gray),
         )
         if second_view and seen_again:
