@@ -169,7 +169,9 @@ def test_every_option_named_in_the_text_exists(page: Path) -> None:
 
 def benchmark_options() -> frozenset[str]:
     """Return the options that scripts beside the package declare."""
-    scripts = [*ROOT.glob("benchmarks/*.py"), *ROOT.glob("experiments/*/*.py")]
+    scripts = [
+        path for folder in ("benchmarks", "examples", "experiments/*") for path in ROOT.glob(f"{folder}/*.py")
+    ]
     return frozenset(
         option
         for script in scripts

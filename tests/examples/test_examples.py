@@ -17,8 +17,12 @@ from openvima.tasks import list_tasks, registry
 from user_shapes import restored_assets
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-# Run in tests of their own: one goes on until it is stopped, others have names or want to be trained.
-APART = ("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy")
+# Run in tests of their own: one goes on until it is stopped, others have names, want to be trained, or need
+# another simulator.
+APART = (
+    *("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy"),
+    "score_in_original_benchmark",
+)
 
 
 @pytest.mark.parametrize(
