@@ -196,6 +196,9 @@ class CausalDecoder(nn.Module):
         mask_BL = torch.cat([segment.mask_BTQ for segment in segments], dim=2).flatten(1)
         valid_BTQ = torch.cat([segment.valid_BTQ for segment in segments], dim=2)
         valid_BL = valid_BTQ.flatten(1)
+        if valid_BL.all():  # as where a single episode acts
+            outputs_BLD, cache = self(cache, sequence_BLD, mask_BL)
+            return outputs_BLD.unflatten(1, valid_BTQ.shape[1:]).split(sizes, dim=2), cache
         order_BP = valid_BL.to(torch.int8).argsort(dim=1, descending=True, stable=True)
         order_BP = order_BP[:, : int(valid_BL.sum(dim=1).max())]
         index_BPD = order_BP[..., None].expand(-1, -1, sequence_BLD.shape[-1])

@@ -130,8 +130,7 @@ class ObjectEncoder(nn.Module):
             Unit vectors, shape (..., N, appearance width); dot products are cosine similarities.
         """
         masked_VNF = features_VNF * masks_VN[..., None].to(features_VNF.dtype)
-        both = torch.cat([masked_VNF[..., v, :, :] for v in range(NUM_VIEWS)], dim=-1)
-        return F.normalize(self.appearance(both), dim=-1)
+        return F.normalize(self.appearance(masked_VNF.transpose(-3, -2).flatten(-2)), dim=-1)
 
     def rotation_between(
         self, features_a: torch.Tensor, features_b: torch.Tensor, masks_a: torch.Tensor, masks_b: torch.Tensor

@@ -36,8 +36,7 @@ class RelativeRotation(nn.Module):
         bins: Number of rotations; bin k is k / bins of a circle, counter-clockwise seen from above.
     """
 
-    cosines_MR: torch.Tensor
-    sines_MR: torch.Tensor
+    waves_2MR: torch.Tensor
 
     def __init__(self, features: int, bins: int) -> None:
         super().__init__()
@@ -48,9 +47,9 @@ class RelativeRotation(nn.Module):
         # computes them, since torch's arithmetic is skipped there.
         harmonics, rotations = np.arange(1, _NUM_HARMONICS + 1), 2 * np.pi * np.arange(bins) / bins
         phases = np.outer(harmonics, rotations)
-        for name, table in (("cosines_MR", np.cos(phases)), ("sines_MR", np.sin(phases))):
-            constant = torch.tensor(table, dtype=torch.float32, device="cpu")
-            self.register_buffer(name, constant, persistent=False)
+        waves = np.concatenate([np.cos(phases), np.sin(phases)])
+        constant = torch.tensor(waves, dtype=torch.float32, device="cpu")
+        self.register_buffer("waves_2MR", constant, persistent=False)
 
     def forward(
         self, features_a: torch.Tensor, features_b: torch.Tensor, masks_a: torch.Tensor, masks_b: torch.Tensor
@@ -67,25 +66,14 @@ class RelativeRotation(nn.Module):
             Log-probabilities of rotations, shape (..., N, R).
         """
         common_VN = masks_a & masks_b
-        top_N = common_VN[..., _TOP, :]
-        by_view = [
-            self._scores(view, features_a[..., v, :, :], features_b[..., v, :, :])
-            for v, view in enumerate(self.views)
-        ]
-        scores = torch.where(top_N[..., None], by_view[_TOP], by_view[_FRONT])
-        scores = scores * common_VN.any(dim=-2)[..., None].to(scores.dtype)
-        return F.log_softmax(scores * self.log_logit_scale.exp(), dim=-1)
-
-    def _scores(self, view: nn.Module, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-        """Similarity after each rotation, shape (..., N, R), in −1 … 1."""
-        x_a, y_a = _harmonics(view(first))
-        x_b, y_b = _harmonics(view(second))
+        both = torch.stack(torch.broadcast_tensors(features_a, features_b))
+        front, top = (view(both[..., v, :, :]) for v, view in enumerate(self.views))
+        values = F.normalize(torch.where(common_VN[..., _TOP, :, None], top, front), dim=-1)
+        real, imaginary = values.unflatten(-1, (2, _NUM_CHANNELS, _NUM_HARMONICS)).unbind(-3)
+        (x_a, x_b), (y_a, y_b) = real.unbind(0), imaginary.unbind(0)
         along = (x_a * x_b + y_a * y_b).sum(dim=-2)
         across = (x_a * y_b - y_a * x_b).sum(dim=-2)
-        return along @ self.cosines_MR.to(along.dtype) + across @ self.sines_MR.to(across.dtype)
-
-
-def _harmonics(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Normalise and split into real and imaginary parts, each (..., C, M)."""
-    parts = F.normalize(values, dim=-1).unflatten(-1, (2, _NUM_CHANNELS, _NUM_HARMONICS))
-    return parts[..., 0, :, :], parts[..., 1, :, :]
+        # Similarity after each rotation, in −1 … 1.
+        scores = torch.cat([along, across], dim=-1) @ self.waves_2MR.to(along.dtype)
+        scores = scores * common_VN.any(dim=-2)[..., None].to(scores.dtype)
+        return F.log_softmax(scores * self.log_logit_scale.exp(), dim=-1)

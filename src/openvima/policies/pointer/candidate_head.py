@@ -20,6 +20,7 @@ from openvima.policies.pointer.candidates import (
     NUM_GEOMETRY,
     GridCandidates,
     PlaceCandidates,
+    distances,
     products,
     proximity,
 )
@@ -234,10 +235,12 @@ class PickPointer(ObjectPointer):
         prompt, num_objects = inputs.prompt.objects, positions_BTN2.shape[2]
         is_other_NN = ~torch.eye(num_objects, dtype=torch.bool, device=positions_BTN2.device)
         others_BTNN = inputs.masks_BTN[:, :, None] & is_other_NN
+        shown_BTNK = distances(positions_BTN2, prompt.positions_BK2[:, None])
+        distance_BTNN = distances(positions_BTN2, positions_BTN2)
         near = [
-            proximity(positions_BTN2, prompt.positions_BK2[:, None], prompt.masks_BK[:, None, None]),
-            proximity(positions_BTN2, positions_BTN2, others_BTNN),
-            proximity(positions_BTN2, positions_BTN2, others_BTNN, _ON_TOP_M),
+            proximity(shown_BTNK, prompt.masks_BK[:, None, None]),
+            proximity(distance_BTNN, others_BTNN),
+            proximity(distance_BTNN, others_BTNN, _ON_TOP_M),
         ]
         geometry_BTNG = torch.cat([relative_BTNG, *near], dim=-1)
         return keys_BTND + self.geometry(geometry_BTNG.to(keys_BTND.dtype))
@@ -310,8 +313,9 @@ class PlacePointer(nn.Module):
             (self.prompt_scale, self._prompt_appearance(inputs, context_BTD)),
         ):
             similarity_BTC = products(appearance_BTA, inputs.appearance_BTNA, kept_BKA)
-            logits_BTC = logits_BTC + F.softplus(scale(context_BTD))[..., kinds_C] * similarity_BTC
-        logits_BTC = logits_BTC + self.kind_bias(context_BTD)[..., kinds_C]
+            scale_BTC = F.softplus(scale(context_BTD)).index_select(-1, kinds_C)
+            logits_BTC = logits_BTC + scale_BTC * similarity_BTC
+        logits_BTC = logits_BTC + self.kind_bias(context_BTD).index_select(-1, kinds_C)
         geometry_BTCG = candidates.geometry(pick_BT).to(logits_BTC.dtype)
         logits_BTC = logits_BTC + torch.einsum("btg,btcg->btc", self.geometry(context_BTD), geometry_BTCG)
         picked_BTC = F.one_hot(pick_BT, logits_BTC.shape[-1]).to(logits_BTC.dtype)

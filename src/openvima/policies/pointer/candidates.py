@@ -5,8 +5,6 @@ They are concatenated in this order; only those in view differ from step to step
 Shape suffixes as in `inputs.py`; C candidates, G geometric features, X any features.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import nn
@@ -56,7 +54,6 @@ class GridCandidates(nn.Module):
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class PlaceCandidates:
     """All candidates of a batch.
 
@@ -65,48 +62,28 @@ class PlaceCandidates:
         first_step: Objects in view at the first step.
         prompt: Objects of prompt images.
         grid: Grid points.
+
+    Attributes:
+        masks_BTC: Which candidates exist.
+        positions_BTC2: Their positions, metres.
+        kinds_C: Where each comes from, as an index of `KINDS`, int64.
+        tokens_BKD, appearance_BKA, image_index_BK: Of those that are the same at every step.
     """
 
-    inputs: HeadInputs
-    first_step: ObjectSet
-    prompt: ObjectSet
-    grid: ObjectSet
-
-    @property
-    def sets(self) -> tuple[ObjectSet, ObjectSet, ObjectSet]:
-        """Those that are the same at every step, in order."""
-        return self.first_step, self.prompt, self.grid
-
-    @property
-    def masks_BTC(self) -> torch.Tensor:
-        """Which candidates exist."""
-        masks_BTN = self.inputs.masks_BTN
+    def __init__(self, inputs: HeadInputs, first_step: ObjectSet, prompt: ObjectSet, grid: ObjectSet) -> None:
+        self.inputs, self.prompt, self.sets = inputs, prompt, (first_step, prompt, grid)
+        self.tokens_BKD = torch.cat([part.tokens_BKD for part in self.sets], dim=1)
+        self.appearance_BKA = torch.cat([part.appearance_BKA for part in self.sets], dim=1)
+        self.image_index_BK = torch.cat([part.image_index_BK for part in self.sets], dim=1)
+        masks_BTN, num_steps = inputs.masks_BTN, inputs.masks_BTN.shape[1]
         masks_BTK = torch.cat([part.masks_BK for part in self.sets], dim=1)[:, None]
-        return torch.cat([masks_BTN, masks_BTK.expand(-1, masks_BTN.shape[1], -1)], dim=2)
-
-    @property
-    def positions_BTC2(self) -> torch.Tensor:
-        """Their positions, metres."""
-        now_BTN2 = self.inputs.positions_BTN2
+        self.masks_BTC = torch.cat([masks_BTN, masks_BTK.expand(-1, num_steps, -1)], dim=2)
         kept_BTK2 = torch.cat([part.positions_BK2 for part in self.sets], dim=1)[:, None]
-        return torch.cat([now_BTN2, kept_BTK2.expand(-1, now_BTN2.shape[1], -1, -1)], dim=2)
-
-    @property
-    def kinds_C(self) -> torch.Tensor:
-        """Where each comes from, as an index of `KINDS`, int64."""
-        masks_BTN = self.inputs.masks_BTN
-        counts = torch.tensor([masks_BTN.shape[2], *(part.masks_BK.shape[1] for part in self.sets)])
-        return torch.arange(len(counts)).repeat_interleave(counts).to(masks_BTN.device)
-
-    @property
-    def appearance_BKA(self) -> torch.Tensor:
-        """Appearance of those that are the same at every step."""
-        return torch.cat([part.appearance_BKA for part in self.sets], dim=1)
-
-    @property
-    def image_index_BK(self) -> torch.Tensor:
-        """Image index of those that are the same at every step."""
-        return torch.cat([part.image_index_BK for part in self.sets], dim=1)
+        kept_BTK2 = kept_BTK2.expand(-1, num_steps, -1, -1)
+        self.positions_BTC2 = torch.cat([inputs.positions_BTN2, kept_BTK2], dim=2)
+        counts = (masks_BTN.shape[2], *(part.masks_BK.shape[1] for part in self.sets))
+        kinds = [kind for kind, count in enumerate(counts) for _ in range(count)]
+        self.kinds_C = torch.tensor(kinds, device=masks_BTN.device)
 
     def positions_at(self, place_BT: torch.Tensor) -> torch.Tensor:
         """Position of one candidate at every step, (B, T, 2), metres."""
@@ -115,10 +92,10 @@ class PlaceCandidates:
     def tokens_at(self, place_BT: torch.Tensor) -> torch.Tensor:
         """Token of one candidate at every step, (B, T, D)."""
         num_in_view = self.inputs.masks_BTN.shape[-1]
-        kept_BKD = torch.cat([part.tokens_BKD for part in self.sets], dim=1)
-        index_BTD = (place_BT - num_in_view).clamp(min=0)[..., None].expand(-1, -1, kept_BKD.shape[-1])
+        index_BT1 = (place_BT - num_in_view).clamp(min=0)[..., None]
+        kept_BTD = self.tokens_BKD.gather(1, index_BT1.expand(-1, -1, self.tokens_BKD.shape[-1]))
         now_BTD = at(self.inputs.objects_BTND, place_BT.clamp(max=num_in_view - 1))
-        return torch.where((place_BT < num_in_view)[..., None], now_BTD, kept_BKD.gather(1, index_BTD))
+        return torch.where((place_BT < num_in_view)[..., None], now_BTD, kept_BTD)
 
     def keys(self, layers: nn.ModuleList) -> torch.Tensor:
         """Keys of those that are the same at every step, (B, K, D), each kind through its own layer."""
@@ -137,9 +114,10 @@ class PlaceCandidates:
         same_BTC1 = torch.exp(-(distance_BTC1 / _SAME_PLACE_M).square())
         others_BTN = inputs.masks_BTN & ~F.one_hot(pick_BT, inputs.masks_BTN.shape[-1]).bool()
         near = [
-            proximity(positions_BTC2, inputs.positions_BTN2, others_BTN[:, :, None]),
+            proximity(distances(positions_BTC2, inputs.positions_BTN2), others_BTN[:, :, None]),
             proximity(
-                positions_BTC2, self.prompt.positions_BK2[:, None], self.prompt.masks_BK[:, None, None]
+                distances(positions_BTC2, self.prompt.positions_BK2[:, None]),
+                self.prompt.masks_BK[:, None, None],
             ),
         ]
         scaled = (relative_BTC2 / OFFSET_UNIT_M, distance_BTC1 / OFFSET_UNIT_M)
@@ -160,11 +138,10 @@ class PlaceCandidates:
             Which candidates are right, (B, T, C), at least one; and whether that follows from what is known,
             (B, T): a grid point is one of many that would do.
         """
-        masks_BTC, num_grid = self.masks_BTC, self.grid.masks_BK.shape[1]
+        masks_BTC, is_grid_C = self.masks_BTC, self.kinds_C == KINDS.index("grid")
         is_named_BT = targets.place_BT >= 0
         distance_BTC = (self.positions_BTC2 - goal_BT2[:, :, None]).norm(dim=-1)
         count = masks_BTC.shape[-1]
-        is_grid_C = torch.arange(count, device=masks_BTC.device) >= count - num_grid
         near_BTC = (distance_BTC < COPIED_WITHIN_M) & masks_BTC & ~is_grid_C
         near_BTC &= ~is_named_BT[..., None] | self._nearest_to(targets.place_BT)
         nearest_BT = distance_BTC.masked_fill(~is_grid_C, torch.inf).argmin(-1)
@@ -177,7 +154,7 @@ class PlaceCandidates:
     def _nearest_to(self, slot_BT: torch.Tensor) -> torch.Tensor:
         """Whether each candidate is nearer to an object in view than to all others in view, (B, T, C)."""
         inputs = self.inputs
-        distance_BTCN = (self.positions_BTC2[:, :, :, None] - inputs.positions_BTN2[:, :, None]).norm(dim=-1)
+        distance_BTCN = distances(self.positions_BTC2, inputs.positions_BTN2)
         distance_BTCN = distance_BTCN.masked_fill(~inputs.masks_BTN[:, :, None], torch.inf)
         return distance_BTCN.argmin(-1) == slot_BT[..., None]
 
@@ -188,20 +165,20 @@ def products(query_BTX: torch.Tensor, now_BTNX: torch.Tensor, kept_BKX: torch.Te
     return torch.cat([now_BTN, query_BTX @ kept_BKX.mT], dim=2)
 
 
+def distances(positions_BTC2: torch.Tensor, others_BTK2: torch.Tensor) -> torch.Tensor:
+    """Distances between positions, (B, T, C, K), metres; T may be 1."""
+    return (positions_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
+
+
 def proximity(
-    positions_BTC2: torch.Tensor,
-    others_BTK2: torch.Tensor,
-    masks_BTCK: torch.Tensor,
-    unit_m: float = _NEIGHBOURHOOD_M,
+    distance_BTCK: torch.Tensor, masks_BTCK: torch.Tensor, unit_m: float = _NEIGHBOURHOOD_M
 ) -> torch.Tensor:
     """How near the nearest other position is, (B, T, C, 1): 1 at the same place, 0 far away.
 
     Args:
-        positions_BTC2: Positions, metres.
-        others_BTK2: Other positions, metres; here and below T may be 1.
-        masks_BTCK: Which of them count for which position; C may be 1.
+        distance_BTCK: Distances, metres.
+        masks_BTCK: Which of them count; B, T and C may be 1.
         unit_m: Scale of the distance.
     """
-    distance_BTCK = (positions_BTC2[:, :, :, None] - others_BTK2[:, :, None]).norm(dim=-1)
-    near_BTCK = torch.exp(-(distance_BTCK / unit_m).square()) * masks_BTCK
+    near_BTCK = torch.exp(distance_BTCK.square() * -(unit_m**-2)) * masks_BTCK
     return F.pad(near_BTCK, (0, 1)).amax(dim=-1, keepdim=True)  # there may be none

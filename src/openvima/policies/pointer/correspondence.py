@@ -87,7 +87,7 @@ class Correspondence(nn.Module):
     def __init__(self, config: CorrespondenceConfig, images: ObjectEncoderConfig) -> None:
         super().__init__()
         heads = config.num_heads
-        self.crop_dropout = images.crop_dropout
+        self.crop_dropout, self.rotation_bins = images.crop_dropout, images.rotation_bins
         # Fresh heads prefer the latest image, the earliest one, neither, and so on.
         preferences = [(2.0, -2.0, 0.0)[head % 3] for head in range(heads)]
         self.logit_scale = nn.Parameter(torch.full((heads,), 20.0))
@@ -124,17 +124,17 @@ class Correspondence(nn.Module):
         # Differences fit any precision; the positions themselves need all digits.
         moved_NM2 = (own.positions_N2[..., :, None, :] - other.positions_N2[..., None, :, :]) / _UNIT_M
         moved_NM2 = moved_NM2.to(dtype) * in_scenes_NM[..., None]
-        distance_NM = moved_NM2.square().sum(-1).add(1e-12).sqrt()
+        squared_NM = moved_NM2.square().sum(-1).add(1e-12)
         similarity_NM = own.appearance_NA @ other.appearance_NA.mT
         age_NM = (own.image_index_N[..., :, None] - other.image_index_N[..., None, :]).clamp(max=_MAX_AGE)
         weights_HNM = self._weights(
             similarity_NM,
-            distance_NM.clamp(max=_MAX_DISTANCE),
+            squared_NM.sqrt().clamp(max=_MAX_DISTANCE),
             age_NM.to(dtype),
             allowed_NM & other.exists_N[..., None, :] & own.exists_N[..., :, None],
         )
         in_scenes_NM = in_scenes_NM.to(dtype)
-        near_NM = torch.exp(-(distance_NM * (_UNIT_M / _SAME_PLACE_M)).square()) * in_scenes_NM
+        near_NM = torch.exp(squared_NM * -((_UNIT_M / _SAME_PLACE_M) ** 2)) * in_scenes_NM
         pairs_NMX = torch.cat(
             [
                 torch.stack([torch.ones_like(near_NM), similarity_NM, in_scenes_NM, near_NM], dim=-1),
@@ -150,7 +150,7 @@ class Correspondence(nn.Module):
             parts += [attended_NX, *views[NUM_VIEWS * head : NUM_VIEWS * (head + 1)]]
         if rotation_between is None:
             return self.difference(torch.cat(parts, dim=-1)), attended_HNX[..., 0, :, :0]
-        rotations_NR = _rotations(own, target_VNF, found_HVN1[..., 0, :, :, 0], rotation_between)
+        rotations_NR = self._rotations(own, target_VNF, found_HVN1[..., 0, :, :, 0], rotation_between)
         return self.difference(torch.cat([*parts, rotations_NR], dim=-1)), rotations_NR
 
     def _weights(
@@ -162,7 +162,7 @@ class Correspondence(nn.Module):
     ) -> torch.Tensor:
         """Attention weights, (..., H, N, M); the rest of 1 goes to the sink."""
         logit_scale, threshold, distance_bias, recency_bias = (
-            parameter[:, None, None]
+            parameter.view(-1, 1, 1)
             for parameter in (
                 F.softplus(self.logit_scale),
                 self.threshold,
@@ -190,7 +190,8 @@ class Correspondence(nn.Module):
             Differences of crop features and of boxes, (..., H, V, N, F + 4); crop features of what the first
             head attends to, (..., V, N, F); and the total attention weights, (..., H, V, N, 1).
         """
-        own_VNX, other_VMX = _crops_and_boxes(own), _crops_and_boxes(other)
+        own_VNX = _crops_and_boxes(own)
+        other_VMX = own_VNX if other is own else _crops_and_boxes(other)
         weights_HVNM = _in_both(own, other, weights_HNM)
         # Negating the smaller tensor saves a copy of the larger one.
         negative_HVNX = torch.einsum("...hvnm,...vmx->...hvnx", -weights_HVNM, other_VMX)
@@ -204,6 +205,22 @@ class Correspondence(nn.Module):
             differ_HVNX = differ_HVNX * (kept_N1 | ~crops)
         return differ_HVNX, -negative_HVNX[..., 0, :, :, :width], found_HVN1
 
+    def _rotations(
+        self,
+        own: ObjectFeatures,
+        target_VNF: torch.Tensor,
+        found_VN: torch.Tensor,
+        rotation_between: RotationBetween,
+    ) -> torch.Tensor:
+        """Probabilities of the rotations from what one head attends to, (..., N, R)."""
+        is_found_VN = found_VN > 0.5
+        if not (self.training or is_found_VN.any()):  # as most often in a view
+            return found_VN.new_zeros(*found_VN.shape[:-2], found_VN.shape[-1], self.rotation_bins)
+        # Attention is nearly always on one object, so the mean stands for its features.
+        target_VNF = target_VNF / found_VN[..., None].clamp(min=1e-4)
+        probabilities_NR = rotation_between(target_VNF, own.features_VNF, is_found_VN, own.masks_VN)
+        return probabilities_NR * is_found_VN.any(dim=-2)[..., None]
+
 
 def _crops_and_boxes(objects: ObjectFeatures) -> torch.Tensor:
     """Crop features and boxes, (..., V, N, F + 4)."""
@@ -215,17 +232,6 @@ def _in_both(own: ObjectFeatures, other: ObjectFeatures, weights_HNM: torch.Tens
     """Attention weights, zero in views that do not show both, (..., H, V, N, M)."""
     shown_VNM = own.masks_VN[..., :, None] & other.masks_VN[..., None, :]
     return weights_HNM.unsqueeze(-3) * shown_VNM.unsqueeze(-4)
-
-
-def _rotations(
-    own: ObjectFeatures, target_VNF: torch.Tensor, found_VN: torch.Tensor, rotation_between: RotationBetween
-) -> torch.Tensor:
-    """Probabilities of the rotations from what one head attends to, (..., N, R)."""
-    # Attention is nearly always on one object, so the mean stands for its features.
-    target_VNF = target_VNF / found_VN[..., None].clamp(min=1e-4)
-    is_found_VN = found_VN > 0.5
-    probabilities_NR = rotation_between(target_VNF, own.features_VNF, is_found_VN, own.masks_VN)
-    return probabilities_NR * is_found_VN.any(dim=-2)[..., None]
 
 
 def in_earlier_image(objects: ObjectFeatures, other: ObjectFeatures | None = None) -> torch.Tensor:

@@ -64,6 +64,7 @@ class PointerPrompt(TensorRecord):
         selected_BP: Which attributes the prompt asks to compare; None without attributes.
         attributes_BLX: Projections of the objects of images, whose dot products are similarities in the
             selected attributes; zero elsewhere.
+        describes: Whether any word describes appearance; may be true without, at the cost of time.
     """
 
     tokens_BLD: torch.Tensor
@@ -76,6 +77,7 @@ class PointerPrompt(TensorRecord):
     objects: ObjectSet
     selected_BP: torch.Tensor | None = None
     attributes_BLX: torch.Tensor | None = None
+    describes: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

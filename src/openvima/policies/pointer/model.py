@@ -132,10 +132,8 @@ class Pointer(PolicyNetwork):
         changes_BMD, rotations_BMR = self._changes_in_prompt(objects)
         changes_SD = features_VSF.new_zeros(prompts.masks_VS.shape[1], self.config.images.width)
         changes_SD = changes_SD.index_put((row_BM[exists_BM],), changes_BMD[exists_BM])
-        tokens_BLD = self._encode(prompts, features_VSF, changes_SD, weights_BLL)
         describes_BL = prompts.names_texture_BL & (self.text_appearance is not None)
-        masked = replace(prompts, word_ids_BL=prompts.word_ids_BL.masked_fill(describes_BL, PADDING_ID))
-        masked_BLD = self._encode(masked, torch.zeros_like(features_VSF), changes_SD, weights_BLL)
+        tokens_BLD, masked_BLD = self._encode(prompts, describes_BL, features_VSF, changes_SD, weights_BLL)
         appearance_BLA = tokens_BLD.new_zeros(*is_image_BL.shape, appearance_SA.shape[-1])
         if len(appearance_SA):
             appearance_BLA = appearance_SA[prompts.object_index_BL.clamp(min=0)] * is_image_BL[..., None]
@@ -164,6 +162,7 @@ class Pointer(PolicyNetwork):
             replace(object_set, image_index_BK=_scene_index(objects)),
             selected_BP,
             attributes_BLX,
+            describes=self.training or bool(describes_BL.any()),
         )
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
@@ -271,15 +270,31 @@ class Pointer(PolicyNetwork):
     def _encode(
         self,
         prompts: PromptBatch,
+        describes_BL: torch.Tensor,
         features_VSF: torch.Tensor,
         changes_SD: torch.Tensor,
         weights_BLL: torch.Tensor,
-    ) -> torch.Tensor:
-        tokens_IE = self.images(features_VSF, prompts.boxes_VS4, prompts.masks_VS) + changes_SD
-        tokens_BLW, images_BLW = self.prompt.embed(prompts, tokens_IE)
+    ) -> tuple[torch.Tensor, ...]:
+        """Encode prompts, and in the same batch without crops and the words that describe appearance."""
+        tokens_IE = torch.cat(
+            [
+                self.images(each_VSF, prompts.boxes_VS4, prompts.masks_VS) + changes_SD
+                for each_VSF in (features_VSF, torch.zeros_like(features_VSF))
+            ]
+        )
+        word_ids_BL, object_index_BL = prompts.word_ids_BL, prompts.object_index_BL
+        masked_ids_BL = word_ids_BL.masked_fill(describes_BL, PADDING_ID)
+        masked_index_BL = object_index_BL + (object_index_BL >= 0) * len(changes_SD)
+        both = replace(
+            prompts,
+            word_ids_BL=torch.cat([word_ids_BL, masked_ids_BL]),
+            object_index_BL=torch.cat([object_index_BL, masked_index_BL]),
+            mask_BL=prompts.mask_BL.repeat(2, 1),
+        )
+        tokens_BLW, images_BLW = self.prompt.embed(both, tokens_IE)
         if self.coreference is not None:
-            tokens_BLW = self.coreference(tokens_BLW, images_BLW, weights_BLL)
-        return self.prompt.encode(tokens_BLW, images_BLW, prompts.mask_BL)
+            tokens_BLW = self.coreference(tokens_BLW, images_BLW, weights_BLL.repeat(2, 1, 1))
+        return self.prompt.encode(tokens_BLW, images_BLW, both.mask_BL).chunk(2)
 
     def _changes_in_prompt(self, objects: ObjectFeatures) -> tuple[torch.Tensor, torch.Tensor]:
         """Compare objects with those of earlier images: changes of tokens, (B, M, D), and rotations."""
