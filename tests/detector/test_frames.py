@@ -46,6 +46,20 @@ def test_frames_of_prompts_show_the_objects_that_policies_see(data):
         assert len(front.boxes) == observe_prompt_image(image).masks[0].sum()
 
 
+def test_rerendered_frames_have_other_objects_in_the_same_places(data):
+    dataset, drawn = Dataset(data), []
+    for prob in (0.0, 1.0):
+        source = FrameSampler(dataset, prompt_prob=0.0, rerendered_prob=prob)
+        drawn.append([source.sample(row, np.random.default_rng(0)) for row in range(len(dataset))])
+    shown = [np.stack([f.rgb for frames in side for f in frames]) for side in drawn]
+    assert not np.array_equal(*shown)
+    assert all(len(f.boxes) for frames in drawn[1] for f in frames)
+    prompts = FrameSampler(dataset, prompt_prob=1.0, rerendered_prob=1.0)
+    (front, top), (again, _) = (prompts.sample(1, np.random.default_rng(0)) for _ in range(2))
+    assert np.array_equal(front.rgb, again.rgb)
+    assert len(top.boxes) and (top.rgb[:, 0, 0] == 255).all()  # on white, as images of objects are
+
+
 def test_held_out_frames_are_the_same_for_the_same_seed(data):
     source = FrameSampler(Dataset(data))
     first, again = (list(held_out_frames(source, 10, seed=3)) for _ in range(2))

@@ -200,6 +200,22 @@ def test_each_cache_is_drawn_with_its_probability(sources) -> None:
     np.testing.assert_allclose(counts / counts.sum(), [0.2, 0.5, 0.3], atol=0.08)
 
 
+def test_demonstrations_that_a_cache_lacks_keep_true_boxes(sources) -> None:
+    true, detected = sources
+    first_image = int(true.cache.image_counts().sum())
+    part = plugged_boxes(HOOK, fraction=0.5)
+    part = alternative_source(detected_object_cache(true.cache.dataset, part), true, first_image)
+    assert 0 < len(part) < len(true)
+    assert detected_rows((true, part), 1.0, 1)[0] == part.rows.tolist()
+    some, every = detected_rows((true, part), 0.5, 7), detected_rows((true, detected), 0.5, 7)
+    assert some[0] == [row for row in every[0] if row in part.rows]
+    assert some[1] == every[1]  # further draws are the same
+    images = np.concatenate([tokens.images for source in (true, part) for tokens in source.cache])
+    example = part.example(int(part.rows[-1]))
+    own = images[example.base : example.base + len(example.episode.images)]
+    np.testing.assert_array_equal(own, example.episode.images)
+
+
 def test_an_example_names_its_images_in_the_stack_of_both(sources) -> None:
     true, detected = sources
     images = np.concatenate([tokens.images for source in sources for tokens in source.cache])
@@ -235,6 +251,7 @@ def assert_equal_runs(ours: Path, theirs: Path) -> None:
             "optimizer.grad_accum_steps": 2,
             "loader.detected_prob": 0.4,
             "loader.rerendered_prob": 0.4,
+            "loader.detected_fraction": 0.5,
             "loader.rerendered_variants": 2,
         },
     ],
@@ -309,6 +326,10 @@ def test_another_detector_is_another_run(settings, tmp_path) -> None:
     [
         ({"loader.detected_prob": 0.5}, "loader.detected_prob is 0.5, but no detector is given"),
         ({"loader.boxes": HOOK, "loader.detected_prob": 1.5}, "between 0 and 1"),
+        (
+            {"loader.boxes": HOOK, "loader.detected_prob": 1.0, "loader.detected_fraction": 0.5},
+            "loader.detected_fraction is 0.5, but loader.detected_prob 1 leaves no true boxes",
+        ),
         ({"loader.boxes": HOOK, "loader.rerendered_prob": 0.6}, "rerendered_prob are 1.1 together"),
         (
             {"loader.boxes": HOOK, "preset": "gato-nano"},

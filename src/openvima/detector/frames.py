@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from openvima.data.object_cache.random_appearance import with_random_appearance
 from openvima.data.reader import Dataset
 from openvima.data.schema import VIEWS
 from openvima.errors import DatasetError
@@ -56,14 +57,20 @@ class FrameSampler:
         dataset: The demonstrations.
         episodes: Indices of the demonstrations to use; None takes all.
         prompt_prob: Probability of sampling a prompt image instead of an observation.
+        rerendered_prob: Probability of rendering the demonstration with random shapes and textures.
     """
 
     def __init__(
-        self, dataset: Dataset, episodes: np.ndarray | None = None, *, prompt_prob: float = 0.25
+        self,
+        dataset: Dataset,
+        episodes: np.ndarray | None = None,
+        *,
+        prompt_prob: float = 0.25,
+        rerendered_prob: float = 0.0,
     ) -> None:
         self.dataset = dataset
         self.episodes = np.arange(len(dataset)) if episodes is None else episodes
-        self._prompt_prob = prompt_prob
+        self._prompt_prob, self._rerendered_prob = prompt_prob, rerendered_prob
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -76,6 +83,8 @@ class FrameSampler:
             rng: Selects the time step or prompt image.
         """
         episode, from_prompt = int(self.episodes[index]), rng.random() < self._prompt_prob
+        if self._rerendered_prob and rng.random() < self._rerendered_prob:
+            return self._rerendered_frames(episode, from_prompt, rng)
         if from_prompt and (frames := self._prompt_frames(episode, rng)):
             return frames
         kinds = [f"{kind}_{view}" for view in VIEWS for kind in ("rgb", "segm")]
@@ -83,6 +92,17 @@ class FrameSampler:
         time = int(rng.integers(len(values["rgb_front"])))
         ids = range(FIRST_OBJECT_ID[values["end_effector"]], BACKGROUND_ID)
         return _both_views(values, time, ids, prefix="")
+
+    def _rerendered_frames(self, episode: int, from_prompt: bool, rng: np.random.Generator) -> list[Frame]:
+        shard = self.dataset.shard(self.dataset.locate(episode)[0])
+        demo = with_random_appearance(self.dataset[episode], shard.info, 0)
+        if from_prompt and (images := list(demo.prompt.images.values())):
+            image = images[int(rng.integers(len(images)))]
+            ids = [record.object_id for record in image.objects]
+            return [frame_of(image.rgb[view], image.segm[view], ids) for view in VIEWS]
+        time = int(rng.integers(demo.num_steps + 1))
+        ids = range(FIRST_OBJECT_ID[demo.end_effector], BACKGROUND_ID)
+        return [frame_of(demo.rgb[view][time], demo.segm[view][time], ids) for view in VIEWS]
 
     def _prompt_frames(self, episode: int, rng: np.random.Generator) -> list[Frame]:
         kinds = [f"prompt_{kind}_{view}" for view in VIEWS for kind in ("rgb", "segm")]

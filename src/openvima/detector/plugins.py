@@ -68,8 +68,12 @@ def plugged_extractor(source: str) -> ObjectExtractor:
     return PluggedExtractor(cast(ObjectExtractor, extractor))  # it has both methods
 
 
-def plugged_boxes(source: str) -> Boxes:
+def plugged_boxes(source: str, *, fraction: float = 1.0) -> Boxes:
     """Return an extractor as the source of boxes for the object cache.
+
+    Args:
+        source: One of the forms above.
+        fraction: Fraction of the demonstrations that the cache holds.
 
     The cache name of a trained detector is a hash of its weights, config and score threshold. That of a
     function is a hash of its source file; other files that it reads are not hashed.
@@ -88,7 +92,7 @@ def plugged_boxes(source: str) -> Boxes:
         extractor_maker(source)  # says which forms are allowed
         name, content = source.rpartition(":")[2], source_hash(source, what="boxes").encode()
     digest = hashlib.blake2b(content, digest_size=_DIGEST_BYTES).hexdigest()
-    return Boxes(f"{name}-{digest}", partial(plugged_extractor, source))
+    return Boxes(f"{name}-{digest}", partial(plugged_extractor, source), fraction)
 
 
 def detected_object_cache(

@@ -49,6 +49,11 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
         )
     if loader.boxes is not None and loader.detected_prob is None:
         config = replace(config, loader=replace(loader, detected_prob=DETECTED_PROB))
+    if loader.boxes is not None and loader.detected_fraction < 1 and config.loader.detected_prob == 1:
+        raise ConfigError(
+            f"loader.detected_fraction is {loader.detected_fraction:g}, but loader.detected_prob 1 leaves no "
+            "true boxes for the other demonstrations; lower the latter, or set the former to 1."
+        )
     if (total := (config.loader.detected_prob or 0.0) + loader.rerendered_prob) > 1:
         raise ConfigError(
             f"loader.detected_prob and loader.rerendered_prob are {total:g} together; at most 1 is allowed. "

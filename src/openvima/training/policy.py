@@ -69,7 +69,9 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
     )
     if config.loader.rerendered_prob:
         check_scenes(dataset)
-    boxes = plugged_boxes(config.loader.boxes) if config.loader.boxes is not None else None
+    boxes = None
+    if config.loader.boxes is not None:
+        boxes = plugged_boxes(config.loader.boxes, fraction=config.loader.detected_fraction)
     runtime = config.runtime
     with (
         torch_threads(runtime.threads),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.data.batching import BatchOrder
+from openvima.data.hash_split import split_hashes
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.reader import Dataset, read_manifest
 from openvima.errors import ConfigError, DatasetError, unknown_name
@@ -17,7 +18,6 @@ from openvima.tasks.registry import list_tasks
 from openvima.training.augmentation.describe_objects import text_of
 from openvima.training.augmentation.distractor_insertion import allows_distractors
 from openvima.training.dataset import Example, StoredEpisode
-from openvima.training.hash_split import split_hashes
 from openvima.training.learner import Collate
 from openvima.training.provenance import held_out_demonstrations
 
@@ -28,7 +28,7 @@ class ExampleSource(Sequence[Example]):
 
     Args:
         cache: All demonstrations.
-        rows: Their indices, shape (N,), int64.
+        rows: Their indices, ascending, shape (N,), int64.
         bases: Index of the first image of each demonstration of the cache, shape (all,), int64.
         lengths: Steps of each, and objects in view in all of them, shape (N, 2), int64.
     """
@@ -50,6 +50,11 @@ class ExampleSource(Sequence[Example]):
         """Return a demonstration by its index in the cache."""
         return Example(self.cache[row], int(self.bases[row]), row)
 
+    def has(self, row: int) -> bool:
+        """Whether a demonstration of the cache, by its index there, is one of these."""
+        place = int(np.searchsorted(self.rows, row))
+        return place < len(self.rows) and int(self.rows[place]) == row
+
     def num_steps(self, indices: np.ndarray) -> int:
         """Return the total steps of some demonstrations."""
         return int(self.lengths[indices, 0].sum())
@@ -64,8 +69,8 @@ class Parts:
         seed: Of the run; every example of every batch has its own generator.
         largest: Maximum size of a part.
         count: Number of parts, whatever the lengths; None is as many as needed.
-        alternatives: Other caches of the same demonstrations, each with the probability of using it instead;
-            see `alternative_source`.
+        alternatives: Other caches of the same demonstrations, each with the probability of using it instead
+            where it has the demonstration; see `alternative_source`.
         distractors: Demonstrations from which distractors are inserted; see `with_distractors`.
         distractor_prob: Probability of that, for demonstrations that allow it.
     """
@@ -93,15 +98,16 @@ class Parts:
             drawn, sources = rng.random(), [source for source, _ in self.alternatives]
             ends = np.cumsum([prob for _, prob in self.alternatives])
             if drawn < ends[-1]:
-                example = sources[int(np.searchsorted(ends, drawn, side="right"))].example(example.row)
-        source = self.distractors
+                source = sources[int(np.searchsorted(ends, drawn, side="right"))]
+                example = source.example(example.row) if source.has(example.row) else example
+        others = self.distractors
         if (
-            source is None
+            others is None
             or not allows_distractors(example.episode.task)
             or rng.random() >= self.distractor_prob
         ):
             return example
-        return replace(example, other=source[int(rng.integers(len(source)))])
+        return replace(example, other=others[int(rng.integers(len(others)))])
 
     def _divided(self, examples: Sequence[Example]) -> list[Sequence[Example]]:
         if self.count is not None:
@@ -174,7 +180,7 @@ def split_examples(
     Raises:
         DatasetError: There is none to train on.
     """
-    hashes = split_hashes(cache.dataset)
+    hashes = split_hashes(cache.dataset.index)
     counts = cache.image_counts()
     bases = np.cumsum(counts) - counts
     lengths = cache.lengths()
@@ -195,13 +201,15 @@ def alternative_source(cache: ObjectCache, source: ExampleSource, first_image: i
     """Return the demonstrations of a source as another cache has them.
 
     Args:
-        cache: Of detected boxes, or of random appearance.
+        cache: Of detected boxes, or of random appearance; it may lack some of them.
         source: The demonstrations.
         first_image: Number of its first image: its images follow those of other caches.
     """
     counts = cache.image_counts()
     bases = np.cumsum(counts) - counts + first_image
-    return ExampleSource(cache, source.rows, bases, cache.lengths()[source.rows])
+    lengths = cache.lengths()
+    rows = source.rows[lengths[source.rows, 0] > 0]
+    return ExampleSource(cache, rows, bases, lengths[rows])
 
 
 def check_words(cache: ObjectCache, processor: Processor, *, describes: bool = False) -> None:

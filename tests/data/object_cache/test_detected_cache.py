@@ -124,6 +124,27 @@ def test_an_interrupted_maker_goes_on_shard_by_shard(copy: Path) -> None:
         assert rows_of(episode.objects).tolist() == rows_of(expected.objects).tolist()
 
 
+def test_a_cache_may_hold_a_fraction_of_the_demonstrations(copy: Path) -> None:
+    dataset = Dataset(copy)
+    whole, part = (open_object_cache(dataset, boxes=replace(CLUMSY, fraction=f)) for f in (1.0, 0.5))
+    assert part.folder.name == "objects-v6-clumsy-1-0.5"
+    held = np.flatnonzero(part.lengths()[:, 0])
+    assert 0 < len(held) < len(dataset)
+    assert held.tolist() == np.flatnonzero(part.image_counts()).tolist()
+    for row, (episode, expected) in enumerate(zip(part, whole, strict=True)):
+        assert (episode.task, episode.seed) == (expected.task, expected.seed)
+        if row in held:
+            np.testing.assert_array_equal(episode.images, expected.images)
+            assert rows_of(episode.objects).tolist() == rows_of(expected.objects).tolist()
+        else:
+            assert not episode.num_steps and not len(episode.images)
+    tasks = Dataset(copy, tasks=["rotate"])  # the same ones, whatever else is there
+    others = open_object_cache(tasks, folder=copy / "other", boxes=replace(CLUMSY, fraction=0.5))
+    names = {(e.task, e.seed) for e in others if e.num_steps}
+    assert names == {(e.task, e.seed) for e in part if e.num_steps and e.task == "rotate"}
+    assert not verify(copy).problems
+
+
 def test_files_of_another_detector_in_the_folder_are_not_trusted(copy: Path) -> None:
     dataset = Dataset(copy, tasks=["rotate"])
     cache = open_object_cache(dataset, boxes=CLUMSY)

@@ -14,6 +14,7 @@ def preprocess(
     *,
     kind: Literal["objects", "frames"] = "objects",
     boxes: str | None = None,
+    fraction: float = 1.0,
     rerendered: int | None = None,
     out: Path | None = None,
     workers: int = 1,
@@ -32,6 +33,8 @@ def preprocess(
         boxes: Detector that extracts the objects, for `openvima train --boxes`: "detector" for the bundled
             one, detector=FOLDER for one trained with `openvima detector train`, or MODULE:FUNCTION or
             FILE.py:FUNCTION, which returns an ObjectExtractor. Default: the segmentation.
+        fraction: Fraction of the demonstrations in which `boxes` detects objects, for `openvima train
+            --loader.detected-fraction`.
         rerendered: Number of a random appearance, from 0, to render the demonstrations again with, for
             `openvima train --loader.rerendered-prob`. Default: as they are stored.
         out: Folder of the cache; default: "object_cache" in the folder of demonstrations.
@@ -49,6 +52,10 @@ def preprocess(
         raise ConfigError(f"boxes is {boxes!r}, but whole frames have none; leave --boxes or --kind out.")
     if rerendered is not None and (boxes is not None or rerendered < 0):
         raise ConfigError(f"rerendered is {rerendered}; it must be 0 or more, and without --boxes.")
+    if not 0 <= fraction <= 1 or (fraction < 1 and boxes is None):
+        raise ConfigError(
+            f"fraction is {fraction:g}; it must lie between 0 and 1, and needs --boxes below 1."
+        )
     dataset = Dataset(folder)
     with progress_bar("object cache") as report:
         if boxes is None:
@@ -57,7 +64,7 @@ def preprocess(
             )
         else:
             cache = detected_object_cache(
-                dataset, plugged_boxes(boxes), folder=out, workers=workers, report=report
+                dataset, plugged_boxes(boxes, fraction=fraction), folder=out, workers=workers, report=report
             )
     print(f"the object cache of {len(cache):,} demonstrations is ready.", file=sys.stderr)
     print(cache.folder)

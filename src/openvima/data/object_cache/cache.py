@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from openvima.data.checksums import Envelope, spans_of
+from openvima.data.hash_split import split_hashes
 from openvima.data.manifest import CACHE_FOLDER, joint_hash
 from openvima.data.object_cache.cache_file import (
     CACHE_VERSION,
@@ -18,7 +19,7 @@ from openvima.data.object_cache.cache_file import (
     file_name,
     write_cache_file,
 )
-from openvima.data.object_cache.episode import PreprocessedEpisode, preprocess
+from openvima.data.object_cache.episode import PreprocessedEpisode, left_out_episode, preprocess
 from openvima.data.object_cache.episode_batch import EpisodeBatch
 from openvima.data.object_cache.joined_records import read_records
 from openvima.data.object_cache.random_appearance import RERENDERING_VERSION, with_random_appearance
@@ -41,10 +42,13 @@ class Boxes:
     Args:
         name: Identifies the extractor and all that its boxes depend on; part of the folder's name.
         make: Makes the extractor. It is sent to other processes, where it is called once.
+        fraction: Fraction of the demonstrations that the cache holds; the others have no steps there. A hash
+            of task and seed decides.
     """
 
     name: str
     make: Callable[[], ObjectExtractor] = field(compare=False)
+    fraction: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +66,10 @@ class Variant:
     @property
     def name(self) -> str:
         """Part of the folder's name."""
-        names = [self.boxes.name] if self.boxes else []
+        names = []
+        if self.boxes:
+            part = f"-{self.boxes.fraction:g}" if self.boxes.fraction < 1 else ""
+            names.append(f"{self.boxes.name}{part}")
         if self.appearance is not None:
             names.append(f"{_RERENDERED}{RERENDERING_VERSION}-{self.appearance}")
         return "-".join(names)
@@ -150,7 +157,7 @@ class ObjectCache(Sequence[PreprocessedEpisode]):
         return self._gathered("num_images")[:, 0]
 
     def texts(self) -> set[str]:
-        """Return the different prompts, with their placeholders."""
+        """Return the different prompts, with their placeholders; "" stands for those that are left out."""
         return {text for file in self._files.values() for text in file.texts()}
 
     def descriptions(self) -> set[str]:
@@ -302,7 +309,13 @@ def _made(folder: Path, source: Source, kind: InputKind, variant: str) -> CacheF
 def _write(work: _Work, count: Callable[[int], None]) -> None:
     shard, episodes, variant = Shard(work.shard, work.envelope), [], work.variant
     extractor = _extractor(variant.boxes) if variant.boxes else None
-    for row, span in enumerate(spans_of(work.source.index)):
+    kept = split_hashes(work.source.index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
+    names = zip(*(work.source.index.column(name).to_pylist() for name in ("task", "seed")), strict=True)
+    for row, (span, name) in enumerate(zip(spans_of(work.source.index), names, strict=True)):
+        if not kept[row]:
+            episodes.append(left_out_episode(*name, work.kind))
+            count(row + 1)
+            continue
         shard.check(row, span)
         demo = shard[row]
         if variant.appearance is None:

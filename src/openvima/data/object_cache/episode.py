@@ -9,7 +9,7 @@ from openvima.data.records import Demonstration
 from openvima.data.schema import VIEWS
 from openvima.perception.image_stack import ImageStack
 from openvima.perception.iou import match_ids_to_slots
-from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe
+from openvima.perception.objects import ObjectExtractor, ObjectViews, crop_box, observe, see_nothing
 from openvima.perception.preprocessing import (
     IMAGE_SIZES,
     InputKind,
@@ -143,6 +143,26 @@ def preprocess(
         actions=np.array([_action_row(action) for action in demo.actions], np.float32).reshape(-1, 12),
         images=stack.images()[1:],
         descriptions=image_descriptions(demo.prompt),
+    )
+
+
+def left_out_episode(task: str, seed: int, kind: InputKind) -> PreprocessedEpisode:
+    """Return an episode without steps and images, in place of one that a cache leaves out."""
+    stack, none = ImageStack(IMAGE_SIZES[kind]), np.zeros(0, np.int16)
+    nothing = ObjectTable.from_views(see_nothing(), stack)
+    return PreprocessedEpisode(
+        task=task,
+        seed=seed,
+        end_effector=0,
+        prompt=PreprocessedPrompt("", nothing, none, none.astype(bool)),
+        objects=nothing,
+        objects_per_step=none,
+        pick_ids=none,
+        place_ids=none,
+        false_positives=FalsePositives(np.zeros((0, 2), np.int32), np.zeros((0, 2, 4), np.int16)),
+        final=nothing,
+        actions=np.zeros((0, sum(ACTION_SHAPES.values())), np.float32),
+        images=stack.images()[1:],
     )
 
 

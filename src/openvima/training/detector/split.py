@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from openvima.data.hash_split import split_hashes
 from openvima.data.reader import Dataset
-from openvima.training.hash_split import split_hashes
 
 
 def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.ndarray]:
@@ -18,5 +18,5 @@ def split_episodes(dataset: Dataset, fraction: float) -> tuple[np.ndarray, np.nd
     Returns:
         Indices of both.
     """
-    hashes = split_hashes(dataset, "detector/")
+    hashes = split_hashes(dataset.index, "detector/")
     return np.flatnonzero(hashes >= fraction), np.flatnonzero(hashes < fraction)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from openvima.data.batching import BatchOrder
+from openvima.data.object_cache.random_appearance import check_scenes
 from openvima.detector.augmentation import augment_frame
 from openvima.detector.checkpoint import load_network
 from openvima.detector.config import detector_config
@@ -46,6 +47,8 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
         FolderLockedError: Another run writes to the folder.
     """
     dataset, loader = open_demonstrations(config.data, allow_heldout=config.allow_heldout), config.loader
+    if loader.rerendered_prob:
+        check_scenes(dataset)
     training, held_out = split_episodes(dataset, loader.validation_fraction)
     if 2 * len(training) < loader.batch_size or not len(held_out):
         raise DatasetError(
@@ -70,8 +73,8 @@ def train_detector(config: DetectorTrainingConfig, report: Report | None = None)
             compile_layers(learner)
 
         def make() -> DetectorStage:
-            source = FrameSampler(dataset, training, prompt_prob=loader.prompt_prob)
-            kept = FrameSampler(dataset, held_out, prompt_prob=loader.prompt_prob)
+            probs = {"prompt_prob": loader.prompt_prob, "rerendered_prob": loader.rerendered_prob}
+            source, kept = (FrameSampler(dataset, rows, **probs) for rows in (training, held_out))
             frames = list(held_out_frames(kept, loader.validation_frames, seed=config.seed))
             return DetectorStage(learner, config, source, frames, parallel)
 

@@ -1,22 +1,20 @@
-"""Which demonstrations are held out for validation: a hash of task and seed decides."""
+"""Splits of demonstrations: a hash of task and seed decides."""
 
 import hashlib
 
 import numpy as np
+import pyarrow as pa
 
-from openvima.data.reader import Dataset
 
-
-def split_hashes(dataset: Dataset, purpose: str = "") -> np.ndarray:
+def split_hashes(index: pa.Table, purpose: str = "") -> np.ndarray:
     """Return a uniform number between 0 and 1 for each demonstration, shape (N,), float64.
 
     It follows from its task and seed alone, so that it stays when data are added.
 
     Args:
-        dataset: The demonstrations.
+        index: Of the demonstrations: `Dataset.index`.
         purpose: Other purposes have other numbers.
     """
-    index = dataset.index
     names = zip(index.column("task").to_pylist(), index.column("seed").to_pylist(), strict=True)
     return np.array([_hash(f"{purpose}{task}/{seed}") for task, seed in names], np.float64)
 
