@@ -24,7 +24,10 @@ VARIANTS = [
     ("vima-nano", {"image_tokens": "object-perceiver"}),
     ("nano-bins", {"image_tokens": "patches"}),
     ("vima-nano", {"width": 96, "num_layers": 1, "tuned_layers": 1}),
-    ("nano", {"width": 64, "num_layers": 3, "visual_residual": True, "conditioning": "prefix"}),
+    (
+        "nano",
+        {"width": 64, "num_layers": 3, "visual_residual": True, "conditioning": "prefix", "crop_kernel": 1},
+    ),
 ]
 SLOW_VARIANTS = [
     ("midas-nano", {"conditioning": "cross-attention"}),
@@ -202,6 +205,8 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
         ("vima-nano", {"width": 10**6}, "width is 1000000; it must be a whole number between"),
         ("vima-nano", {"num_layers": 10**6}, "num_layers is 1000000; it must be a whole number between"),
         ("nano", {"head": "mixture"}, "pointers to candidates alone"),
+        ("nano", {"crop_kernel": 2}, "last_kernel is 2; it must be"),
+        ("vima-2m", {"crop_kernel": 1}, "crop_kernel is 1, but the network has no convolutions"),
         ("vima-nano", {"conditioning": "suffix"}, "conditioning.*suffix.*cross-attention"),
         ("vima-nano", {"colour": "red"}, "colour"),
     ],

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.policies.config import PolicyConfig
 from openvima.policies.limits import check_limits
 from openvima.policies.midas.config import MidasConfig
 from openvima.policies.nn.autoregressive import AutoregressiveConfig
+from openvima.policies.nn.conv_encoder import ConvConfig
 from openvima.policies.nn.decoder import DecoderConfig, PrefixDecoderConfig
 from openvima.policies.nn.heads import HEADS
 from openvima.policies.nn.object_encoder import ObjectEncoderConfig
@@ -220,6 +221,18 @@ def with_attributes(config: PolicyConfig, wanted: bool = True) -> PolicyConfig:
     return replace(config, attributes=AttributeConfig() if wanted else None)
 
 
+def with_crop_kernel(config: PolicyConfig, size: Literal[1, 3]) -> PolicyConfig:
+    """Return the same network with another kernel size in the last layer of its crop encoder.
+
+    Raises:
+        ConfigError: The network encodes no crops by convolutions.
+    """
+    images = config.images
+    if not isinstance(images, ObjectEncoderConfig) or not isinstance(images.crop, ConvConfig):
+        raise ConfigError(f"crop_kernel is {size}, but the network has no convolutions; take nano or small.")
+    return replace(config, images=replace(images, crop=replace(images.crop, last_kernel=size)))
+
+
 # In the order in which they are made: later ones see the parts of earlier ones.
 SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "text_encoder": with_text_encoder,
@@ -231,4 +244,5 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "head": with_head,
     "visual_residual": with_visual_residual,
     "attributes": with_attributes,
+    "crop_kernel": with_crop_kernel,
 }
