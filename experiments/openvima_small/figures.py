@@ -1,4 +1,4 @@
-"""Figures about openvima-small; `results.py` makes them from evaluations."""
+"""Figures about openvima-small; `publish.py` makes them from evaluations."""
 
 import textwrap
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from findings import LEVELS, PUBLISHED_DEMONSTRATIONS, Findings, Training
+from findings import DEMONSTRATIONS, LEVELS, POLICY, PUBLISHED_DEMONSTRATIONS, Findings, Training
 from openvima.evaluation.results import LevelMean
 from openvima.report.published import PublishedModel, leading_models, published_models
 
@@ -42,6 +42,11 @@ TITLES = {
     "L3": "L3 · new objects",
     "L4": "L4 · new tasks",
 }
+_OWN = {
+    "simulator": f"{POLICY}, original simulator",
+    "default": POLICY,
+    "previous": "previous weights",
+}
 SCALING_LEVELS = ("L1", "L3", "L4")
 
 
@@ -49,10 +54,10 @@ def save_all(findings: Findings, folder: Path) -> dict[str, Path]:
     """Draw all figures with data.
 
     Returns:
-        The files by name: levels, and scaling and ablations where there are trainings.
+        The files by name: levels where there are scores, scaling and ablations where there are trainings.
     """
     with rc_context(STYLE):
-        figures = {"levels": levels(findings)}
+        figures = {"levels": levels(findings)} if findings.means() else {}
         if findings.trainings:
             figures["scaling"] = scaling(findings)
         if findings.differences:
@@ -66,16 +71,17 @@ def save_all(findings: Findings, folder: Path) -> dict[str, Path]:
 
 
 def levels(findings: Findings) -> Figure:
-    """A panel for each level: our mean with its interval, and the published ones."""
+    """A panel for each level: our means with their intervals, and the published ones."""
     models = sorted(leading_models(), key=lambda model: -model.levels["L1"])
-    names = [findings.policy, *(model.name for model in models)]
+    own = {what: means for name, what in _OWN.items() if (means := findings.means(name))}
+    names = [*own, *(model.name for model in models)]
     figure = Figure(figsize=(11, 0.9 + 0.27 * len(names)), layout="constrained")
-    means = findings.means()
     for axes, level in zip(figure.subplots(1, len(LEVELS), sharey=True), LEVELS, strict=True):
         axes.set_title(TITLES[level])
-        if level in means:
-            draw_bar(axes, 0, means[level], OURS)
-        for place, model in enumerate(models, 1):
+        for place, means in enumerate(own.values()):
+            if level in means:
+                draw_bar(axes, place, means[level], OURS)
+        for place, model in enumerate(models, len(own)):
             if level in model.levels:
                 axes.barh(place, model.levels[level], color=PUBLISHED, height=0.66)
                 draw_label(axes, model.levels[level], place, f"{model.levels[level]:.1f}")
@@ -83,7 +89,8 @@ def levels(findings: Findings) -> Figure:
         axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(names) - 0.5, -0.6)
         axes.grid(visible=False, axis="y")
-    figure.axes[0].get_yticklabels()[0].set(color=OURS, fontweight="bold")
+    for label in figure.axes[0].get_yticklabels()[: len(own)]:
+        label.set(color=OURS, fontweight="bold")
     figure.supxlabel(
         "Success rate (%), mean over the tasks of the level. Blue: measured, with 95 % interval. "
         "Grey: published.",
@@ -106,15 +113,15 @@ def scaling(findings: Findings) -> Figure:
         draw_curve(axes, findings.curve(vima=True), level, VIMA, "VIMA architecture of similar size")
         draw_curve(axes, findings.curve(vima=False), level, OURS, "preset small")
         if level in own:
-            draw_point(axes, findings.demonstrations, own[level], OURS)
+            draw_point(axes, DEMONSTRATIONS, own[level], OURS)
             axes.plot(
-                [findings.demonstrations],
+                [DEMONSTRATIONS],
                 [100 * own[level].mean],
                 "*",
                 color=OURS,
                 markersize=13,
                 markeredgecolor=PAPER,
-                label=findings.policy,
+                label=POLICY,
                 zorder=4,
             )
         axes.set_xscale("log")

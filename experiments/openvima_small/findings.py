@@ -1,20 +1,50 @@
-"""Evaluations of the bundled checkpoint and of smaller trainings."""
+"""Scores, records of the original simulator and trainings behind the tables of openvima-small."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from openvima.errors import ConfigError, DatasetError, OpenVimaError, UnknownPolicyError, unknown_name
 from openvima.evaluation.comparison import Comparison, compare_pairs
 from openvima.evaluation.merging import merge
-from openvima.evaluation.results import LevelMean, Results
+from openvima.evaluation.results import EpisodeOutcome, LevelMean, Results, Row
+from openvima.input_files import read_json
 
 POLICY = "openvima-small"
 DEMONSTRATIONS = 52_000  # of the bundled checkpoint
 PUBLISHED_DEMONSTRATIONS = 650_000  # of the papers' models, the full dataset
 LEVELS = ("L1", "L2", "L3", "L4")
+SWAPPED = "swapped_attribute"
+TEXT_ABLATIONS = ("text_prompts", "held_out_phrasings", "text_prompts+held_out_phrasings")
+
+# Folders of SCORES: evaluations, and what their plain score is.
+EVALUATIONS = {
+    "default": "procedural assets",
+    "original_assets": "assets of the original benchmark",
+    "original_compat": "assets of the original benchmark, compat",
+    "detected": "procedural assets, detected boxes",
+    "second_seed": "second training seed",
+    "without_attributes": "trained without attributes",
+    "without_ears": "trained without containers with ears",
+    "previous": "previous weights",
+    "previous_original_assets": "previous weights, assets of the original benchmark",
+    "previous_original_compat": "previous weights, assets of the original benchmark, compat",
+    "previous_detected": "previous weights, detected boxes",
+    "controls": "input ablations",
+    "text": "text prompts and held-out phrasings",
+    "previous_text": "text prompts and held-out phrasings, previous weights",
+}
+# Folders of SCORES that `examples/score_in_original_benchmark.py` wrote.
+SIMULATORS = {
+    "simulator": POLICY,
+    "second_seed_simulator": "second training seed",
+    "previous_simulator": "previous weights",
+}
+_OTHER_WEIGHTS = ("second_seed", "without_", "previous")
+_DETECTED = "detected_boxes"
 _VIMA = "vima"  # names of trainings of its architecture begin so
 
 
@@ -47,7 +77,7 @@ class Training:
 
     def means(self) -> dict[str, LevelMean]:
         """Success by level."""
-        return {mean.level: mean for mean in self.results.level_means() if not mean.ablation}
+        return level_means(self.results)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,20 +85,18 @@ class Findings:
     """Data of tables and figures.
 
     Args:
-        policy: Name of the bundled checkpoint in `results`.
-        results: Its evaluation, ablations included.
-        demonstrations: Number of its training demonstrations.
+        scores: Evaluations by the names of `EVALUATIONS` and `SIMULATORS`; absent ones are not there.
         trainings: Smaller trainings, compared with each other.
         baseline: The one with the full model.
         differences: Of each training with as many demonstrations and steps minus the baseline.
+        baselines: Other architectures at equal cost, and ours.
     """
 
-    policy: str
-    results: Results
-    demonstrations: int
-    trainings: tuple[Training, ...]
-    baseline: Training | None
-    differences: Mapping[str, Comparison]
+    scores: Mapping[str, Results]
+    trainings: tuple[Training, ...] = ()
+    baseline: Training | None = None
+    differences: Mapping[str, Comparison] = field(default_factory=dict)
+    baselines: tuple[Training, ...] = ()
 
     @property
     def variants(self) -> list[Training]:
@@ -84,13 +112,74 @@ class Findings:
         ]
         return sorted(chosen, key=lambda training: (training.demonstrations, training.steps))
 
-    def means(self) -> dict[str, LevelMean]:
-        """Success rate of the bundled checkpoint by level."""
-        return {
-            mean.level: mean
-            for mean in self.results.level_means()
-            if mean.policy == self.policy and not mean.ablation
-        }
+    def means(self, name: str = "default") -> dict[str, LevelMean]:
+        """Plain success rate by level; of `detected` and `previous_detected` that with detected boxes."""
+        if name not in self.scores:
+            return {}
+        return level_means(self.scores[name], _DETECTED if name.endswith("detected") else "")
+
+
+def level_means(results: Results, ablation: str = "") -> dict[str, LevelMean]:
+    """Success by level, under one ablation."""
+    return {mean.level: mean for mean in results.level_means() if mean.ablation == ablation}
+
+
+def read_scores(folder: Path, weights: str) -> dict[str, Results]:
+    """Read what a folder holds of `EVALUATIONS` and `SIMULATORS`; a line on stderr names what is absent.
+
+    Args:
+        folder: The folder.
+        weights: SHA-256 of the bundled weights, which all evaluations but those of other weights must have.
+
+    Raises:
+        DatasetError: A file is damaged, or the folder holds nothing.
+        ConfigError: An evaluation is of other weights.
+    """
+    found: dict[str, Results] = {}
+    for name in (*SIMULATORS, *EVALUATIONS):
+        if not (folder / name).is_dir():
+            print(f"{folder / name} is absent; its tables are left out.", file=sys.stderr)
+        elif name in SIMULATORS:
+            found[name] = read_simulator(folder / name)
+        else:
+            found[name] = _of_first_policy(Results.read(folder / name), POLICY)
+            own = next(iter(found[name].policies.values())).get("sha256", "")
+            if own != weights and not name.startswith(_OTHER_WEIGHTS):
+                raise ConfigError(
+                    f"{folder / name} is of weights {own[:12]}; those bundled are {weights[:12]}."
+                )
+    if not found:
+        known = ", ".join((*SIMULATORS, *EVALUATIONS))
+        raise DatasetError(f"{folder} holds no evaluation; it may hold the folders {known}.")
+    return found
+
+
+def read_simulator(folder: Path) -> Results:
+    """Read the episodes of the original simulator, LEVEL/TASK/SEED.json.
+
+    Raises:
+        DatasetError: A file is damaged, or there is none.
+    """
+    rows = []
+    for level in LEVELS:
+        for task in sorted(path for path in (folder / level).glob("*") if path.is_dir()):
+            outcomes = [_simulator_outcome(path) for path in task.glob("*.json")]
+            if outcomes:
+                ordered = tuple(sorted(outcomes, key=lambda outcome: outcome.seed))
+                rows.append(Row(POLICY, task.name, level, 0, ordered))
+    if not rows:
+        raise DatasetError(f"{folder} has no episode LEVEL/TASK/SEED.json, as L1/rotate/40000.json.")
+    return Results(tuple(rows), policies={POLICY: {}})
+
+
+def _simulator_outcome(path: Path) -> EpisodeOutcome:
+    try:
+        content = read_json(path)
+        return EpisodeOutcome(int(content["seed"]), content["success"] is True, int(content["steps"]))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise DatasetError(
+            f"{path} cannot be read ({error!r}); remove it, and play its episode again."
+        ) from error
 
 
 def read_trainings(files: Sequence[Path]) -> tuple[Training, ...]:
@@ -130,36 +219,37 @@ def _training(record: dict[str, Any], folder: Path) -> Training:  # Any: JSON
         path = folder / path
     name = str(record["name"])
     found = Results.read(path)
-    played = [row for row in found.rows if row.policy == found.policy_names()[0]]
     if len(found.policy_names()) > 1:
         raise ConfigError(f"{path} holds {', '.join(found.policy_names())}; one policy is wanted in each.")
-    rows = tuple(replace(row, policy=name) for row in played)
-    policies = {name: dict(next(iter(found.policies.values()), {}))}
-    results = replace(found, rows=rows, policies=policies)
     count, steps = int(record["demonstrations"]), int(record["steps"])
     minutes, parameters = float(record["minutes"]), int(record.get("parameters", 0))
+    results = _of_first_policy(found, name)
     return Training(name, str(record["what"]), count, steps, minutes, results, parameters)
 
 
+def _of_first_policy(results: Results, name: str) -> Results:
+    """Keep the rows of the first policy, under another name."""
+    first = results.policy_names()[0]
+    rows = tuple(replace(row, policy=name) for row in results.rows if row.policy == first)
+    return replace(results, rows=rows, policies={name: dict(results.policies.get(first, {}))})
+
+
 def find(
-    results: Results,
-    trainings: Sequence[Training],
+    scores: Mapping[str, Results],
+    trainings: Sequence[Training] = (),
     *,
-    policy: str = POLICY,
+    baselines: Sequence[Training] = (),
     baseline: str = "full",
-    demonstrations: int = DEMONSTRATIONS,
 ) -> Findings:
     """Put together what is known.
 
     Raises:
-        UnknownPolicyError: The evaluation has no such policy, or there is no such baseline.
+        UnknownPolicyError: There is no such baseline.
         ConfigError: Two trainings that are compared played different episodes.
     """
-    if policy not in results.policy_names():
-        raise UnknownPolicyError(unknown_name("policy", policy, results.policy_names()))
     by_name = {training.name: training for training in trainings}
     if not by_name:
-        return Findings(policy, results, demonstrations, (), None, {})
+        return Findings(scores, baselines=tuple(baselines))
     if baseline not in by_name:
         raise UnknownPolicyError(unknown_name("training", baseline, by_name))
     full = by_name[baseline]
@@ -172,4 +262,4 @@ def find(
     merged = merge({name: training.results for name, training in by_name.items()}).results
     comparisons = compare_pairs(merged, [(name, baseline) for name in compared]) if compared else []
     differences = dict(zip(compared, comparisons, strict=True))
-    return Findings(policy, results, demonstrations, tuple(trainings), full, differences)
+    return Findings(scores, tuple(trainings), full, differences, tuple(baselines))

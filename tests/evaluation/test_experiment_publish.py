@@ -1,0 +1,240 @@
+"""`experiments/openvima_small/publish.py`: right numbers, whole figures, whole pages, shipped weights."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("matplotlib")
+
+from failures import draw_failures, failures
+from findings import Findings, find, read_scores, read_simulator, read_trainings
+from openvima.errors import ConfigError, DatasetError, UnknownPolicyError
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.results import EpisodeOutcome, Results, Row
+from openvima.evaluation.statistics import PairCounts, mean_difference, mean_of_rates
+from openvima.policies.build import build_network
+from openvima.policies.checkpoint import save_checkpoint
+from publish import fill, record, write
+from small_networks import narrow_small
+from tables import tables
+from weights import facts, settings, ship, shipped
+
+EPISODES = 10
+TASKS = {"L1": ("rotate", "twist"), "L2": ("rotate",), "L3": ("twist",), "L4": ("same_texture",)}
+WEIGHTS = "ab" * 32
+WHERE = {"machine": "a machine", "commit": "abc"}
+
+
+def evaluation(policy: str, solved: int, *, ablation: str = "", late: int = 0) -> Results:
+    """The first `solved` of ten episodes of each task end well, `late` of them a step late."""
+    outcomes = tuple(
+        EpisodeOutcome(seed, seed < solved, 1 + (seed < late), "", "" if seed < solved else "missed")
+        for seed in range(EPISODES)
+    )
+    rows = tuple(Row(policy, task, x, 1, outcomes, ablation) for x, tasks in TASKS.items() for task in tasks)
+    return Results(rows, {"episodes": EPISODES}, {}, {policy: {"kind": "run", "sha256": WEIGHTS}})
+
+
+def training(folder: Path, name: str, solved: int, *, demonstrations: int = 500) -> dict[str, object]:
+    """Write an evaluation, and return the record of its training."""
+    evaluation("whatever", solved).write(folder / name / "results.json")
+    return {
+        "name": name,
+        "what": f"what is particular to {name}",
+        "demonstrations": demonstrations,
+        "steps": 100,
+        "minutes": 3.0,
+        "evaluation": f"{name}/results.json",
+    }
+
+
+@pytest.fixture
+def records(tmp_path: Path) -> list[dict[str, object]]:
+    return [
+        training(tmp_path, "full", 8),
+        training(tmp_path, "blind", 3),
+        training(tmp_path, "same", 8),
+        training(tmp_path, "vima", 1),
+        training(tmp_path, "tenth", 4, demonstrations=50),
+        training(tmp_path, "vima-tenth", 0, demonstrations=50),
+    ]
+
+
+@pytest.fixture
+def scores(tmp_path: Path) -> Path:
+    """Scores, controls and the original simulator; the previous weights are other ones."""
+    plain, blind = evaluation("mine", 9, late=2), evaluation("mine", 1, ablation="no_prompt")
+    swapped = [replace(row, ablation="swapped_attribute") for row in evaluation("mine", 4).rows[-1:]]
+    plain.write(tmp_path / "scores" / "default" / "results.json")
+    controls = replace(plain, rows=(*plain.rows, *blind.rows, *swapped))
+    controls.write(tmp_path / "scores" / "controls" / "results.json")
+    previous = replace(evaluation("old", 6), policies={"old": {"sha256": "cd" * 32}})
+    previous.write(tmp_path / "scores" / "previous" / "results.json")
+    for seed in range(4):
+        path = tmp_path / "scores" / "simulator" / "L3" / "rotate" / f"{seed}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"seed": seed, "success": seed > 0, "failure": False, "steps": 2}))
+    return tmp_path / "scores"
+
+
+@pytest.fixture
+def findings(tmp_path: Path, records: list, scores: Path) -> Findings:
+    (tmp_path / "list.json").write_text(json.dumps(records[:-1]))
+    (tmp_path / "one.json").write_text(json.dumps(records[-1]))
+    trainings = read_trainings([tmp_path / "list.json", tmp_path / "one.json"])
+    return find(read_scores(scores, WEIGHTS), trainings, baselines=trainings[3:4])
+
+
+def test_trainings_of_equal_effort_are_compared_and_the_others_make_curves(findings: Findings) -> None:
+    assert [training.name for training in findings.variants] == ["blind", "same", "vima"]
+    assert [training.name for training in findings.curve(vima=False)] == ["tenth", "full"]
+    assert [training.name for training in findings.curve(vima=True)] == ["vima-tenth", "vima"]
+
+
+def test_numbers_are_those_of_the_statistics(findings: Findings) -> None:
+    content = record(findings)
+    mean, interval = mean_of_rates([(9, EPISODES)] * 2)
+    level = content["scores"]["default"]["levels"][0]
+    assert (level["level"], level["ablation"], level["mean"]) == ("L1", "", mean)
+    assert level["interval"] == [round(end, 6) for end in interval]
+    assert content["scores"]["simulator"]["tasks"][0]["successes"] == 3
+    (blind, same, _) = content["differences"]
+    difference, interval = mean_difference([PairCounts(3, 0, 5, 2)] * 2)
+    assert blind["levels"][0]["difference"] == round(difference, 6) == -0.5
+    assert blind["levels"][0]["interval"] == [round(end, 6) for end in interval]
+    assert same["overall"]["verdict"] == "noise"
+    json.dumps(content)
+
+
+def lines_of(table: str) -> dict[str, list[str]]:
+    rows = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in table.splitlines()]
+    return {row[0]: row[1:] for row in rows if len(row) > 1}
+
+
+def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findings) -> None:
+    made = tables(findings)
+    lines = lines_of(made["simulator"])
+    assert lines["openvima-small"][4].startswith("75.0 (") and lines["openvima-small"][2] == "–"
+    assert lines["MIDAS, published"][2:] == ["97.8", "97.9", "93.4", "59.1"]
+    assert lines_of(made["levels"])["openvima-small"][2].startswith("90.0 (")
+    settings = lines_of(made["settings"])
+    assert settings["procedural assets"][2].startswith("90.0")
+    assert settings["previous weights"][0] == "8.5M"
+    assert settings["previous weights"][2].startswith("60.0")
+    assert "no prompt" in made["controls"] and "swapped" not in made["controls"]
+    swapped = lines_of(made["swapped_attribute"])["same\\_texture, L4"]
+    assert [cell.split()[0] for cell in swapped] == ["90.0", "40.0", "33.3"]
+    assert lines_of(made["failures"])["rotate, L1"][1] == "missed (1)"
+    assert made["ablations"].count("≈") == 4  # of the one that is the same, at every level
+    assert [line.split(" | ")[1] for line in made["scaling"].splitlines()[2:]] == ["50", "500", "50", "500"]
+    assert made["text"] == made["attributes"] == made["original_tasks"] == ""
+
+
+def test_scores_of_other_weights_are_refused_and_absent_ones_named(scores: Path, capsys) -> None:
+    assert set(read_scores(scores, WEIGHTS)) == {"simulator", "default", "controls", "previous"}
+    assert "detected is absent" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match=r"default is of weights abab.*bundled are efef"):
+        read_scores(scores, "ef" * 32)
+    with pytest.raises(DatasetError, match="holds no evaluation"):
+        read_scores(scores / "default", WEIGHTS)
+    with pytest.raises(DatasetError, match="has no episode"):
+        read_simulator(scores / "default")
+    (scores / "simulator" / "L3" / "rotate" / "2.json").write_text("{}")
+    with pytest.raises(DatasetError, match=r"2\.json cannot be read"):
+        read_simulator(scores / "simulator")
+
+
+@pytest.mark.slow
+def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findings: Findings) -> None:
+    page = tmp_path / "docs" / "page.md"
+    page.parent.mkdir()
+    page.write_text(
+        "before\n<!-- small:settings -->\nold\n<!-- /small:settings -->\nafter\n"
+        "<!-- small:levels-figure -->\n<!-- /small:levels-figure -->\n"
+    )
+    images = tmp_path / "docs" / "images"
+    for _ in range(2):  # the second time changes nothing
+        write(findings, tmp_path / "out", images, [page], WHERE)
+        text = page.read_text()
+        assert text.startswith("before\n<!-- small:settings -->\n") and "\nafter\n" in text
+        assert "old" not in text and text.count("| previous weights |") == 1
+        assert "](images/openvima_small_levels.png)" in text
+    assert {file.stem.split("_")[-1] for file in images.iterdir()} == {"levels", "scaling", "ablations"}
+    assert json.loads((tmp_path / "out.json").read_text())["machine"] == "a machine"
+    result = (tmp_path / "out.md").read_text()
+    assert "commit `abc`" in result and "preset small" in result
+
+
+def test_a_run_is_shipped_with_its_record(tmp_path: Path) -> None:
+    run, folder = tmp_path / "run", tmp_path / "package"
+    save_checkpoint(build_network(narrow_small(), seed=5), run)
+    session = {
+        "git": {"commit": "f" * 40, "changed": False},
+        "data": {"content_hash": "da7a", "counts": {"episodes": 9}},
+    }
+    times = [(0, 4, 1800.0), (1, 2, 3600.0), (1, 2, 0.0), (1, 6, 900.0)]  # resumed once
+    timings = [
+        {"stage": stage, "step": step, "seconds_since_start": s, "cpu_seconds_since_start": s / 2}
+        for stage, step, s in times
+    ]
+    for name, lines in (("sessions", [session]), ("timings", timings)):
+        (run / f"{name}_log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(DatasetError, match=r"lacks metrics\.jsonl"):
+        ship(run, folder)
+    (run / "metrics.jsonl").write_text("{}\n")
+    policy = (run / "config.yaml").read_text()  # of the checkpoint, as a run folder has its own
+    (run / "config.yaml").write_text(
+        f"training:\n  pretraining:\n    grating_prob: 0.4\n    eared_prob: 0.0\n{policy}"
+    )
+    folder.mkdir()
+    (folder / "training_data.json").write_text(json.dumps({"manifest": {"content_hash": "other"}}))
+    with pytest.raises(ConfigError, match=r"trained on data da7a.*are other"):
+        ship(run, folder)
+    (folder / "training_data.json").write_text(json.dumps({"manifest": {"content_hash": "da7a"}}))
+    assert shipped(folder) is None
+    ship(run, folder)
+    found = shipped(folder)
+    assert found is not None and (found.steps, found.hours, found.cpu_hours) == ((4, 6), 1.25, 0.625)
+    assert (found.commits, found.episodes) == (("f" * 12,), 9)
+    assert dict(facts(found))["demonstrations"] == "9, content hash da7a"
+    assert settings(folder) == [("pretraining.grating_prob", "0.4")]
+    assert (folder / "model.safetensors").stat().st_size < (run / "model.safetensors").stat().st_size
+    session["git"]["changed"] = True
+    (run / "sessions_log.jsonl").write_text(json.dumps(session))
+    with pytest.raises(ConfigError, match="uncommitted changes"):
+        ship(run, folder)
+
+
+def test_failures_are_drawn_from_recorded_actions(tmp_path: Path) -> None:
+    pytest.importorskip("PIL")
+    config = EvaluationConfig(("random",), ("rotate",), ("L1",), 2, seed=60_000, out=tmp_path / "evaluation")
+    evaluate(config)
+    (failure,) = failures(tmp_path / "evaluation")
+    assert failure.outcome.seed == 60_000 and failure.title == "rotate, L1: 2 of 2 failed"
+    assert len(failure.actions) == failure.outcome.steps
+    assert draw_failures(tmp_path / "evaluation", tmp_path / "failures.png") == tmp_path / "failures.png"
+    assert (tmp_path / "failures.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_wrong_inputs_are_named(tmp_path: Path, records: list) -> None:
+    file = tmp_path / "list.json"
+    with pytest.raises(DatasetError, match=r"list\.json"):
+        read_trainings([file])
+    file.write_text(json.dumps([{"name": "full"}]))
+    with pytest.raises(DatasetError, match="evaluation"):
+        read_trainings([file])
+    file.write_text(json.dumps([*records, records[1]]))
+    with pytest.raises(ConfigError, match="blind"):
+        read_trainings([file])
+    file.write_text(json.dumps(records))
+    with pytest.raises(UnknownPolicyError, match="ful"):
+        find({}, read_trainings([file]), baseline="ful")
+
+
+@pytest.mark.parametrize("text", ["<!-- small:text -->", "<!-- small:txt --><!-- /small:txt -->"])
+def test_marks_that_cannot_be_filled_are_named(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"page\.md.*text"):
+        fill(text, {"text": "table"}, where="page.md")
