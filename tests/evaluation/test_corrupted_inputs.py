@@ -108,6 +108,18 @@ def test_the_attribute_of_a_comparison_is_swapped_and_nothing_else():
     assert of == {"same_texture", "same_shape"}
 
 
+def test_each_prompt_image_lists_its_objects_in_an_order_of_its_own():
+    env, orders = begun("follow_order"), set()
+    changed = ablate(env, "shuffled_prompt_objects").prompt
+    assert changed.text == env.prompt.text
+    for name, image in env.prompt.images.items():
+        listed = changed.images[name].objects
+        assert sorted(map(str, listed)) == sorted(map(str, image.objects))
+        assert changed.images[name].segm is image.segm
+        orders.add(tuple(image.objects.index(record) for record in listed))
+    assert len(orders) > 1
+
+
 class Noting(RandomPolicy):
     """Notes the prompts; its actions depend on nothing."""
 

@@ -22,6 +22,7 @@ from openvima.training.augmentation.drop_unused_objects import without_unused_ob
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt  # noqa: E402
 from openvima.training.augmentation.paraphrase import paraphrased  # noqa: E402
 from openvima.training.augmentation.rename_objects import renamed  # noqa: E402
+from openvima.training.augmentation.shuffle_prompt_objects import with_shuffled_prompt_objects  # noqa: E402
 from openvima.training.augmentation.shuffle_sentences import shuffled  # noqa: E402
 from openvima.training.augmentation.unknown_words import UnknownWords  # noqa: E402
 from openvima.training.config import AugmentationConfig  # noqa: E402
@@ -215,3 +216,20 @@ def test_settings_that_need_objects_and_their_ids_say_so(settings, message, tmp_
     config = TrainingConfig.of({"data": tmp_path, "out": tmp_path / "run", **settings})
     with pytest.raises(ConfigError, match=message):
         train(config)
+
+
+@pytest.mark.parametrize("task", ["follow_order", "novel_adj"])
+def test_each_prompt_image_lists_its_objects_in_an_order_of_its_own(task, episodes):
+    episode, orders = episodes[task], set()
+    for seed in range(5):
+        shuffled_episode = with_shuffled_prompt_objects(episode, np.random.default_rng(seed))
+        before, after = _images(episode), _images(shuffled_episode)
+        assert {name: sorted(rows) for name, rows in after.items()} == {
+            k: sorted(v) for k, v in before.items()
+        }
+        orders.add(tuple(tuple(before[name].index(row) for row in rows) for name, rows in after.items()))
+    if task == "follow_order":
+        assert len(orders) == 5
+        assert any(len(set(order)) > 1 for order in orders)  # not one permutation for all frames
+    else:
+        assert orders == {((0,),) * len(before)}

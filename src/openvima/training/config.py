@@ -225,6 +225,8 @@ class AugmentationConfig:
             `tasks/paraphrases.yaml`.
         unknown_word_prob: Probability for each word of a task's prompt of the unknown token in its place, so
             that words which training lacks can be read past.
+        shuffle_prompt_objects_prob: Probability of listing the objects of each prompt image in an order of
+            its own; else an object has the same position in all frames.
     """
 
     false_positive_prob: Probability = 0.05
@@ -237,6 +239,7 @@ class AugmentationConfig:
     synonym_prob: Probability = 0.0
     paraphrase_prob: Probability = 0.0
     unknown_word_prob: Probability = 0.0
+    shuffle_prompt_objects_prob: Probability = 0.0
 
 
 @dataclass(frozen=True, slots=True)

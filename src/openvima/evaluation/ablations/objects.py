@@ -28,6 +28,15 @@ def shuffled(env: TabletopEnv, seen: AblatedInput, rng: np.random.Generator) -> 
     return replace(seen, prompt=RenderedPrompt(prompt.text, images), id_map=id_map)
 
 
+def with_shuffled_prompt_objects(prompt: RenderedPrompt, rng: np.random.Generator) -> RenderedPrompt:
+    """Let each prompt image list its objects in an order of its own; an object keeps its id."""
+    images = {
+        name: replace(image, objects=tuple(image.objects[k] for k in rng.permutation(len(image.objects))))
+        for name, image in prompt.images.items()
+    }
+    return replace(prompt, images=images)
+
+
 def jittered(seen: AblatedInput, pixels: int, rng: np.random.Generator) -> AblatedInput:
     """Move the borders of all boxes, in prompt images and observations."""
     jitter = BoxJitter(pixels, rng)

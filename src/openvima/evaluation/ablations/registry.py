@@ -19,7 +19,7 @@ from openvima.evaluation.ablations.environments import (
 )
 from openvima.evaluation.ablations.images import NEUTRAL_PROMPT, with_images_of_another
 from openvima.evaluation.ablations.inputs import AblatedInput
-from openvima.evaluation.ablations.objects import jittered, shuffled
+from openvima.evaluation.ablations.objects import jittered, shuffled, with_shuffled_prompt_objects
 from openvima.evaluation.ablations.words import (
     gibberish,
     masked,
@@ -214,6 +214,11 @@ INPUT_ABLATIONS = {
             "shuffled_objects",
             "Object ids are permuted; only with compat do they reveal the order of spawning.",
             lambda env, seen, rate, rng: shuffled(env, seen, rng),
+        ),
+        InputAblation(
+            "shuffled_prompt_objects",
+            "Each prompt image lists its objects in an order of its own.",
+            lambda env, seen, rate, rng: replace(seen, prompt=with_shuffled_prompt_objects(seen.prompt, rng)),
         ),
         InputAblation(
             DETECTED_BOXES,

@@ -13,6 +13,7 @@ from openvima.training.augmentation.drop_unused_objects import DropUnusedObjects
 from openvima.training.augmentation.inverse_dynamics import with_motion_prompt
 from openvima.training.augmentation.paraphrase import paraphrased
 from openvima.training.augmentation.rename_objects import renamed
+from openvima.training.augmentation.shuffle_prompt_objects import with_shuffled_prompt_objects
 from openvima.training.augmentation.shuffle_sentences import shuffled
 from openvima.training.augmentation.unknown_words import UnknownWords
 from openvima.training.config import AugmentationConfig
@@ -80,9 +81,10 @@ NO_AUGMENTATION = DemonstrationAugmentation()
 
 def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugmentation:
     """Return the transforms that the settings ask for."""
+    shuffle_prompt_objects = Randomly(config.shuffle_prompt_objects_prob, with_shuffled_prompt_objects)
     return DemonstrationAugmentation(
         config.inverse_dynamics_prob,
-        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob),),
+        of_inverse_dynamics=(DropUnusedObjects(config.drop_unused_objects_prob), shuffle_prompt_objects),
         of_tasks=(
             with_distractors,  # acts where the loader supplies another demonstration
             Randomly(config.paraphrase_prob, paraphrased),  # before others change the text
@@ -91,5 +93,6 @@ def demonstration_augmentation(config: AugmentationConfig) -> DemonstrationAugme
             # after those that look for images
             DescribeObjects(config.text_description_prob, config.synonym_prob),
             UnknownWords(config.unknown_word_prob),
+            shuffle_prompt_objects,
         ),
     )
