@@ -103,8 +103,10 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "augmentation.inverse_dynamics_prob": 0.0,
             "augmentation.drop_unused_objects_prob": 0.0,
             "augmentation.text_description_prob": 0.4,
+            "augmentation.synonym_prob": 0.3,
             "augmentation.paraphrase_prob": 0.4,
             "augmentation.unknown_word_prob": 0.03,
+            "augmentation.shuffle_prompt_objects_prob": 1.0,
         },
     }
 )
