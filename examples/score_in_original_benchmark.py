@@ -185,10 +185,10 @@ def main():
     args = parser.parse_args()
     specs = specifications()
     levels, tasks = args.levels.split(","), list(filter(None, args.tasks.split(",")))
-    known = sorted({task for options in specs.values() for task in options})
-    for kind, given, allowed in (("level", levels, specs), ("task", tasks, known)):
-        if unknown := [name for name in given if name not in allowed]:
-            parser.error(f"there is no {kind} {unknown[0]!r}; allowed: {', '.join(allowed)}.")
+    known = {task for level in levels for task in specs.get(level, ())}
+    for kind, given, allowed in (("level", levels, set(specs)), ("task", tasks, known)):
+        if unknown := sorted(set(given) - allowed):
+            parser.error(f"there is no {kind} {unknown[0]!r}; allowed: {', '.join(sorted(allowed))}.")
     if args.episodes < 1 or args.workers < 1 or args.seed < 0:
         parser.error("--episodes and --workers must be at least 1, and --seed at least 0.")
 
