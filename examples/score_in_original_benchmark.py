@@ -90,15 +90,12 @@ def reset(env, seed):
 def play(env, ask, seed):
     """Play an episode of at most two steps more than the oracle's and return its record."""
     seen, redraws = reset(env, seed)
-    request = {"prompt": encode_prompt(env)}
-    for _ in range(env.task.oracle_max_steps + 2):
-        action = ask({**encode_observation(env, seen), **request})
-        seen, _, done, info = env.step(action)
-        if done:
-            break
-        request = {}
+    prompt, steps, done = {"prompt": encode_prompt(env)}, 0, False
+    while not done and steps < env.task.oracle_max_steps + 2:
+        seen, _, done, info = env.step(ask({**encode_observation(env, seen), **prompt}))
+        prompt, steps = {}, steps + 1  # the server keeps the prompt
     outcome = {name: bool(info[name]) for name in ("success", "failure")}
-    return {"seed": seed, **outcome, "redraws": redraws, "prompt": env.prompt}
+    return {"seed": seed, **outcome, "steps": steps, "redraws": redraws, "prompt": env.prompt}
 
 
 def write(path, value):

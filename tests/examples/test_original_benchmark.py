@@ -83,7 +83,8 @@ def test_a_served_policy_is_scored_and_a_second_run_plays_what_is_missing(
     assert [image.kind for image in prompt.images.values()] == ["object", "scene"]
     assert prompt.images["scene"].rgb["top"].max() == 40001 % 256 and len(picker.prompts) == 10
     record = json.loads((tmp_path / "L4" / "same_texture" / "40001.json").read_text())
-    assert record == {"seed": 40001, "success": True, "failure": False, "redraws": 1, "prompt": prompt.text}
+    outcome = {"success": True, "failure": False, "steps": 2, "redraws": 1}
+    assert record == {"seed": 40001, **outcome, "prompt": prompt.text}
     assert picker.arm_pixels == {0}
 
     (tmp_path / "L2" / "twist" / "40003.json").unlink()
