@@ -57,7 +57,7 @@ class Training:
         what: Description, in one line.
         demonstrations: Number of training demonstrations.
         steps: Steps of behaviour cloning.
-        minutes: CPU minutes.
+        minutes: Minutes of training.
         results: Its evaluation, with the training's name for the policy.
         parameters: Parameters of the network; 0 if unknown.
     """

@@ -25,6 +25,7 @@ from openvima.report.paper import paper_tables
 from openvima.report.published import PublishedModel, leading_models, published_models
 from openvima.report.text import ablation_name, counted
 from openvima.report.typesetting import Estimate, Line, Table, markdown
+from weights import shipped
 
 _BESIDE = (("MIDAS", "92M"), ("VIMA", "200M"), ("VIMA", "9M"))  # best, best known, of similar size
 _PREVIOUS_SIZE = "8.5M"
@@ -61,7 +62,7 @@ def tables(findings: Findings) -> dict[str, str]:
         "failures": _failure_table(of.get("default")),
         "ablations": _ablation_table(findings) if findings.differences else None,
         "scaling": _scaling_table(findings) if findings.trainings else None,
-        "baselines": _baseline_table(findings.baselines) if findings.baselines else None,
+        "baselines": _baseline_table(findings) if findings.baselines else None,
     }
     return {name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()}
 
@@ -220,10 +221,19 @@ def _scaling_table(findings: Findings) -> Table:
     return Table("scaling", "", ("", "demonstrations", "steps", "minutes", *levels), tuple(lines))
 
 
-def _baseline_table(trainings: Sequence[Training]) -> Table:
-    """Architectures that were trained on the same demonstrations for the same time."""
+def _baseline_table(findings: Findings) -> Table:
+    """Architectures that were trained on the same demonstrations for the same time, and ours."""
+    trainings, own = findings.baselines, shipped(BUNDLED[POLICY].folder)
     levels = list(dict.fromkeys(level for training in trainings for level in training.means()))
-    lines = [
+    lines = []
+    if own is not None:
+        cells = (
+            f"{own.parameters / 1e6:.1f}M",
+            " + ".join(f"{each:,}" for each in own.steps),
+            f"{own.hours:.1f}",
+        )
+        lines = [Line(POLICY, (*cells, *_cells(findings.means(), levels)))]
+    lines += [
         Line(
             training.what,
             (
@@ -236,9 +246,7 @@ def _baseline_table(trainings: Sequence[Training]) -> Table:
         for training in trainings
     ]
     counts = (row.episodes for training in trainings for row in _plain(training.results))
-    return Table(
-        "baselines", _caption(counts), ("", "parameters", "steps", "CPU hours", *levels), tuple(lines)
-    )
+    return Table("baselines", _caption(counts), ("", "parameters", "steps", "hours", *levels), tuple(lines))
 
 
 def _cells(means: Mapping[str, LevelMean], levels: Sequence[str]) -> tuple[Estimate | str, ...]:

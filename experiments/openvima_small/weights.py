@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,7 @@ def ship(run: Path, folder: Path, data: Path | None = None) -> None:
     missing = [name for name in _FILES if not (run / name).is_file()]
     if missing:
         raise DatasetError(f"{run} lacks {', '.join(missing)}; give the folder of a finished training.")
-    sessions = _lines(run / "sessions_log.jsonl")
+    sessions = read_lines(run / "sessions_log.jsonl")
     changed = [each["git"]["commit"] for each in sessions if each.get("git", {}).get("changed", True)]
     if changed:
         raise ConfigError(f"{run} ran with uncommitted changes at {changed[0]}; train from a clean clone.")
@@ -93,12 +94,10 @@ def shipped(folder: Path) -> Shipped | None:
     """Read the record of the bundled weights; None where it is absent."""
     if not (folder / RECORD / "sessions_log.jsonl").is_file():
         return None
-    sessions, times = (_lines(folder / RECORD / f"{name}_log.jsonl") for name in ("sessions", "timings"))
+    sessions, times = (read_lines(folder / RECORD / f"{name}_log.jsonl") for name in ("sessions", "timings"))
     steps: dict[int, int] = {}
     for each in times:
         steps[each["stage"]] = max(each["step"], steps.get(each["stage"], 0))
-    # Each session counts from its start: the last time before the next start is its length.
-    ends = [a for a, b in zip(times, [*times[1:], {}], strict=True) if _starts(a, b)]
     return Shipped(
         policy_size(read_info(folder).config).parameters.total,
         (folder / WEIGHTS_FILE).stat().st_size,
@@ -106,8 +105,7 @@ def shipped(folder: Path) -> Shipped | None:
         sessions[-1]["data"]["counts"]["episodes"],
         tuple(dict.fromkeys(each["git"]["commit"][:_COMMITS] for each in sessions)),
         tuple(steps[stage] for stage in sorted(steps)),
-        sum(each["seconds_since_start"] for each in ends) / 3600,
-        sum(each["cpu_seconds_since_start"] for each in ends) / 3600,
+        *spent(times),
     )
 
 
@@ -136,10 +134,18 @@ def settings(folder: Path) -> list[tuple[str, str]]:
     return [(name, f"{value:g}") for name, value in chosen.items() if _SETTING.search(name) and value]
 
 
-def _starts(line: dict[str, Any], following: dict[str, Any]) -> bool:  # Any: JSON
-    """Whether a session ends with a line."""
-    return following.get("seconds_since_start", -1.0) < line["seconds_since_start"]
+def spent(times: Sequence[Mapping[str, Any]]) -> tuple[float, float]:  # Any: JSON
+    """Return wall-clock hours and CPU hours of the first process, from a log of times.
+
+    Each session counts from its start, so the last entry before a start is a session's length.
+    """
+    following = [*(each["seconds_since_start"] for each in times[1:]), -1.0]
+    ends = [each for each, then in zip(times, following, strict=True) if then < each["seconds_since_start"]]
+    kinds = ("seconds_since_start", "cpu_seconds_since_start")
+    wall, cpu = (sum(each[kind] for each in ends) / 3600 for kind in kinds)
+    return wall, cpu
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:  # Any: JSON
+def read_lines(path: Path) -> list[dict[str, Any]]:  # Any: JSON
+    """Read a log of a run, an object a line."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
