@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from openvima.data import Dataset
-from openvima.detector.augmentation import augment_frame, flip_horizontally, mix_channels
+from openvima.detector.augmentation import augment_frame, flip_horizontally, mix_channels, paste_object
 from openvima.detector.frames import FrameSampler, frame_of, held_out_frames
 from openvima.perception.objects import observe, observe_prompt_image
 
@@ -83,6 +83,27 @@ def test_mirroring_twice_changes_nothing_and_once_moves_boxes_with_masks(rectang
     for box, mask in zip(once.boxes.astype(int), once.masks, strict=True):
         assert mask[box[1] : box[3], box[0] : box[2]].all()
         assert mask.sum() == (box[2] - box[0]) * (box[3] - box[1])
+
+
+def test_a_pasted_object_covers_others_and_has_their_pixels(rectangles):
+    frame, counts = rectangles(), set()
+    for seed in range(30):
+        pasted = paste_object(frame, np.random.default_rng(seed))
+        counts.add(len(pasted.boxes))
+        if len(pasted.boxes) == len(frame.boxes):
+            assert np.array_equal(pasted.rgb, frame.rgb)
+            continue
+        *others, own = pasted.masks
+        assert not (np.array(others) & own).any()
+        assert np.array_equal(np.any(others, axis=0) | own, frame.masks.any(axis=0) | own)
+        colours = {tuple(colour) for colour in pasted.rgb[:, own].T.tolist()}
+        assert any(colours <= {tuple(c) for c in frame.rgb[:, m].T.tolist()} for m in frame.masks)
+        assert np.array_equal(pasted.rgb[:, ~own], frame.rgb[:, ~own])
+        left, upper, right, lower = pasted.boxes[-1].astype(int)
+        assert own[upper:lower, left:right].sum() == own.sum()
+        assert own[:, left].any() and own[upper].any()
+    assert counts == {len(frame.boxes), len(frame.boxes) + 1}
+    assert len(augment_frame(frame, np.random.default_rng(1), paste_prob=0.0).boxes) == len(frame.boxes)
 
 
 def test_only_objects_change_colour(rectangles):

@@ -166,6 +166,21 @@ def test_of_objects_in_one_place_those_of_one_colour_belong_together() -> None:
     np.testing.assert_array_equal(colours[FRONT], colours[TOP])
 
 
+def test_of_objects_in_one_place_those_of_one_pattern_belong_together() -> None:
+    """Stripes and a plain colour with the same mean."""
+    rgb = {view: np.zeros((3, *SHAPE), np.uint8) for view in VIEWS}
+    rgb["front"][0, 60:75, 100:121:2] = 254
+    rgb["front"][0, 76:91, 100:121] = 127
+    rgb["top"][0, 86:100, 100:121] = 127
+    rgb["top"][0, 101:107, 100:121:2] = 254
+    front = plain((100, 60, 120, 74), (100, 76, 120, 90))
+    top = plain((100, 86, 120, 99), (100, 101, 120, 106))
+    found = DetectedObjects(Fixed(front, top)).in_observation(observation(rgb))
+    assert found.masks.all()
+    is_striped = found.crops.max(axis=(2, 3, 4)) > 200
+    np.testing.assert_array_equal(is_striped[FRONT], is_striped[TOP])
+
+
 def test_detections_of_low_score_are_left_out() -> None:
     rows = boxes((10, 10, 20, 20), (50, 10, 60, 20), (90, 10, 99, 20))
     detector = Fixed(plain(), Detections(rows, scores=np.array([0.9, 0.3, 0.5])))

@@ -40,10 +40,15 @@ def frame_of(rgb: np.ndarray, segm: np.ndarray, ids: Sequence[int] | np.ndarray)
         segm: Object ids, shape (H, W), uint8.
         ids: The ids of objects.
     """
-    visible = np.bincount(segm.ravel(), minlength=_NUM_IDS) >= MIN_PIXELS
-    ids = np.array([object_id for object_id in ids if visible[object_id]], np.int64)
-    masks = segm == ids[:, None, None]
-    boxes = np.zeros((len(ids), 4), np.float32)
+    there = np.bincount(segm.ravel(), minlength=_NUM_IDS) > 0
+    ids = np.array([object_id for object_id in ids if there[object_id]], np.int64)
+    return frame_of_masks(rgb, segm == ids[:, None, None])
+
+
+def frame_of_masks(rgb: np.ndarray, masks: np.ndarray) -> Frame:
+    """Annotate an image from masks, shape (N, H, W), bool; too small ones are dropped."""
+    masks = masks[np.count_nonzero(masks, axis=(1, 2)) >= MIN_PIXELS]
+    boxes = np.zeros((len(masks), 4), np.float32)
     for index, mask in enumerate(masks):
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         boxes[index] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1

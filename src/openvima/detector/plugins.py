@@ -20,7 +20,7 @@ from openvima.data.reader import Dataset
 from openvima.detector import detector_folder, load_detector, load_extractor
 from openvima.errors import ConfigError
 from openvima.perception.objects import ObjectExtractor, ObjectViews, see_nothing
-from openvima.policies.detection import DetectedObjects
+from openvima.policies.detection import MATCHING_VERSION, DetectedObjects
 from openvima.policies.file_names import WEIGHTS_FILE
 from openvima.policies.sources import checkpoint_folder
 from openvima.scene import PromptImage
@@ -87,7 +87,8 @@ def plugged_boxes(source: str, *, fraction: float = 1.0) -> Boxes:
         detector = load_detector(folder)
         sizes, least = detector.network.config.to_dict(), DetectedObjects(detector).min_score
         weights = hashlib.blake2b((checkpoint_folder(folder) / WEIGHTS_FILE).read_bytes()).hexdigest()
-        name, content = DETECTOR, json.dumps([sizes, least, weights], sort_keys=True).encode()
+        values = [sizes, least, MATCHING_VERSION, weights]
+        name, content = DETECTOR, json.dumps(values, sort_keys=True).encode()
     else:
         extractor_maker(source)  # says which forms are allowed
         name, content = source.rpartition(":")[2], source_hash(source, what="boxes").encode()

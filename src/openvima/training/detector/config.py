@@ -23,6 +23,7 @@ class FrameLoaderConfig:
         prompt_prob: Probability of drawing a prompt image instead of an observation.
         rerendered_prob: Probability of rendering a frame's demonstration with random shapes and textures;
             gratings and containers with ears are among them.
+        paste_prob: Probability of pasting a copy of an object onto an object, as in stacks and containers.
         augment: Random colours and horizontal flips.
         validation_fraction: Fraction of the demonstrations held out to choose the best checkpoint.
         validation_frames: Frames drawn from them.
@@ -31,6 +32,7 @@ class FrameLoaderConfig:
     batch_size: Annotated[int, Range(2)] = 16
     prompt_prob: Probability = 0.25
     rerendered_prob: Probability = 0.0
+    paste_prob: Probability = 0.0
     augment: bool = True
     validation_fraction: Annotated[float, Range(0, 0.9)] = 0.02
     validation_frames: Annotated[int, Range(2)] = 200

@@ -140,11 +140,13 @@ class DetectorStage:
         return loss * weight
 
     def _frames(self, step: int) -> list[Frame]:
-        frames = []
+        frames, loader = [], self._config.loader
         for row in self._order.rows(step).tolist():
             rng = np.random.default_rng([self._config.seed, step, row])
             drawn = self._source.sample(row, rng)
-            frames += [augment_frame(f, rng) for f in drawn] if self._config.loader.augment else drawn
+            if loader.augment:
+                drawn = [augment_frame(frame, rng, paste_prob=loader.paste_prob) for frame in drawn]
+            frames += drawn
         return frames
 
 
