@@ -24,7 +24,7 @@ from openvima.training.validation import flattened
 RECORD = "training"  # folder beside the weights
 DATA = "training_data.json"
 _FILES = ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
-_SETTING = re.compile(r"(_prob|_steps|\.steps|_scenes|_px|_weight|batch_size|learning_rate)$")
+_SETTING = re.compile(r"(_prob|warmup_steps|\.steps|_scenes|_px|_weight|batch_size|learning_rate)$")
 _COMMITS = 12  # letters
 
 
