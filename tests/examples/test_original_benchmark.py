@@ -69,13 +69,13 @@ def test_a_served_policy_is_scored_and_a_second_run_plays_what_is_missing(
     picker: Picker, url: str, tmp_path: Path
 ) -> None:
     words = ("--url", url, "--out", tmp_path, "--levels", "L2,L4", "--tasks", "twist,same_texture")
-    table, _ = client(*words, "--episodes", 5, "--seed", 40000)
+    table, problem = client(*words, "--episodes", 5, "--seed", 40000)
     assert table.splitlines()[2:] == [
         "| L2 | twist | 3 of 5 | 23% to 88% |",
         "| L2 | **mean** | **60.0%** | |",
         "| L4 | same_texture | 3 of 5 | 23% to 88% |",
         "| L4 | **mean** | **60.0%** | |",
-    ]
+    ], problem
     prompt = picker.prompts[1]  # of seed 40001
     assert prompt.text == "Put the {dragged_obj_1} as in {scene}, not the {dragged_obj_1}."
     shown = {name: [(o.object_id, o.object) for o in image.objects] for name, image in prompt.images.items()}
