@@ -1,42 +1,49 @@
 r"""Ablations of the preset `small`, and its scaling with demonstrations.
 
-    python experiments/openvima_small/ablations.py --data train400 --crops openvima-small --out ablations \
+    python experiments/openvima_small/ablations.py --data train --crops run --out ablations \
         --only full,no-correspondence
 
-All variants are trained for the same number of steps and evaluated on the same episodes. Most start from
-the frozen crop encoder, appearance and attributes of the run `--crops`, so that only behaviour cloning
-differs. Two have a short pretraining of their own, with and without appearance randomization. Repeating a
-command resumes it.
+All variants are trained by one recipe for the same number of steps, each with several seeds, and evaluated on
+the same episodes, other ones for each seed. Most start from the frozen crop encoder of the run `--crops`, a
+checkpoint of the same recipe, so that only behaviour cloning differs. The others have a short pretraining of
+their own, and "short-pretraining" is what those are compared with.
+
+A killed command goes on where it was when repeated. Several may share the work: each takes what no other one
+is at. OUT/NAME.json describes each run (NAME-seed-S from the second seed on), and OUT/ablations.md has the
+differences, with intervals over seeds and episodes; `--table` only writes that.
 """
 
 import argparse
 import json
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-from safetensors.torch import load_file
 
 from openvima.atomic_io import atomic_write_file
 from openvima.cli.progress import progress_bar
 from openvima.data import Dataset
+from openvima.errors import FolderLockedError
 from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.results import Results
+from openvima.evaluation.statistics import PairCounts, difference_over_seeds, mean_over_seeds
 from openvima.policies.build import build_network
-from openvima.policies.checkpoint import read_info, save_checkpoint
-from openvima.policies.config import PolicyConfig
-from openvima.policies.file_names import TOKENIZER_FOLDER, WEIGHTS_FILE
-from openvima.policies.parameter_counts import policy_size
-from openvima.policies.pointer.config import CandidateHeadConfig, ObjectHeadConfig, PointerConfig, small
+from openvima.policies.checkpoint import load_network, save_checkpoint
+from openvima.policies.pointer.config import ObjectHeadConfig, PointerConfig
 from openvima.policies.presets import PRESETS
-from openvima.policies.sources import find_checkpoint
-from openvima.policies.t5 import tokenizer_for
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
+from openvima.policies.variants import with_variant
+from openvima.report.typesetting import Estimate, Line, Table, markdown
 from openvima.training import TrainingConfig, train
-from openvima.training.recipes import RECIPES
+from openvima.training.recipes import overridden, recipe_settings
 from weights import read_lines, spent
 
-_CROPS = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
+_PRETRAINED = ("images.crop_encoder.", "images.appearance.", "images.rotation.", "attributes.")
+_SHORT_PRETRAINING = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000}
+_NO_ATTRIBUTES = {"model.attributes": False, "pretraining.attribute_loss_weight": 0.0}
+
+Settings = dict[str, Any]  # Any: as in `TrainingConfig`
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,28 +52,94 @@ class Variant:
 
     Args:
         what: In a few words.
-        change: Changes the sizes of the network of `--crops`.
-        settings: Settings of training that differ.
-        is_pretrained: Whether it has a contrastive pretraining of its own, and takes nothing from `--crops`.
+        change: Changes the network of `--crops`.
+        settings: Settings of training that differ from the recipe.
+        baseline: The variant that it is compared with.
     """
 
     what: str
     change: Callable[[PointerConfig], PointerConfig] = lambda config: config
-    settings: dict[str, Any] = field(default_factory=dict)  # Any: as in `TrainingConfig`
-    is_pretrained: bool = False
+    settings: Settings = field(default_factory=dict)
+    baseline: str = "full"
+
+    @property
+    def has_own_crops(self) -> bool:
+        """Whether it pretrains a crop encoder of its own, instead of that of another run."""
+        return "pretraining.steps" in self.settings
 
 
-def _without_rotations(config: PointerConfig) -> PointerConfig:
-    return replace(config, images=replace(config.images, rotation_bins=0))
+def _without(part: str) -> Callable[[PointerConfig], PointerConfig]:
+    """Return a change of the network that sets one of its fields to None, False or 0."""
+
+    def change(config: PointerConfig) -> PointerConfig:
+        if part in ("correspondence", "coreference"):
+            return replace(config, **{part: None if part == "correspondence" else False})
+        if part in ("rotation_bins", "crop_dropout"):
+            return replace(config, images=replace(config.images, **{part: 0}))
+        return replace(config, head=replace(config.head, **{part: 0.0}))
+
+    return change
 
 
-def _with_dropout(config: PointerConfig, probability: float) -> PointerConfig:
-    return replace(config, images=replace(config.images, crop_dropout=probability))
+def _within_prompts_only(config: PointerConfig) -> PointerConfig:
+    assert config.correspondence
+    return replace(config, correspondence=replace(config.correspondence, within_view=False))
 
 
-def _without_appearance_loss(config: PointerConfig) -> PointerConfig:
-    assert isinstance(config.head, CandidateHeadConfig)
-    return replace(config, head=replace(config.head, appearance_loss_weight=0.0))
+def _probs_of_cloning() -> dict[str, Variant]:
+    """Leave out what `small-2` draws in behaviour cloning, one at a time, or add what it does not."""
+    return {
+        "inverse-dynamics": Variant(
+            "with inverse dynamics",
+            settings={
+                "augmentation.inverse_dynamics_prob": 0.2,
+                "augmentation.drop_unused_objects_prob": 0.35,
+            },
+        ),
+        "no-rerendering": Variant(
+            "no demonstrations with random appearance", settings={"loader.rerendered_prob": 0.0}
+        ),
+        "no-wording": Variant(
+            "no text descriptions, synonyms, paraphrases and unknown words",
+            settings={
+                f"augmentation.{name}_prob": 0.0
+                for name in ("text_description", "synonym", "paraphrase", "unknown_word")
+            },
+        ),
+        **{
+            name: Variant(what, settings={f"augmentation.{setting}": 0.0})
+            for name, what, setting in (
+                ("no-renaming", "no renamed objects", "rename_objects_prob"),
+                ("no-shuffling", "no shuffled sentences", "shuffle_sentences_prob"),
+                ("no-distractors", "no inserted distractors", "distractor_prob"),
+                ("no-false-positives", "no false positives", "false_positive_prob"),
+                ("no-object-shuffling", "prompt objects in order", "shuffle_prompt_objects_prob"),
+            )
+        },
+    }
+
+
+def _pretraining() -> dict[str, Variant]:
+    """A short pretraining, and what it is worth without each of its parts."""
+    parts = (
+        ("appearance-randomization", "appearance randomization", ("appearance_randomization_prob",)),
+        ("hard-negatives", "hard negatives", ("hard_negative_prob",)),
+        ("occlusion", "occlusion", ("occlusion_prob",)),
+        ("grayscale", "grayscale prompt images", ("grayscale_prob",)),
+        ("box-jitter", "box jitter", ("box_jitter_px",)),
+        (
+            "random-containers",
+            "gratings, ears, rings and blocks",
+            ("grating_prob", "eared_prob", "ring_and_block_prob"),
+        ),
+    )
+    found = {"short-pretraining": Variant("own pretraining of 1,000 steps", settings=_SHORT_PRETRAINING)}
+    for name, what, settings in parts:
+        off = {f"pretraining.{setting}": 0.0 for setting in settings}
+        found[f"no-{name}"] = Variant(
+            f"the same without {what}", settings={**_SHORT_PRETRAINING, **off}, baseline="short-pretraining"
+        )
+    return found
 
 
 VARIANTS = {
@@ -74,131 +147,157 @@ VARIANTS = {
     "pointing": Variant(
         "object head: place positions relative to visible objects only",
         lambda config: replace(config, head=ObjectHeadConfig(), attributes=None),
+        _NO_ATTRIBUTES,
+        baseline="no-attributes",
     ),
-    "no-attributes": Variant("no attributes", lambda config: replace(config, attributes=None)),
-    "no-correspondence": Variant(
-        "no correspondence between images", lambda config: replace(config, correspondence=None)
+    "no-attributes": Variant("no attributes", settings=_NO_ATTRIBUTES),
+    "no-correspondence": Variant("no correspondence between images", _without("correspondence")),
+    "no-view-correspondence": Variant("no correspondence within the view", _within_prompts_only),
+    "no-coreference": Variant("no coreference", _without("coreference")),
+    "no-rotation": Variant("no relative rotation", _without("rotation_bins")),
+    "no-appearance-loss": Variant("no appearance loss", _without("appearance_loss_weight")),
+    "no-grounding-loss": Variant("no grounding loss", _without("grounding_loss_weight")),
+    "no-dropout": Variant("no crop dropout", _without("crop_dropout")),
+    "one-prompt-query": Variant(
+        "one prompt object at once",
+        lambda config: replace(config, head=replace(config.head, num_prompt_queries=1)),
     ),
-    "no-appearance-loss": Variant("no appearance loss", _without_appearance_loss),
-    "no-coreference": Variant("no coreference", lambda config: replace(config, coreference=False)),
-    "no-rotation": Variant("no relative rotation", _without_rotations),
-    "no-dropout": Variant("no crop dropout", lambda config: _with_dropout(config, 0.0)),
-    "inverse-dynamics": Variant(
-        "with inverse dynamics",
-        settings={
-            "augmentation.inverse_dynamics_prob": 0.2,
-            "augmentation.drop_unused_objects_prob": 0.35,
-        },
-    ),
-    "no-renaming": Variant("no renamed objects", settings={"augmentation.rename_objects_prob": 0.0}),
-    "no-shuffling": Variant("no shuffled sentences", settings={"augmentation.shuffle_sentences_prob": 0.0}),
-    "no-distractors": Variant("no inserted distractors", settings={"augmentation.distractor_prob": 0.0}),
-    "no-rerendering": Variant(
-        "no demonstrations with random appearance", settings={"loader.rerendered_prob": 0.0}
-    ),
-    "no-wording": Variant(
-        "no text descriptions, paraphrases and unknown words",
-        settings={
-            "augmentation.text_description_prob": 0.0,
-            "augmentation.paraphrase_prob": 0.0,
-            "augmentation.unknown_word_prob": 0.0,
-        },
-    ),
-    "short-pretraining": Variant("own pretraining of 1,000 steps", is_pretrained=True),
-    "no-appearance-randomization": Variant(
-        "the same without appearance randomization",
-        settings={"pretraining.appearance_randomization_prob": 0.0},
-        is_pretrained=True,
-    ),
+    "two-layers": Variant("two decoder layers", settings={"model.num_layers": 2}),
+    "three-layers": Variant("three decoder layers", settings={"model.num_layers": 3}),
+    **_probs_of_cloning(),
+    **_pretraining(),
 }
 
 
 def main() -> int:
-    """Train and evaluate the selected variants."""
+    """Train and evaluate the selected variants, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
-    parser.add_argument("--crops", default="openvima-small", help="run of `small` after pretraining")
-    parser.add_argument("--recipe", default="small", help="recipe of the other settings")
+    parser.add_argument("--crops", required=True, help="run of the recipe after pretraining, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, help="folder of runs and results")
     parser.add_argument("--only", default=",".join(VARIANTS), help="variants, separated by commas")
-    parser.add_argument("--name", default="", help="name in the table, instead of the variant's")
-    parser.add_argument("--what", default="", help="short description, instead of the variant's")
-    parser.add_argument("--seed", type=int, default=0, help="seed of weights, order and augmentation")
-    parser.add_argument("--steps", type=int, default=400, help="steps of behaviour cloning")
+    parser.add_argument("--recipe", default="small-2", help="recipe that the variants differ from")
+    parser.add_argument("--seeds", default="0,1,2", help="seeds of weights, order and augmentation")
+    parser.add_argument("--steps", type=int, default=1500, help="steps of behaviour cloning")
+    parser.add_argument("--batch", type=int, default=64, help="demonstrations a step")
     parser.add_argument("--episodes", type=int, default=40, help="episodes per task and level")
-    parser.add_argument("--first-episode", type=int, default=0, help="first seed of the evaluation")
+    parser.add_argument("--first-episode", type=int, default=60_000, help="seed of the first of them")
     parser.add_argument("--workers", type=int, default=1, help="processes of the evaluation")
-    parser.add_argument("--levels", default="L1,L3,L4", help="levels of the evaluation")
+    parser.add_argument("--levels", default="L1,L2,L3,L4", help="levels of the evaluation")
+    parser.add_argument("--table", action="store_true", help="train nothing")
     given = parser.parse_args()
-    for name in given.only.split(","):
+    names, seeds = given.only.split(","), [int(seed) for seed in given.seeds.split(",")]
+    for name in names:
         if name not in VARIANTS:
             parser.error(f"there is no variant {name!r}; allowed: {', '.join(VARIANTS)}.")
-    for name in given.only.split(","):
-        row = _measure(given, name)
-        atomic_write_file(given.out / f"{row['name']}.json", json.dumps(row, indent=2) + "\n")
-        print(row)
+    for seed in () if given.table else seeds:  # all variants of one seed, then those of the next
+        for name in names:
+            row = _row_file(given.out, name, seed)
+            try:
+                if not row.exists():
+                    atomic_write_file(row, json.dumps(_measure(given, name, seed), indent=2) + "\n")
+            except FolderLockedError:
+                print(f"{name} with seed {seed} is another command's")
+    table = differences_table(given.out, seeds)
+    atomic_write_file(given.out / "ablations.md", table)
+    print(table)
     return 0
 
 
-def _measure(given: argparse.Namespace, name: str) -> dict[str, Any]:  # Any: plain JSON values
-    variant, folder = VARIANTS[name], given.out / (given.name or name)
-    settings = _settings(variant, given.recipe)
-    sizes: PolicyConfig = small()
-    if not variant.is_pretrained:
-        sizes, initial = _begin(variant, given.crops, folder / "init", given.seed)
-        settings |= {"init_from": str(initial)}
-    PRESETS[f"small-{name}"] = lambda: sizes
-    settings |= {"data": given.data, "preset": f"small-{name}", "seed": given.seed}
-    settings |= {"schedule.steps": given.steps, "schedule.checkpoint_every": min(200, given.steps)}
-    with progress_bar(f"training {name}") as report:
-        run = train(TrainingConfig.of({**settings, "out": folder / "run"}), report)
+def _row_file(out: Path, name: str, seed: int) -> Path:
+    return out / (f"{name}-seed-{seed}.json" if seed else f"{name}.json")
+
+
+def settings_of(name: str, recipe: str) -> Settings:
+    """Return the settings of a variant, without paths, seed and length."""
+    alone = {"runtime.processes": 1, "runtime.tensorboard": False}  # several commands share the cores instead
+    pretraining = {} if VARIANTS[name].has_own_crops else {"pretraining.steps": 0}
+    return overridden(recipe_settings(recipe), {**alone, **pretraining, **VARIANTS[name].settings})
+
+
+def _measure(given: argparse.Namespace, name: str, seed: int) -> dict[str, Any]:  # Any: plain JSON values
+    variant, row = VARIANTS[name], _row_file(given.out, name, seed)
+    folder, preset = row.with_suffix(""), f"small-{name}"
+    pretrained, stored = load_network(given.crops)
+    assert isinstance(pretrained.config, PointerConfig)
+    sizes = variant.change(pretrained.config)
+    PRESETS[preset] = lambda: sizes
+    settings = settings_of(name, given.recipe)
+    settings |= {"data": given.data, "out": folder / "run", "preset": preset, "seed": seed}
+    settings |= {"schedule.steps": given.steps, "schedule.checkpoint_every": min(250, given.steps)}
+    settings |= {"loader.batch_size": given.batch}
+    config = TrainingConfig.of(settings)
+    network = build_network(with_variant(sizes, asdict(config.model)), seed=seed)
+    if not variant.has_own_crops and not (folder / "init").exists():
+        own, other = network.state_dict(), pretrained.state_dict()
+        own |= {key: other[key] for key in own if key.startswith(_PRETRAINED)}
+        network.load_state_dict(own)
+        save_checkpoint(network, folder / "init", WordTokenizer(Vocabulary.read(stored)) if stored else None)
+    if not variant.has_own_crops:
+        config = replace(config, init_from=str(folder / "init"))
+    with progress_bar(f"training {row.stem}") as report:
+        run = train(config, report)
     evaluation = EvaluationConfig(
-        policies=(f"{given.name or name}={run}",),
+        policies=(f"{row.stem}={run}",),
         levels=tuple(given.levels.split(",")),
         episodes=given.episodes,
-        seed=given.first_episode,
+        seed=given.first_episode + seed * given.episodes,
         workers=given.workers,
         out=folder / "evaluation",
     )
-    with progress_bar(f"evaluation of {name}") as report:
+    with progress_bar(f"evaluation of {row.stem}") as report:
         evaluate(evaluation, report)
     return {
-        "name": given.name or name,
-        "what": given.what or variant.what,
+        "name": row.stem,
+        "what": variant.what,
         "demonstrations": len(Dataset(given.data)),
         "steps": given.steps,
-        "seed": given.seed,
-        "parameters": policy_size(read_info(find_checkpoint(run)).config).parameters.total,
+        "seed": seed,
+        "recipe": given.recipe,
+        "parameters": sum(p.numel() for p in network.parameters()),
         "minutes": round(60 * spent(read_lines(run / "timings_log.jsonl"))[0], 1),
         "evaluation": os.fspath(folder / "evaluation" / "results.json"),
     }
 
 
-def _settings(variant: Variant, recipe: str) -> dict[str, Any]:  # Any: as in `TrainingConfig`
-    """Return the settings of a recipe for a variant; the parts of its network are in its sizes already."""
-    kept = {
-        name: value
-        for name, value in RECIPES[recipe].items()
-        if variant.is_pretrained or not name.startswith(("pretraining.", "model."))
+def differences_table(out: Path, seeds: Sequence[int]) -> str:
+    """Write the success of all variants and their differences from their baselines, of the seeds of both."""
+    found: dict[str, dict[int, Results]] = {}
+    for name in VARIANTS:
+        for seed in seeds:
+            if (row := _row_file(out, name, seed)).exists():
+                found.setdefault(name, {})[seed] = Results.read(row.with_suffix("") / "evaluation")
+    levels = next(iter(next(iter(found.values())).values())).levels() if found else []
+    lines = []
+    for name, of_seeds in found.items():
+        baseline, cells = found.get(VARIANTS[name].baseline, {}), []
+        shared = sorted(of_seeds.keys() & baseline.keys())
+        for level in levels:
+            outcomes = {seed: _outcomes(results, level) for seed, results in of_seeds.items()}
+            counts = [[(sum(o.values()), len(o)) for o in tasks.values()] for tasks in outcomes.values()]
+            score = mean_over_seeds(counts)
+            cells.append(Estimate(score.mean, score.interval))
+            if not shared or VARIANTS[name].baseline == name:
+                cells.append("")
+                continue
+            pairs = [(outcomes[seed], _outcomes(baseline[seed], level)) for seed in shared]
+            difference, interval = difference_over_seeds(
+                [[PairCounts.of((a[t][e], b[t][e]) for e in a[t]) for t in a] for a, b in pairs]
+            )
+            mark = "≈" if interval[0] <= 0 <= interval[1] else ""
+            cells.append(Estimate(difference, interval, True, mark))
+        lines.append(Line(VARIANTS[name].what, (str(len(of_seeds)), *cells)))
+    columns = ("", "seeds", *(column for level in levels for column in (level, "difference")))
+    return markdown([Table("ablations", "", columns, tuple(lines))])
+
+
+def _outcomes(results: Results, level: str) -> Mapping[str, Mapping[int, bool]]:
+    """Success by task and seed of the episode."""
+    return {
+        row.task: {outcome.seed: outcome.success for outcome in row.outcomes}
+        for row in results.rows
+        if row.level == level
     }
-    steps = {"pretraining.steps": 1000, "pretraining.num_scenes": 4000} if variant.is_pretrained else {}
-    own = {"pretraining.steps": 0, **steps, "loader.batch_size": 64, "runtime.tensorboard": False}
-    own["runtime.processes"] = 1  # others do not know the presets that are made here
-    return {**kept, **own, **variant.settings}
-
-
-def _begin(variant: Variant, crops: str, folder: Path, seed: int) -> tuple[PolicyConfig, Path]:
-    """Write initial weights: fresh ones, with what contrastive pretraining of another run has learnt."""
-    source = find_checkpoint(crops)
-    config = read_info(source).config
-    assert isinstance(config, PointerConfig)  # `--crops` is a run of `small`
-    sizes = variant.change(config)
-    network = build_network(sizes, seed=seed)
-    own, other = network.state_dict(), load_file(source / WEIGHTS_FILE)
-    pretrained = {name: other[name] for name in own if name.startswith(_CROPS)}
-    network.load_state_dict({**own, **pretrained})
-    save_checkpoint(network, folder, tokenizer_for(sizes.prompt, source / TOKENIZER_FOLDER))
-    return sizes, folder
 
 
 if __name__ == "__main__":

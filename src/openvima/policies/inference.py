@@ -374,7 +374,7 @@ class NetworkPolicy(Policy):
             [[observation] for observation in observations], episodes.num_slots
         )
         features_KF, features = self._encode(stack, episodes.features)
-        history = batch.to(self.device)
+        history = batch if self.device.type == "cpu" else batch.to(self.device)
         previous_BC = episodes.actions_BC
         if previous_BC is None:
             previous_BC = torch.zeros(len(observations), ACTION_WIDTH, device=self.device)

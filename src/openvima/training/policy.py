@@ -14,7 +14,6 @@ from openvima.errors import ConfigError
 from openvima.policies.devices import torch_threads
 from openvima.policies.own_code import held_out_data
 from openvima.tasks.registry import held_out_tasks, list_tasks
-from openvima.training.augmentation.appearance_randomization import ShapeKinds
 from openvima.training.augmentation.inverse_dynamics import MOTION_TEXT
 from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, freezes_crops
 from openvima.training.building import build_learner, resolved
@@ -138,12 +137,9 @@ class _Stages:
             num_scenes=config.num_scenes,
             seed=self.config.seed,
             assets=self.config.assets,
-            augmentation=SceneAugmentation(
-                config.appearance_randomization_prob,
-                config.hard_negative_prob,
-                second_view=(compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes),
-                grayscale_prob=config.grayscale_prob,
-                kinds=ShapeKinds(config.grating_prob, config.eared_prob, config.ring_and_block_prob),
+            augmentation=SceneAugmentation.of(
+                config,
+                second_view=compares_rotations(network) or config.hard_negative_prob > 0 or with_attributes,
             ),
             with_attributes=with_attributes,
             report=self._say,

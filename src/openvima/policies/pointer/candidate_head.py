@@ -97,8 +97,9 @@ class CandidatePointerHead(nn.Module):
         right_BTC = right_BTC | ~has_pick[..., None]
         right_logits = mask_scores(place_logits, right_BTC)
         place = right_logits.argmax(-1)  # of the right ones that with the highest logit
-        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
-        true_offset = goal - candidates.positions_at(place)
+        points = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick), candidates.positions_at(place)
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place, points)
+        true_offset = goal - points[-1]
         yaw = yaw_to_bin(relative_yaw(targets.actions_BTC), config.num_yaw_bins)
         place_nll = place_logits.logsumexp(-1) - right_logits.logsumexp(-1)
         pick_appearance = self.pick.appearance_scores(inputs)
@@ -131,11 +132,13 @@ class CandidatePointerHead(nn.Module):
         candidates = self.candidates(inputs)
         pick = strategy(self.pick(inputs))
         place = strategy(self.place(inputs, candidates, pick))
-        offset, yaw_logits = self.relate(inputs, candidates, pick, place)
+        grasp, start = at(inputs.grasps_BTN2, pick), at(inputs.positions_BTN2, pick)
+        goal = candidates.positions_at(place)
+        offset, yaw_logits = self.relate(inputs, candidates, pick, place, (grasp, start, goal))
         offset = offset.to(inputs.positions_BTN2.dtype)  # half precision is too coarse for metres and radians
         yaw = bin_to_yaw(strategy(yaw_logits), self.config.num_yaw_bins, offset.dtype)
-        grasp, goal = at(inputs.grasps_BTN2, pick), candidates.positions_at(place) + offset
-        held = rotated(grasp - at(inputs.positions_BTN2, pick), yaw)
+        goal = goal + offset
+        held = rotated(grasp - start, yaw)
         return pick_and_place(grasp, torch.where(inputs.has_suction_BT[..., None], goal + held, goal), yaw)
 
     def trace(self, inputs: HeadInputs, choices: Sequence[torch.Tensor]) -> StepTrace:
@@ -159,11 +162,18 @@ class CandidatePointerHead(nn.Module):
         return PlaceCandidates(inputs, inputs.first_step, inputs.prompt.objects, self.grid(inputs.first_step))
 
     def relate(
-        self, inputs: HeadInputs, candidates: PlaceCandidates, pick_BT: torch.Tensor, place_BT: torch.Tensor
+        self,
+        inputs: HeadInputs,
+        candidates: PlaceCandidates,
+        pick_BT: torch.Tensor,
+        place_BT: torch.Tensor,
+        points_BT2: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Offset from the candidate in metres, (B, T, 2), and logits of yaw bins, (B, T, bins)."""
-        grasp, start = at(inputs.grasps_BTN2, pick_BT), at(inputs.positions_BTN2, pick_BT)
-        goal = candidates.positions_at(place_BT)
+        """Offset from the candidate in metres, (B, T, 2), and logits of yaw bins, (B, T, bins).
+
+        The points are grasp and position of the picked object, and the position of the candidate.
+        """
+        grasp, start, goal = points_BT2
         metric = torch.cat([grasp - start, start - 0.5, goal - 0.5, goal - start], dim=-1) / OFFSET_UNIT_M
         token_BTD = candidates.tokens_at(place_BT)
         by_kind_BTED = torch.stack([layer(token_BTD) for layer in self.values], dim=2)

@@ -75,10 +75,12 @@ class CorrespondenceConfig:
     Args:
         hidden_width: Width of the hidden layer that reads the differences.
         num_heads: Objects that each object is compared with, such as the latest and the earliest similar one.
+        within_view: Compare the objects in view with each other, too.
     """
 
     hidden_width: int = 192
     num_heads: int = 2
+    within_view: bool = True
 
     def __post_init__(self) -> None:
         if self.hidden_width < 1 or self.num_heads < 1:

@@ -175,7 +175,7 @@ class Correspondence(nn.Module):
         scores_HNM = (
             scores_HNM - distance_bias * distance_NM.unsqueeze(-3) - recency_bias * age_NM.unsqueeze(-3)
         )
-        scores_HNM = scores_HNM.masked_fill(~allowed_HNM, torch.finfo(scores_HNM.dtype).min)
+        scores_HNM = torch.where(allowed_HNM, scores_HNM, torch.finfo(scores_HNM.dtype).min)
         weights_HNM = torch.softmax(scores_HNM, dim=-1) * allowed_HNM
         # Whether anything is found depends on similarity alone; the biases only break ties.
         found_HN1 = (weights_HNM * similarity_HNM).sum(-1, keepdim=True) - threshold

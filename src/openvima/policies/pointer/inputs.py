@@ -122,4 +122,4 @@ def at(values_BTNX: torch.Tensor, slot_BT: torch.Tensor) -> torch.Tensor:
 
 def mask_scores(scores: torch.Tensor, exists: torch.Tensor) -> torch.Tensor:
     """Give what does not exist the most negative finite score."""
-    return scores.masked_fill(~exists, torch.finfo(scores.dtype).min)
+    return torch.where(exists, scores, torch.finfo(scores.dtype).min)

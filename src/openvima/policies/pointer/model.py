@@ -309,9 +309,12 @@ class Pointer(PolicyNetwork):
         if self.correspondence is None or self.prompt_correspondence is None:
             return objects.appearance_NA.new_zeros(())
         shown, rotation_between = prompt.features.at_each_step(), self._rotation_between
-        within_BTND, _ = self.correspondence(objects, objects, is_another(objects), rotation_between)
         allowed = in_earlier_image(objects, shown)
-        return within_BTND + self.prompt_correspondence(objects, shown, allowed, rotation_between)[0]
+        changes_BTND, _ = self.prompt_correspondence(objects, shown, allowed, rotation_between)
+        if self.config.correspondence and self.config.correspondence.within_view:
+            others = is_another(objects)
+            changes_BTND = self.correspondence(objects, objects, others, rotation_between)[0] + changes_BTND
+        return changes_BTND
 
     @property
     def _rotation_between(self) -> RotationBetween | None:

@@ -24,6 +24,7 @@ from openvima.training.augmentation.appearance_randomization import ShapeKinds, 
 from openvima.training.augmentation.grayscale import draw_grayscale, grayscale
 from openvima.training.augmentation.hard_negatives import with_hard_negatives
 from openvima.training.augmentation.rearranged_view import rearranged
+from openvima.training.config import PretrainingConfig
 from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.attribute_labels import AttributeLabeller, AttributeLabels, name_id
 from openvima.training.schedule import step_seed
@@ -103,6 +104,17 @@ class SceneAugmentation:
     second_view: bool = False
     grayscale_prob: float = 0.0
     kinds: ShapeKinds | None = None
+
+    @staticmethod
+    def of(config: PretrainingConfig, *, second_view: bool) -> "SceneAugmentation":
+        """Return the augmentation that the settings of a stage ask for."""
+        return SceneAugmentation(
+            config.appearance_randomization_prob,
+            config.hard_negative_prob,
+            second_view=second_view,
+            grayscale_prob=config.grayscale_prob,
+            kinds=ShapeKinds(config.grating_prob, config.eared_prob, config.ring_and_block_prob),
+        )
 
     def __call__(
         self, scene: Scene, shades: AbstractSet[str], assets: Assets, rng: np.random.Generator
