@@ -16,7 +16,7 @@ from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
 from openvima.training.loop import Metrics
-from openvima.training.parallel import Parallel
+from openvima.training.parallel import ONE_PROCESS, Parallel
 from openvima.training.pretraining.stage import crop_parameters
 from openvima.training.source import ExampleSource, Parts, by_length, order_of
 
@@ -149,12 +149,15 @@ def freezes_crops(network: PolicyNetwork, config: TrainingConfig) -> bool:
     return has_appearance and is_pretrained and not pretraining.finetune_crop_encoder
 
 
-def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
+def freeze_crops(
+    learner: PolicyLearner, caches: Sequence[ObjectCache], parallel: Parallel = ONE_PROCESS
+) -> None:
     """Freeze the crop encoder, and precompute the features of all images unless there are too many.
 
     Args:
         learner: Its crop encoder is frozen.
         caches: All training data; image indices count through all of them.
+        parallel: Processes that share the work.
     """
     for parameter in crop_parameters(learner.network):
         parameter.requires_grad_(False)
@@ -163,16 +166,17 @@ def freeze_crops(learner: PolicyLearner, caches: Sequence[ObjectCache]) -> None:
         return
     device = next(learner.parameters()).device
     height, width = learner.processor.image_size
-    parts = [np.zeros((1, 3, height, width), np.uint8)]  # index 0 is black
-    features = []
+    chunks = [(cache, start) for cache in caches for start in range(0, len(cache), CHUNK)]
     with torch.no_grad():
-        for cache in caches:
-            for start in range(0, len(cache), CHUNK):
-                parts += [episode.images for episode in cache[start : start + CHUNK]]
-                images = torch.from_numpy(np.concatenate(parts)).to(device)
-                features.append(learner.network.encode_images(images))
-                parts = []
-    learner.features = torch.cat(features)
+        black = learner.network.encode_images(
+            torch.zeros(1, 3, height, width, dtype=torch.uint8, device=device)
+        )
+        features = [black[: parallel.is_first]]  # it has index 0
+        for number in parallel.part_of(len(chunks)):
+            cache, start = chunks[number]
+            images = np.concatenate([episode.images for episode in cache[start : start + CHUNK]])
+            features.append(learner.network.encode_images(torch.from_numpy(images).to(device)))
+    learner.features = parallel.rows_of_all(torch.cat(features))
 
 
 def _num_cpus() -> int:

@@ -166,7 +166,7 @@ class _Stages:
                     describes=describes,
                 )
             if freezes_crops(learner.network, config):
-                freeze_crops(learner, caches)
+                freeze_crops(learner, caches, self.parallel)
         if config.runtime.compile:
             compile_layers(learner)
         module = self.parallel.wrap(learner)
