@@ -156,8 +156,8 @@ def test_of_objects_in_one_place_those_of_one_colour_belong_together() -> None:
     rgb = {view: np.zeros((3, *SHAPE), np.uint8) for view in VIEWS}
     rgb["front"][0, 60:75, 100:121] = 255  # the red one stands behind
     rgb["front"][1, 76:91, 100:121] = 255
-    rgb["top"][1, 86:100, 100:121] = 255
-    rgb["top"][0, 101:107, 100:121] = 255  # but seems in front from above
+    rgb["top"][0, 86:100, 100:121] = 255
+    rgb["top"][1, 101:107, 100:121] = 255  # farther from its place in the front view than the red one
     front = plain((100, 60, 120, 74), (100, 76, 120, 90))
     top = plain((100, 86, 120, 99), (100, 101, 120, 106))
     found = DetectedObjects(Fixed(front, top)).in_observation(observation(rgb))
@@ -171,8 +171,8 @@ def test_of_objects_in_one_place_those_of_one_pattern_belong_together() -> None:
     rgb = {view: np.zeros((3, *SHAPE), np.uint8) for view in VIEWS}
     rgb["front"][0, 60:75, 100:121:2] = 254
     rgb["front"][0, 76:91, 100:121] = 127
-    rgb["top"][0, 86:100, 100:121] = 127
-    rgb["top"][0, 101:107, 100:121:2] = 254
+    rgb["top"][0, 86:100, 100:121:2] = 254
+    rgb["top"][0, 101:107, 100:121] = 127
     front = plain((100, 60, 120, 74), (100, 76, 120, 90))
     top = plain((100, 86, 120, 99), (100, 101, 120, 106))
     found = DetectedObjects(Fixed(front, top)).in_observation(observation(rgb))
