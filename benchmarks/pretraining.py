@@ -2,9 +2,9 @@
 
     python benchmarks/pretraining.py [--scenes N] [--batch K] [--rounds R] [--json FILE]
 
-Crop encoders whose last layers have kernels of 3 and 1 take steps in turns, on the same batches; a first
-round warms up. Times are CPU time, medians. "augmentation" is that of a batch, "encoder" forward and backward
-passes of the crop encoder alone; most of what remains of a step is losses.
+Crop encoders of several sizes (channels of the first layer, kernel of the last one) take steps in turns, on
+the same batches; a first round warms up. Times are CPU time, medians. "augmentation" is that of a batch,
+"encoder" forward and backward passes of the crop encoder alone; most of what remains of a step is losses.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from openvima.training.pretraining.stage import ContrastivePretraining
 from openvima.training.recipes import recipe_settings
 from sim import circumstances
 
-KERNELS = (3, 1)
+ENCODERS = ((48, 3), (48, 1), (32, 1))
 
 
 def augmented(pairs: Pairs, config: TrainingConfig) -> Pairs:
@@ -66,9 +66,9 @@ def measure(num_scenes: int, batch: int, num_rounds: int) -> dict[str, float]:
     found = {"scene_ms": 1000 * (time.process_time() - start) / num_scenes, "objects": len(pairs.scenes)}
     times: dict[str, list[float]] = {}
     stages = {}
-    for kernel in KERNELS:
-        sizes = with_variant(small(), {"attributes": True, "crop_kernel": kernel})
-        stages[kernel] = ContrastivePretraining(
+    for width, kernel in ENCODERS:
+        sizes = with_variant(small(), {"attributes": True, "crop_width": width, "crop_kernel": kernel})
+        stages[f"{width}_channels_kernel_{kernel}"] = ContrastivePretraining(
             build_network(sizes, seed=0), config.pretraining, 0, pairs, ONE_PROCESS, WordTokenizer().encode
         )
     part = pairs.select(torch.arange(batch))
@@ -78,9 +78,9 @@ def measure(num_scenes: int, batch: int, num_rounds: int) -> dict[str, float]:
         stage.encoder.encode_images(crops).sum().backward()
 
     works: dict[str, Callable[[int], object]] = {"augmentation_ms": lambda _: augmented(part, config)}
-    for kernel, stage in stages.items():
-        works[f"step_ms_kernel_{kernel}"] = stage.backward
-        works[f"encoder_ms_kernel_{kernel}"] = lambda _, stage=stage: encode(stage)
+    for name, stage in stages.items():
+        works[f"step_ms_{name}"] = stage.backward
+        works[f"encoder_ms_{name}"] = lambda _, stage=stage: encode(stage)
     for number in range(num_rounds + 1):
         for name, work in works.items():
             start = time.process_time()
@@ -104,7 +104,7 @@ def main() -> None:
         name: round(value, 1) for name, value in measure(given.scenes, given.batch, given.rounds).items()
     }
     for name, value in result.items():
-        print(f"{name:24}{value:10.1f}")
+        print(f"{name:36}{value:10.1f}")
     if given.json:
         given.json.write_text(json.dumps(result | circumstances(), indent=2) + "\n", encoding="utf-8")
 

@@ -26,7 +26,10 @@ VARIANTS = [
     ("vima-nano", {"width": 96, "num_layers": 1, "tuned_layers": 1}),
     (
         "nano",
-        {"width": 64, "num_layers": 3, "visual_residual": True, "conditioning": "prefix", "crop_kernel": 1},
+        {
+            **{"width": 64, "num_layers": 3, "visual_residual": True, "conditioning": "prefix"},
+            **{"crop_kernel": 1, "crop_width": 16},
+        },
     ),
 ]
 SLOW_VARIANTS = [
@@ -206,6 +209,7 @@ def test_the_objects_of_one_prompt_image_do_not_reach_the_tokens_of_another(name
         ("vima-nano", {"num_layers": 10**6}, "num_layers is 1000000; it must be a whole number between"),
         ("nano", {"head": "mixture"}, "pointers to candidates alone"),
         ("nano", {"crop_kernel": 2}, "last_kernel is 2; it must be"),
+        ("nano", {"crop_width": 18}, "width is 18; it must be a multiple of 4"),
         ("vima-2m", {"crop_kernel": 1}, "crop_kernel is 1, but the network has no convolutions"),
         ("vima-nano", {"conditioning": "suffix"}, "conditioning.*suffix.*cross-attention"),
         ("vima-nano", {"colour": "red"}, "colour"),

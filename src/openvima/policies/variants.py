@@ -227,10 +227,23 @@ def with_crop_kernel(config: PolicyConfig, size: Literal[1, 3]) -> PolicyConfig:
     Raises:
         ConfigError: The network encodes no crops by convolutions.
     """
+    return _with_convolutions(config, f"crop_kernel is {size}", last_kernel=size)
+
+
+def with_crop_width(config: PolicyConfig, width: int) -> PolicyConfig:
+    """Return the same network with so many channels in the first layer of its crop encoder.
+
+    Raises:
+        ConfigError: The network encodes no crops by convolutions, or the width is no multiple of 4.
+    """
+    return _with_convolutions(config, f"crop_width is {width}", width=width)
+
+
+def _with_convolutions(config: PolicyConfig, given: str, **sizes: int) -> PolicyConfig:
     images = config.images
     if not isinstance(images, ObjectEncoderConfig) or not isinstance(images.crop, ConvConfig):
-        raise ConfigError(f"crop_kernel is {size}, but the network has no convolutions; take nano or small.")
-    return replace(config, images=replace(images, crop=replace(images.crop, last_kernel=size)))
+        raise ConfigError(f"{given}, but the network has no convolutions; take nano or small.")
+    return replace(config, images=replace(images, crop=replace(images.crop, **sizes)))
 
 
 # In the order in which they are made: later ones see the parts of earlier ones.
@@ -245,4 +258,5 @@ SWITCHES: Mapping[str, Callable[[PolicyConfig, Any], PolicyConfig]] = {
     "visual_residual": with_visual_residual,
     "attributes": with_attributes,
     "crop_kernel": with_crop_kernel,
+    "crop_width": with_crop_width,
 }

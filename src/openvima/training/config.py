@@ -86,6 +86,7 @@ class ModelConfig:
             preset small; `pretraining.attribute_loss_weight` trains them.
         crop_kernel: Kernel size of the last layer of a convolutional crop encoder (nano, small): 1 takes
             about half of the multiply-adds of 3.
+        crop_width: Channels of its first layer, a multiple of 4; the next have 2, 4 and 4 times as many.
     """
 
     head: Literal["bins", "autoregressive", "mixture", "regression"] | None = None
@@ -98,6 +99,7 @@ class ModelConfig:
     num_layers: Count | None = None
     attributes: bool | None = None
     crop_kernel: Literal[1, 3] | None = None
+    crop_width: Count | None = None
 
 
 @dataclass(frozen=True, slots=True)
