@@ -22,13 +22,14 @@ import torch
 from openvima.catalog.partitions import tasks_at
 from openvima.policies.build import build_network
 from openvima.policies.pointer.config import small
-from openvima.policies.tokenizer import WordTokenizer
+from openvima.policies.tokenizer import Vocabulary, WordTokenizer
 from openvima.policies.variants import with_variant
 from openvima.training import TrainingConfig
 from openvima.training.augmentation.box_jitter import with_box_jitter
 from openvima.training.augmentation.horizontal_flip import with_horizontal_flips
 from openvima.training.augmentation.occlusion import with_occlusion
 from openvima.training.parallel import ONE_PROCESS
+from openvima.training.pretraining.captions import caption_texts
 from openvima.training.pretraining.pairs import Pairs, SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining
 from openvima.training.recipes import recipe_settings
@@ -64,12 +65,13 @@ def measure(num_scenes: int, batch: int, num_rounds: int) -> dict[str, float]:
     start = time.process_time()
     pairs = rendered(num_scenes)
     found = {"scene_ms": 1000 * (time.process_time() - start) / num_scenes, "objects": len(pairs.scenes)}
+    tokenizer = WordTokenizer(Vocabulary().extended(caption_texts()))
     times: dict[str, list[float]] = {}
     stages = {}
     for width, kernel in ENCODERS:
         sizes = with_variant(small(), {"attributes": True, "crop_width": width, "crop_kernel": kernel})
         stages[f"{width}_channels_kernel_{kernel}"] = ContrastivePretraining(
-            build_network(sizes, seed=0), config.pretraining, 0, pairs, ONE_PROCESS, WordTokenizer().encode
+            build_network(sizes, seed=0), config.pretraining, 0, pairs, ONE_PROCESS, tokenizer.encode
         )
     part = pairs.select(torch.arange(batch))
     crops = torch.cat([augmented(part, config).scene_crops] * 3)

@@ -171,7 +171,8 @@ VARIANTS = {
 
 def main() -> int:
     """Train and evaluate the selected variants, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--data", type=Path, required=True, help="folder of demonstrations")
     parser.add_argument("--crops", required=True, help="run of the recipe after pretraining, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, help="folder of runs and results")
