@@ -3,13 +3,11 @@
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from openvima.errors import ConfigError, DatasetError, OpenVimaError, UnknownPolicyError, unknown_name
-from openvima.evaluation.comparison import Comparison, compare_pairs
-from openvima.evaluation.merging import merge
+from openvima.errors import ConfigError, DatasetError, OpenVimaError
 from openvima.evaluation.results import EpisodeOutcome, LevelMean, Results, Row
 from openvima.input_files import read_json
 
@@ -45,12 +43,12 @@ SIMULATORS = {
 }
 _OTHER_WEIGHTS = ("second_seed", "without_", "previous")
 _DETECTED = "detected_boxes"
-_VIMA = "vima"  # names of trainings of its architecture begin so
+ABLATIONS, BASELINES = "ablations", "baselines"  # what the scripts of these names write
 
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """One evaluated training.
+    """One evaluated training of another architecture.
 
     Args:
         name: Short and unique.
@@ -70,11 +68,6 @@ class Training:
     results: Results
     parameters: int = 0
 
-    @property
-    def is_vima(self) -> bool:
-        """Whether it is VIMA's architecture."""
-        return self.name.startswith(_VIMA)
-
     def means(self) -> dict[str, LevelMean]:
         """Success by level."""
         return level_means(self.results)
@@ -86,31 +79,13 @@ class Findings:
 
     Args:
         scores: Evaluations by the names of `EVALUATIONS` and `SIMULATORS`; absent ones are not there.
-        trainings: Smaller trainings, compared with each other.
-        baseline: The one with the full model.
-        differences: Of each training with as many demonstrations and steps minus the baseline.
-        baselines: Other architectures at equal cost, and ours.
+        ablations: Table of `ablations.py`, in Markdown; empty if absent.
+        baselines: Other architectures at equal cost.
     """
 
     scores: Mapping[str, Results]
-    trainings: tuple[Training, ...] = ()
-    baseline: Training | None = None
-    differences: Mapping[str, Comparison] = field(default_factory=dict)
+    ablations: str = ""
     baselines: tuple[Training, ...] = ()
-
-    @property
-    def variants(self) -> list[Training]:
-        """Trainings that can be compared with the baseline, in the order given."""
-        return [training for training in self.trainings if training.name in self.differences]
-
-    def curve(self, *, vima: bool) -> list[Training]:
-        """Trainings of one architecture, by demonstrations ascending: the full model, or VIMA's."""
-        chosen = [
-            training
-            for training in self.trainings
-            if training.is_vima == vima and (vima or training.name not in self.differences)
-        ]
-        return sorted(chosen, key=lambda training: (training.demonstrations, training.steps))
 
     def means(self, name: str = "default") -> dict[str, LevelMean]:
         """Plain success rate by level; of `detected` and `previous_detected` that with detected boxes."""
@@ -124,11 +99,12 @@ def level_means(results: Results, ablation: str = "") -> dict[str, LevelMean]:
     return {mean.level: mean for mean in results.level_means() if mean.ablation == ablation}
 
 
-def read_scores(folder: Path, weights: str) -> dict[str, Results]:
-    """Read what a folder holds of `EVALUATIONS` and `SIMULATORS`; a line on stderr names what is absent.
+def find(folder: Path, weights: str) -> Findings:
+    """Read what a folder holds; a line on stderr names what is absent.
 
     Args:
-        folder: The folder.
+        folder: The folder, with a folder of each name of `EVALUATIONS`, `SIMULATORS`, `ABLATIONS` and
+            `BASELINES`.
         weights: SHA-256 of the bundled weights, which all evaluations but those of other weights must have.
 
     Raises:
@@ -136,22 +112,25 @@ def read_scores(folder: Path, weights: str) -> dict[str, Results]:
         ConfigError: An evaluation is of other weights.
     """
     found: dict[str, Results] = {}
-    for name in (*SIMULATORS, *EVALUATIONS):
-        if not (folder / name).is_dir():
+    known = (*SIMULATORS, *EVALUATIONS, ABLATIONS, BASELINES)
+    present = [name for name in known if (folder / name).is_dir()]
+    if not present:
+        raise DatasetError(f"{folder} holds no evaluation; it may hold the folders {', '.join(known)}.")
+    for name in known:
+        if name not in present:
             print(f"{folder / name} is absent; its tables are left out.", file=sys.stderr)
         elif name in SIMULATORS:
             found[name] = read_simulator(folder / name)
-        else:
+        elif name in EVALUATIONS:
             found[name] = _of_first_policy(Results.read(folder / name), POLICY)
             own = next(iter(found[name].policies.values())).get("sha256", "")
             if own != weights and not name.startswith(_OTHER_WEIGHTS):
                 raise ConfigError(
                     f"{folder / name} is of weights {own[:12]}; those bundled are {weights[:12]}."
                 )
-    if not found:
-        known = ", ".join((*SIMULATORS, *EVALUATIONS))
-        raise DatasetError(f"{folder} holds no evaluation; it may hold the folders {known}.")
-    return found
+    table = folder / ABLATIONS / "ablations.md"
+    trainings = read_trainings(sorted((folder / BASELINES).glob("*.json")))
+    return Findings(found, table.read_text(encoding="utf-8").strip() if table.is_file() else "", trainings)
 
 
 def read_simulator(folder: Path) -> Results:
@@ -232,34 +211,3 @@ def _of_first_policy(results: Results, name: str) -> Results:
     first = results.policy_names()[0]
     rows = tuple(replace(row, policy=name) for row in results.rows if row.policy == first)
     return replace(results, rows=rows, policies={name: dict(results.policies.get(first, {}))})
-
-
-def find(
-    scores: Mapping[str, Results],
-    trainings: Sequence[Training] = (),
-    *,
-    baselines: Sequence[Training] = (),
-    baseline: str = "full",
-) -> Findings:
-    """Put together what is known.
-
-    Raises:
-        UnknownPolicyError: There is no such baseline.
-        ConfigError: Two trainings that are compared played different episodes.
-    """
-    by_name = {training.name: training for training in trainings}
-    if not by_name:
-        return Findings(scores, baselines=tuple(baselines))
-    if baseline not in by_name:
-        raise UnknownPolicyError(unknown_name("training", baseline, by_name))
-    full = by_name[baseline]
-    compared = [
-        training.name
-        for training in trainings
-        if training is not full
-        and (training.demonstrations, training.steps) == (full.demonstrations, full.steps)
-    ]
-    merged = merge({name: training.results for name, training in by_name.items()}).results
-    comparisons = compare_pairs(merged, [(name, baseline) for name in compared]) if compared else []
-    differences = dict(zip(compared, comparisons, strict=True))
-    return Findings(scores, tuple(trainings), full, differences, tuple(baselines))

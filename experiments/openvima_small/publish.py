@@ -1,19 +1,13 @@
 """Publish openvima-small: weights into the package; record, tables and figures from its evaluations.
 
     python experiments/openvima_small/publish.py --run RUN --data DATA
-    PYTHONPATH=benchmarks python experiments/openvima_small/publish.py SCORES \
-        --trainings FILES --baselines FILES
+    PYTHONPATH=benchmarks python experiments/openvima_small/publish.py SCORES
 
 The first copies the best checkpoint of a training, its settings, metrics and logs, and the list of its
 training data into the package. The second reads the folders of SCORES, which the names in `findings.py` say
 (`default`, `simulator`, `previous`, …), and writes OUT.json, figures, and the tables between
 `<!-- small:NAME -->` and `<!-- /small:NAME -->` in each file of `--fill` and in OUT.md. What is absent leaves
 its tables out, with a line on stderr.
-
-Each file of `--trainings` and `--baselines` contains a record of `ablations.py`, or a list of them: name,
-what, demonstrations, steps, minutes, parameters, and evaluation, the path of a results.json. Trainings with
-the demonstrations and steps of `--baseline` are compared with it; those with other numbers of demonstrations
-form the scaling curve. Names that begin with "vima" are VIMA's architecture.
 """
 
 import argparse
@@ -27,7 +21,7 @@ from typing import Any
 
 from failures import draw_failures
 from figures import save_all
-from findings import Findings, Training, find, level_means, read_scores, read_trainings
+from findings import Findings, Training, find, level_means
 from openvima.atomic_io import atomic_write_file
 from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.actions import ACTIONS_NAME
@@ -45,8 +39,6 @@ END = "<!-- /small:{name} -->"
 _FIGURES = {
     "animation": "openvima-small at work on six tasks, each with its prompt",
     "levels": "Success of openvima-small at the four levels beside published models",
-    "scaling": "Success against the number of demonstrations",
-    "ablations": "Success of the full model and of variants without one component",
     "failures": "Failed episodes: prompt, first picture with the actions, and why they failed",
 }
 _DRAWN_ELSEWHERE = {"animation": "openvima_small.webp"}  # by `animation.py`
@@ -63,9 +55,6 @@ def record(findings: Findings) -> dict[str, Any]:  # Any: plain JSON values
     """Return all numbers as plain values; outcomes of single episodes stay with the evaluations."""
     return {
         "scores": {name: _score_record(results) for name, results in findings.scores.items()},
-        "trainings": [_training_record(training) for training in findings.trainings],
-        "differences_to": findings.baseline.name if findings.baseline else "",
-        "differences": [comparison.record() for comparison in findings.differences.values()],
         "baselines": [_training_record(training) for training in findings.baselines],
     }
 
@@ -204,11 +193,6 @@ def main() -> None:
     parser.add_argument("scores", type=Path, nargs="?", help="folder of the folders of evaluations")
     parser.add_argument("--run", type=Path, help="training whose best checkpoint becomes the bundled one")
     parser.add_argument("--data", type=Path, help="its demonstrations, unless training_data.json lists them")
-    parser.add_argument("--trainings", type=Path, nargs="*", default=[], help="records of smaller trainings")
-    parser.add_argument(
-        "--baselines", type=Path, nargs="*", default=[], help="records of other architectures"
-    )
-    parser.add_argument("--baseline", default="full", help="training that others are compared with")
     parser.add_argument(
         "--failures", type=Path, help="evaluation to draw failures of, in place of SCORES/default"
     )
@@ -224,12 +208,7 @@ def main() -> None:
             print(f"{folder}: weights {weights_hash(folder)[:12]} of {given.run}")
         if given.scores is None:
             return
-        findings = find(
-            read_scores(given.scores, weights_hash(folder)),
-            read_trainings(given.trainings),
-            baselines=read_trainings(given.baselines),
-            baseline=given.baseline,
-        )
+        findings = find(given.scores, weights_hash(folder))
         evaluation = given.failures or given.scores / "default"
         if not (evaluation / ACTIONS_NAME).is_file():
             print(f"{evaluation} has no {ACTIONS_NAME}; the figure of failures is left out.", file=sys.stderr)

@@ -13,9 +13,7 @@ from findings import (
     SWAPPED,
     TEXT_ABLATIONS,
     Findings,
-    Training,
 )
-from openvima.evaluation.comparison import Comparison
 from openvima.evaluation.results import LevelMean, Results, Row
 from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.bundled import BUNDLED
@@ -60,11 +58,12 @@ def tables(findings: Findings) -> dict[str, str]:
         "controls": _control_table(of.get("controls")),
         "swapped_attribute": _swapped_table(of.get("controls")),
         "failures": _failure_table(of.get("default")),
-        "ablations": _ablation_table(findings) if findings.differences else None,
-        "scaling": _scaling_table(findings) if findings.trainings else None,
         "baselines": _baseline_table(findings) if findings.baselines else None,
     }
-    return {name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()}
+    written = {
+        name: markdown([table]).strip() if table and table.lines else "" for name, table in made.items()
+    }
+    return {**written, "ablations": findings.ablations}
 
 
 def _level_table(
@@ -180,45 +179,6 @@ def _failure_table(results: Results | None) -> Table | None:
         lines.append(Line(f"{row.task}, {row.level}", (_rate(row), why)))
     caption = f"{_caption(row.episodes for row in weak)} Failures with the number of their episodes."
     return Table("failures", caption, ("task", "solved", "most frequent failures"), tuple(lines))
-
-
-def _ablation_table(findings: Findings) -> Table:
-    assert findings.baseline  # there is none without differences
-    levels = list(findings.baseline.means())
-    lines = [_training_line(findings.baseline, levels, None)]
-    lines += [_training_line(t, levels, findings.differences[t.name]) for t in findings.variants]
-    columns = [column for level in levels for column in (level, "difference")]
-    return Table("ablations", "", ("", *columns), tuple(lines))
-
-
-def _training_line(training: Training, levels: Sequence[str], comparison: Comparison | None) -> Line:
-    means, cells = training.means(), []
-    differences = {difference.level: difference for difference in comparison.levels} if comparison else {}
-    for level in levels:
-        cells.append(_estimate(means.get(level)))
-        found = differences.get(level)
-        mark = "≈" if found and found.verdict == "noise" else ""
-        cells.append(Estimate(found.difference, found.interval, True, mark) if found else "")
-    return Line(training.what, tuple(cells))
-
-
-def _scaling_table(findings: Findings) -> Table:
-    shown = [*findings.curve(vima=False), *findings.curve(vima=True)]
-    levels = list(dict.fromkeys(level for training in shown for level in training.means()))
-    lines = [
-        Line(
-            "VIMA's architecture" if training.is_vima else "preset small",
-            (
-                f"{training.demonstrations:,}",
-                f"{training.steps:,}",
-                f"{training.minutes:.0f}",
-                *_cells(training.means(), levels),
-            ),
-            starts_group=training.is_vima,
-        )
-        for training in shown
-    ]
-    return Table("scaling", "", ("", "demonstrations", "steps", "minutes", *levels), tuple(lines))
 
 
 def _baseline_table(findings: Findings) -> Table:

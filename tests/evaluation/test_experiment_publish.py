@@ -10,11 +10,11 @@ pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
 from failures import draw_failures, failures
-from findings import Findings, find, read_scores, read_simulator, read_trainings
-from openvima.errors import ConfigError, DatasetError, UnknownPolicyError
+from findings import Findings, find, read_simulator, read_trainings
+from openvima.errors import ConfigError, DatasetError
 from openvima.evaluation import EvaluationConfig, evaluate
 from openvima.evaluation.results import EpisodeOutcome, Results, Row
-from openvima.evaluation.statistics import PairCounts, mean_difference, mean_of_rates
+from openvima.evaluation.statistics import mean_of_rates
 from openvima.policies.build import build_network
 from openvima.policies.checkpoint import save_checkpoint
 from publish import fill, record, write
@@ -47,20 +47,9 @@ def training(folder: Path, name: str, solved: int, *, demonstrations: int = 500)
         "demonstrations": demonstrations,
         "steps": 100,
         "minutes": 3.0,
+        "parameters": 2_000_000,
         "evaluation": f"{name}/results.json",
     }
-
-
-@pytest.fixture
-def records(tmp_path: Path) -> list[dict[str, object]]:
-    return [
-        training(tmp_path, "full", 8),
-        training(tmp_path, "blind", 3),
-        training(tmp_path, "same", 8),
-        training(tmp_path, "vima", 1),
-        training(tmp_path, "tenth", 4, demonstrations=50),
-        training(tmp_path, "vima-tenth", 0, demonstrations=50),
-    ]
 
 
 @pytest.fixture
@@ -77,21 +66,17 @@ def scores(tmp_path: Path) -> Path:
         path = tmp_path / "scores" / "simulator" / "L3" / "rotate" / f"{seed}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"seed": seed, "success": seed > 0, "failure": False, "steps": 2}))
+    (tmp_path / "scores" / "ablations").mkdir()
+    (tmp_path / "scores" / "ablations" / "ablations.md").write_text("| no head | −3.0 |\n")
+    (tmp_path / "scores" / "baselines").mkdir()
+    record = training(tmp_path / "scores" / "baselines", "vima", 1)
+    (tmp_path / "scores" / "baselines" / "vima.json").write_text(json.dumps(record))
     return tmp_path / "scores"
 
 
 @pytest.fixture
-def findings(tmp_path: Path, records: list, scores: Path) -> Findings:
-    (tmp_path / "list.json").write_text(json.dumps(records[:-1]))
-    (tmp_path / "one.json").write_text(json.dumps(records[-1]))
-    trainings = read_trainings([tmp_path / "list.json", tmp_path / "one.json"])
-    return find(read_scores(scores, WEIGHTS), trainings, baselines=trainings[3:4])
-
-
-def test_trainings_of_equal_effort_are_compared_and_the_others_make_curves(findings: Findings) -> None:
-    assert [training.name for training in findings.variants] == ["blind", "same", "vima"]
-    assert [training.name for training in findings.curve(vima=False)] == ["tenth", "full"]
-    assert [training.name for training in findings.curve(vima=True)] == ["vima-tenth", "vima"]
+def findings(scores: Path) -> Findings:
+    return find(scores, WEIGHTS)
 
 
 def test_numbers_are_those_of_the_statistics(findings: Findings) -> None:
@@ -101,11 +86,6 @@ def test_numbers_are_those_of_the_statistics(findings: Findings) -> None:
     assert (level["level"], level["ablation"], level["mean"]) == ("L1", "", mean)
     assert level["interval"] == [round(end, 6) for end in interval]
     assert content["scores"]["simulator"]["tasks"][0]["successes"] == 3
-    (blind, same, _) = content["differences"]
-    difference, interval = mean_difference([PairCounts(3, 0, 5, 2)] * 2)
-    assert blind["levels"][0]["difference"] == round(difference, 6) == -0.5
-    assert blind["levels"][0]["interval"] == [round(end, 6) for end in interval]
-    assert same["overall"]["verdict"] == "noise"
     json.dumps(content)
 
 
@@ -128,18 +108,18 @@ def test_tables_show_ours_beside_the_published_and_the_previous(findings: Findin
     swapped = lines_of(made["swapped_attribute"])["same\\_texture, L4"]
     assert [cell.split()[0] for cell in swapped] == ["90.0", "40.0", "33.3"]
     assert lines_of(made["failures"])["rotate, L1"][1] == "missed (1)"
-    assert made["ablations"].count("≈") == 4  # of the one that is the same, at every level
-    assert [line.split(" | ")[1] for line in made["scaling"].splitlines()[2:]] == ["50", "500", "50", "500"]
+    assert made["ablations"] == "| no head | −3.0 |"
+    assert lines_of(made["baselines"])["what is particular to vima"][:3] == ["2.0M", "100", "0.1"]
     assert made["text"] == made["attributes"] == made["original_tasks"] == ""
 
 
 def test_scores_of_other_weights_are_refused_and_absent_ones_named(scores: Path, capsys) -> None:
-    assert set(read_scores(scores, WEIGHTS)) == {"simulator", "default", "controls", "previous"}
+    assert set(find(scores, WEIGHTS).scores) == {"simulator", "default", "controls", "previous"}
     assert "detected is absent" in capsys.readouterr().err
     with pytest.raises(ConfigError, match=r"default is of weights abab.*bundled are efef"):
-        read_scores(scores, "ef" * 32)
+        find(scores, "ef" * 32)
     with pytest.raises(DatasetError, match="holds no evaluation"):
-        read_scores(scores / "default", WEIGHTS)
+        find(scores / "default", WEIGHTS)
     with pytest.raises(DatasetError, match="has no episode"):
         read_simulator(scores / "default")
     (scores / "simulator" / "L3" / "rotate" / "2.json").write_text("{}")
@@ -162,10 +142,10 @@ def test_everything_is_written_and_pages_keep_their_words(tmp_path: Path, findin
         assert text.startswith("before\n<!-- small:settings -->\n") and "\nafter\n" in text
         assert "old" not in text and text.count("| previous weights |") == 1
         assert "](images/openvima_small_levels.png)" in text
-    assert {file.stem.split("_")[-1] for file in images.iterdir()} == {"levels", "scaling", "ablations"}
+    assert {file.stem.split("_")[-1] for file in images.iterdir()} == {"levels"}
     assert json.loads((tmp_path / "out.json").read_text())["machine"] == "a machine"
     result = (tmp_path / "out.md").read_text()
-    assert "commit `abc`" in result and "preset small" in result
+    assert "commit `abc`" in result and "particular to vima" in result
 
 
 def test_a_run_is_shipped_with_its_record(tmp_path: Path) -> None:
@@ -219,19 +199,16 @@ def test_failures_are_drawn_from_recorded_actions(tmp_path: Path) -> None:
     assert (tmp_path / "failures.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_wrong_inputs_are_named(tmp_path: Path, records: list) -> None:
-    file = tmp_path / "list.json"
+def test_wrong_inputs_are_named(tmp_path: Path) -> None:
+    record, file = training(tmp_path, "vima", 8), tmp_path / "list.json"
     with pytest.raises(DatasetError, match=r"list\.json"):
         read_trainings([file])
-    file.write_text(json.dumps([{"name": "full"}]))
+    file.write_text(json.dumps([{"name": "vima"}]))
     with pytest.raises(DatasetError, match="evaluation"):
         read_trainings([file])
-    file.write_text(json.dumps([*records, records[1]]))
-    with pytest.raises(ConfigError, match="blind"):
+    file.write_text(json.dumps([record, record]))
+    with pytest.raises(ConfigError, match="vima"):
         read_trainings([file])
-    file.write_text(json.dumps(records))
-    with pytest.raises(UnknownPolicyError, match="ful"):
-        find({}, read_trainings([file]), baseline="ful")
 
 
 @pytest.mark.parametrize("text", ["<!-- small:text -->", "<!-- small:txt --><!-- /small:txt -->"])
