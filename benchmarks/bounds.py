@@ -1,7 +1,7 @@
 """What limits a policy: nearest appearance, attributes that separate, and success with forced choices.
 
     python benchmarks/bounds.py --policy RUN [--tasks T,…] [--levels L3,…] [--episodes N] [--forced N]
-                                [--seed S] [--assets PACK] [--json FILE]
+                                [--attribute NAME] [--seed S] [--assets PACK] [--json FILE]
 
 At the start of each episode, for policies with an appearance embedding:
 
@@ -156,11 +156,18 @@ def separated(
     return [(least[0] > most[0], f"{key(base)}: {key(least[1])}", key(most[1]))]
 
 
-def start_row(network: PolicyNetwork, task: str, level: str, seeds: Iterable[int], assets: str) -> Row:
-    """Measure the starts of episodes of one task and level."""
+def start_row(
+    network: PolicyNetwork,
+    task: str,
+    level: str,
+    seeds: Iterable[int],
+    assets: str,
+    compared_in: str | None = None,
+) -> Row:
+    """Measure the starts of episodes of one task and level, in an attribute or in what the task asks for."""
     pack = load_assets(assets)
     rasteriser, attribute = Rasteriser(pack), COMPARED.get(task)
-    embed, found = Embedding(network, attribute), []
+    embed, found = Embedding(network, compared_in or attribute), []
     for seed in seeds:
         episode = sample_episode(task, level=level, seed=seed, domain="eval", assets=pack)
         (objects, views), (shown, images) = in_scene(episode, rasteriser), in_prompt(episode, rasteriser)
@@ -200,7 +207,7 @@ class ForcedPolicy(PromptedRolloutPolicy):
             for env, seen in zip(self._envs, observations, strict=True)
             if seen is not None
         ]
-        decode_step = network.decode_step
+        decode_step: Any = network.decode_step  # Any: its arguments are passed on
 
         def restricted(*inputs: Any) -> Any:
             return decode_step(*inputs[:-1], self._restricted(inputs[-1]))
@@ -279,6 +286,7 @@ def main() -> None:
     parser.add_argument("--levels", default="L1,L2,L3,L4")
     parser.add_argument("--episodes", type=int, default=100, help="starts of each task and level")
     parser.add_argument("--forced", type=int, default=0, help="episodes to play in each of four ways")
+    parser.add_argument("--attribute", choices=ATTRIBUTES, help="compare in it, whatever the task asks for")
     parser.add_argument("--seed", type=int, default=60000, help="first episode")
     parser.add_argument("--assets", default="procedural", help="as of `openvima evaluate`")
     parser.add_argument("--json", type=Path, help="file to write")
@@ -288,7 +296,7 @@ def main() -> None:
     rows: list[Row] = []
     for task in arguments.tasks.split(","):
         for level in sorted(set(arguments.levels.split(",")) & set(task_spec(task).levels)):
-            new = [start_row(policy.network, task, level, seeds, arguments.assets)]
+            new = [start_row(policy.network, task, level, seeds, arguments.assets, arguments.attribute)]
             if arguments.forced:
                 new += forced_rows(policy, task, level, seeds[: arguments.forced], arguments.assets)
             for row in new:
