@@ -100,24 +100,13 @@ def test_crops_reach_the_decoder_only_without_attributes(network, demo):
     assert not shown.attributes_BTNX.any()
 
 
-def test_other_prompts_are_decided_as_without_attributes(network, demo):
-    bare = build_network(replace(network.config, attributes=None), seed=3).eval().double()
-    weights = {name: value for name, value in network.state_dict().items() if name in bare.state_dict()}
-    bare.load_state_dict(weights)
-    assert set(network.state_dict()) - set(weights) == {
-        "head.pick.appearance_weight",
-        *(f"attributes.{name}" for name in network.attributes.state_dict()),
-    }
-    text = SAME.replace("same ", "")
-    for first, second in zip(
-        *(
-            (net.head.pick(inputs), net.head.decode(inputs))
-            for net in (network, bare)
-            for inputs in [read(net, demo, text)]
-        ),
-        strict=True,
-    ):
-        assert torch.equal(first, second)
+def test_appearance_is_compared_with_texture_and_shape(network, demo):
+    objects = read(network, demo, SAME.replace("same ", "")).prompt.features
+    images = objects.features_VNF, objects.boxes_VN4, objects.masks_VN
+    own, parts = network.object_encoder.embed_appearance(images[0], images[2]), network.attributes(*images)
+    vectors = [own, *(parts[..., ATTRIBUTES.index(name), :] for name in ("texture", "shape"))]
+    expected = sum(vector @ vector.mT for vector in vectors) / 3
+    torch.testing.assert_close(objects.appearance_NA @ objects.appearance_NA.mT, expected)
 
 
 def test_similarity_is_the_mean_cosine_of_the_selected_attributes(network, demo):

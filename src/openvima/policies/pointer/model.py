@@ -90,7 +90,8 @@ class Pointer(PolicyNetwork):
             rotation_bins = images.rotation_bins if config.correspondence else 0
             has_attributes = config.attributes is not None
             self.head = CandidatePointerHead(config.head, width, rotation_bins, has_attributes=has_attributes)
-            self.text_appearance = nn.Linear(words, images.appearance_width, bias=False)
+            joined_width = Attributes.joined_width(config.attributes) if config.attributes else 0
+            self.text_appearance = nn.Linear(words, images.appearance_width + joined_width, bias=False)
             nn.init.zeros_(self.text_appearance.weight)
         else:
             self.head = ObjectPointerHead(config.head, width)
@@ -111,7 +112,7 @@ class Pointer(PolicyNetwork):
         """Encode prompts with and without appearance, and gather their objects."""
         features_VSF = features_KF[prompts.crop_index_VS]
         is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
-        appearance_SA = self.images.embed_appearance(features_VSF, prompts.masks_VS)
+        appearance_SA = self._appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
         order_BM = _images_first(is_image_BL)
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
@@ -216,7 +217,7 @@ class Pointer(PolicyNetwork):
     ) -> tuple[HeadInputs, DecodingState]:
         """Decode steps of a previous action and an observation each."""
         features_BTVNF = features_KF[history.crop_index_BTVN]
-        appearance_BTNA = self.images.embed_appearance(features_BTVNF, history.masks_BTVN)
+        appearance_BTNA = self._appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
         attributes_BTNX = None
         if self.attributes is not None and prompt.selected_BP is not None:
@@ -248,6 +249,15 @@ class Pointer(PolicyNetwork):
             attributes_BTNX=attributes_BTNX,
         )
         return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
+
+    def _appearance(
+        self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
+    ) -> torch.Tensor:
+        """Unit vectors by which objects are matched, (..., N, A)."""
+        appearance_NA = self.images.embed_appearance(features_VNF, masks_VN)
+        if self.attributes is None:
+            return appearance_NA
+        return self.attributes.with_appearance(appearance_NA, features_VNF, boxes_VN4, masks_VN)
 
     def _observation_tokens(
         self, history: HistoryBatch, features_BTVNF: torch.Tensor, changes_BTND: torch.Tensor
