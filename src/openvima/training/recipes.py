@@ -95,6 +95,9 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "small-2": {
             **_SMALL,
             "model.attributes": True,
+            "model.crop_kernel": 1,
+            "model.crop_width": 32,
+            "model.num_layers": 3,
             "pretraining.attribute_loss_weight": 0.5,
             "pretraining.grating_prob": 0.4,
             "pretraining.eared_prob": 0.3,
@@ -105,7 +108,7 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "augmentation.text_description_prob": 0.4,
             "augmentation.synonym_prob": 0.3,
             "augmentation.paraphrase_prob": 0.4,
-            "augmentation.unknown_word_prob": 0.03,
+            "augmentation.unknown_word_prob": 0.05,
             "augmentation.shuffle_prompt_objects_prob": 1.0,
         },
     }

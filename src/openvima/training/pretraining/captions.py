@@ -28,6 +28,8 @@ _COMPARING = ("the {same} {what}", "{same} {what}", "objects of {same} {what}", 
 # Neither of these compares: an attribute may be named without, and without one "same" means the object.
 _OTHERS = ("the {what} of this object", "another {what}", "a different {what}", "the {same} object")
 _MOST_ATTRIBUTES = 3
+# "The same shape" leaves open whether more than the outline is meant, so that both are compared.
+_SHAPE, _PROFILE = ATTRIBUTES.index("shape"), ATTRIBUTES.index("profile")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +60,7 @@ def sample_captions(count: int, encode: Callable[[str], list[int]], rng: np.rand
         template = templates[int(rng.integers(len(templates)))]
         named = rng.permutation(len(ATTRIBUTES))[: int(rng.integers(1, _MOST_ATTRIBUTES + 1))]
         targets[row, named] = "{what}" in template
+        targets[row, _PROFILE] |= targets[row, _SHAPE]
         targets[row, -1] = "{same}" in template
         words = [str(rng.choice(WORDS[ATTRIBUTES[index]])) for index in named]
         what = " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
