@@ -163,7 +163,7 @@ VARIANTS = {
         lambda config: replace(config, head=replace(config.head, num_prompt_queries=1)),
     ),
     "two-layers": Variant("two decoder layers", settings={"model.num_layers": 2}),
-    "three-layers": Variant("three decoder layers", settings={"model.num_layers": 3}),
+    "four-layers": Variant("four decoder layers", settings={"model.num_layers": 4}),
     **_probs_of_cloning(),
     **_pretraining(),
 }

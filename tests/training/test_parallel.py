@@ -134,7 +134,9 @@ def test_a_run_of_two_processes_resumes_with_one(bins, tmp_path, sharding) -> No
 
 
 def test_processes_share_contrastive_pretraining(settings, tmp_path) -> None:
-    settings |= {"pretraining.hard_negative_prob": 0.5, "schedule.steps": 1}
+    """And then clone text prompts, which leave parameters without gradients."""
+    settings |= {"pretraining.hard_negative_prob": 0.5, "schedule.steps": 3, "loader.batch_size": 2}
+    settings["augmentation.text_description_prob"] = 1.0
     one = train(TrainingConfig.of({**settings, "out": tmp_path / "one"}))
     shared = {**settings, "out": tmp_path / "two"}
     with joined_by(1, script_arguments(shared)):

@@ -78,7 +78,7 @@ class BehaviourCloning:
             weight = num_steps * self._parallel.num_ranks / total
             with self._parallel.synchronized(self._module, last=number == len(parts) - 1):
                 loss, metrics = self._call(batch, self._module)
-                (loss * weight).backward()
+                self._parallel.with_all_gradients(loss * weight, self.parameters).backward()
             _add(sums, {"loss": loss, **metrics}, weight)
         return sums
 

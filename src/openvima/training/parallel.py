@@ -81,6 +81,15 @@ class Parallel:
             with module.no_sync():  # type: ignore[operator]
                 yield
 
+    def with_all_gradients(self, loss: torch.Tensor, parameters: Iterable[nn.Parameter]) -> torch.Tensor:
+        """Let every parameter have a gradient, if only of zero: DDP waits for all of them.
+
+        Prompts without images, as text prompts are, leave some out.
+        """
+        if self.num_ranks == 1 or self.is_sharded:
+            return loss
+        return loss + 0.0 * torch.stack([parameter.sum() for parameter in parameters]).sum()
+
     def autocast(self, precision: str) -> torch.autocast:
         """Return a context for mixed precision, "float32" or "bfloat16"."""
         is_half = precision == "bfloat16"
