@@ -251,7 +251,7 @@ def _crop_objects(rgb: np.ndarray, found: Detections, view: View) -> _ViewDetect
 def _histogram(pixels: np.ndarray) -> np.ndarray:
     """Return which fraction of pixels (3, K), uint8, is in each bin of RGB, shape (64,)."""
     bins = np.ravel_multi_index(tuple(pixels // (256 // NUM_BINS)), (NUM_BINS,) * 3)
-    return np.bincount(bins, minlength=NUM_BINS**3) / len(bins)
+    return np.bincount(bins, minlength=NUM_BINS**3) / pixels.shape[1]
 
 
 def _match_views(front: _ViewDetections, top: _ViewDetections) -> list[tuple[int, int]]:

@@ -310,10 +310,10 @@ def _write(work: _Work, count: Callable[[int], None]) -> None:
     shard, episodes, variant = Shard(work.shard, work.envelope), [], work.variant
     extractor = _extractor(variant.boxes) if variant.boxes else None
     kept = split_hashes(work.source.index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
-    names = zip(*(work.source.index.column(name).to_pylist() for name in ("task", "seed")), strict=True)
-    for row, (span, name) in enumerate(zip(spans_of(work.source.index), names, strict=True)):
+    tasks, seeds = (work.source.index.column(name).to_pylist() for name in ("task", "seed"))
+    for row, span in enumerate(spans_of(work.source.index)):
         if not kept[row]:
-            episodes.append(left_out_episode(*name, work.kind))
+            episodes.append(left_out_episode(tasks[row], seeds[row], work.kind))
             count(row + 1)
             continue
         shard.check(row, span)
