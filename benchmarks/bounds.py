@@ -42,8 +42,8 @@ from openvima.perception.objects import ObjectViews, extract_objects, observe_pr
 from openvima.perception.preprocessing import extract_observation
 from openvima.policies.inference import NetworkPolicy
 from openvima.policies.nn.actions import DecodingStrategy
-from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.pointer.config import ATTRIBUTES
+from openvima.policies.pointer.model import Pointer
 from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Episode, InOrder, ObjectImage, Placement, SceneImage
 from openvima.scene.goal import object_of
@@ -65,8 +65,8 @@ Answer = tuple[bool, str, str]  # whether it is right, what was wanted, what was
 class Embedding:
     """Embeds the objects of images, by appearance or by one attribute if the network has attributes."""
 
-    def __init__(self, network: PolicyNetwork, attribute: str | None = None) -> None:
-        self._network, self._attributes = network, getattr(network, "attributes", None)
+    def __init__(self, network: Pointer, attribute: str | None = None) -> None:
+        self._network, self._attributes = network, network.attributes
         self.name = attribute if attribute and self._attributes is not None else "appearance"
 
     @torch.inference_mode()
@@ -74,12 +74,11 @@ class Embedding:
         """Return unit vectors, shape (N, A)."""
         features_VNF = self._network.encode_images(torch.from_numpy(views.crops))
         masks_VN = torch.from_numpy(views.masks)
+        boxes_VN4 = torch.from_numpy(views.boxes)
         if self.name == "appearance":
-            encoder = self._network.object_encoder
-            assert encoder is not None
-            return encoder.embed_appearance(features_VNF, masks_VN)
+            return self._network.embed_appearance(features_VNF, boxes_VN4, masks_VN)
         assert self._attributes is not None
-        projected_NPW = self._attributes(features_VNF, torch.from_numpy(views.boxes), masks_VN)
+        projected_NPW = self._attributes(features_VNF, boxes_VN4, masks_VN)
         return projected_NPW[:, ATTRIBUTES.index(self.name)]
 
 
@@ -157,7 +156,7 @@ def separated(
 
 
 def start_row(
-    network: PolicyNetwork,
+    network: Pointer,
     task: str,
     level: str,
     seeds: Iterable[int],
@@ -292,6 +291,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write")
     arguments = parser.parse_args()
     policy = NetworkPolicy.from_pretrained(arguments.policy, dtype=torch.float32)
+    if not isinstance(policy.network, Pointer):
+        parser.error(f"--policy is {arguments.policy}; it must be a pointer network, such as nano or small")
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     rows: list[Row] = []
     for task in arguments.tasks.split(","):

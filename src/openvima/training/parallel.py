@@ -130,10 +130,8 @@ class Parallel:
         """
         if self.num_ranks == 1:
             return function(rows_N)
-        size = -(-len(rows_N) // self.num_ranks)
-        missing = rows_N.new_zeros(size * self.num_ranks - len(rows_N), *rows_N.shape[1:])
-        part = torch.cat([rows_N, missing])[self.rank * size : (self.rank + 1) * size]
-        return _Gathered.apply(function(part), self)[: len(rows_N)]
+        part = self.part_of(len(rows_N))
+        return _Gathered.apply(function(rows_N[part.start : part.stop]), self, part)
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
         """Average gradients over all processes."""
@@ -154,17 +152,14 @@ class _Gathered(torch.autograd.Function):
     """Concatenates the rows of all processes, each of which goes on to the same loss."""
 
     @staticmethod
-    def forward(ctx: Any, part_NX: torch.Tensor, parallel: Parallel) -> torch.Tensor:
-        ctx.parallel, ctx.size = parallel, len(part_NX)
-        parts = [torch.empty_like(part_NX) for _ in range(parallel.num_ranks)]
-        dist.all_gather(parts, part_NX.contiguous())
-        return torch.cat(parts)
+    def forward(ctx: Any, part_NX: torch.Tensor, parallel: Parallel, part: range) -> torch.Tensor:
+        ctx.num_ranks, ctx.part = parallel.num_ranks, part
+        return parallel.rows_of_all(part_NX)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         # All processes have the same gradient of the whole; their parts are averaged afterwards.
-        own = gradients[0][ctx.parallel.rank * ctx.size :][: ctx.size]
-        return own * ctx.parallel.num_ranks, None
+        return gradients[0][ctx.part.start : ctx.part.stop] * ctx.num_ranks, None, None
 
 
 ONE_PROCESS = Parallel(0, 1, torch.device("cpu"))

@@ -112,7 +112,7 @@ class Pointer(PolicyNetwork):
         """Encode prompts with and without appearance, and gather their objects."""
         features_VSF = features_KF[prompts.crop_index_VS]
         is_image_BL = (prompts.object_index_BL >= 0) & prompts.mask_BL
-        appearance_SA = self._appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
+        appearance_SA = self.embed_appearance(features_VSF, prompts.boxes_VS4, prompts.masks_VS)
         order_BM = _images_first(is_image_BL)
         exists_BM = is_image_BL.gather(1, order_BM)
         row_BM = prompts.object_index_BL.gather(1, order_BM).clamp(min=0)
@@ -217,7 +217,7 @@ class Pointer(PolicyNetwork):
     ) -> tuple[HeadInputs, DecodingState]:
         """Decode steps of a previous action and an observation each."""
         features_BTVNF = features_KF[history.crop_index_BTVN]
-        appearance_BTNA = self._appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
+        appearance_BTNA = self.embed_appearance(features_BTVNF, history.boxes_BTVN4, history.masks_BTVN)
         objects = _objects_in_view(history, features_BTVNF, appearance_BTNA, prompt.features)
         attributes_BTNX = None
         if self.attributes is not None and prompt.selected_BP is not None:
@@ -250,7 +250,7 @@ class Pointer(PolicyNetwork):
         )
         return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
 
-    def _appearance(
+    def embed_appearance(
         self, features_VNF: torch.Tensor, boxes_VN4: torch.Tensor, masks_VN: torch.Tensor
     ) -> torch.Tensor:
         """Unit vectors by which objects are matched, (..., N, A)."""
