@@ -98,11 +98,12 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     """Return rollouts of a checkpoint on the tasks of the data, with prompts in their form."""
     from openvima.data.reader import Dataset
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
+    from openvima.scene import COMPOSED
     from openvima.tasks.registry import task_spec
 
     dataset = Dataset(config.data)
     trained = sorted(set(dataset.manifest["tasks"]) - {*config.loader.excluded_tasks})
-    playable = tuple(task for task in trained if ONLINE_EVAL_LEVEL in task_spec(task).levels)
+    playable = tuple(t for t in trained if t != COMPOSED and ONLINE_EVAL_LEVEL in task_spec(t).levels)
     if not playable:
         raise ConfigError(
             f"none of the tasks in {config.data} exists at {ONLINE_EVAL_LEVEL}; leave out rollout.every."

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from openvima.data.reader import Dataset
     from openvima.data.records import Demonstration, Step, rollout_oracle
     from openvima.data.shard import Shard
+    from openvima.data.user_demonstrations import record_demonstration
     from openvima.data.verification import VerifyConfig, repair, verify
     from openvima.data.writer import ShardWriter
 
@@ -27,6 +28,7 @@ _HOMES = {
     "VerifyConfig": "verification",
     "generate": "generation",
     "plan": "planning",
+    "record_demonstration": "user_demonstrations",
     "repair": "verification",
     "rollout_oracle": "records",
     "verify": "verification",
@@ -44,6 +46,7 @@ __all__ = [
     "VerifyConfig",
     "generate",
     "plan",
+    "record_demonstration",
     "repair",
     "rollout_oracle",
     "verify",

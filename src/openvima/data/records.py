@@ -1,4 +1,4 @@
-"""A demonstration: observations, actions and outcome of one rollout of the oracle."""
+"""A demonstration: observations, actions and outcome of one rollout of the oracle or a user."""
 
 import itertools
 import json
@@ -39,7 +39,7 @@ _JSON = json.JSONEncoder(sort_keys=True)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstration:
-    """One rollout of the oracle over T steps, as stored.
+    """One rollout of the oracle, or of a user, over T steps, as stored.
 
     Args:
         task: Name of the task.
@@ -188,36 +188,66 @@ def rollout_oracle(env: "TabletopEnv", seed: int) -> Demonstration:
         OracleError: The oracle finds no action.
     """
     observation, _ = env.reset(seed=seed)
-    episode, observations, scenes = env.episode, [observation], [env.scene]
-    decisions, paths = [], []
-    while not env.outcome.is_over and len(decisions) < episode.oracle_max_steps:
-        decision = env.oracle_decision()
-        observation, *_ = env.step(decision.action)
-        decisions.append(decision)
-        paths.append(env.joint_path)
-        observations.append(observation)
-        scenes.append(env.scene)
-    return Demonstration(
-        task=episode.task,
-        level=episode.level,
-        domain=episode.domain,
-        seed=episode.seed,
-        num_redraws=episode.num_redraws,
-        max_steps=episode.max_steps,
-        prompt=env.prompt,
-        rgb=_stacked(observations, "rgb"),
-        segm=_stacked(observations, "segm"),
-        end_effector=scenes[0].end_effector,
-        actions=tuple(decision.action for decision in decisions),
-        pick_ids=tuple(decision.pick_id for decision in decisions),
-        place_ids=tuple(decision.place_id for decision in decisions),
-        joint_paths=tuple(paths),
-        objects=tuple(ObjectRecord(p.id, p.object, p.texture) for p in scenes[0].placements),
-        scenes=tuple(scenes),
-        outcome=env.outcome,
-        assets=env.assets.name,
-        versions=package_versions(),
+    rollout, decisions = Rollout(env, observation), []
+    while not env.outcome.is_over and len(decisions) < env.episode.oracle_max_steps:
+        decisions.append(env.oracle_decision())
+        rollout.step(decisions[-1].action)
+    return rollout.demonstration(
+        [decision.pick_id for decision in decisions], [decision.place_id for decision in decisions]
     )
+
+
+class Rollout:
+    """Collects what a demonstration holds while an environment steps.
+
+    Args:
+        env: The environment, which was reset.
+        observation: Its first observation.
+    """
+
+    def __init__(self, env: "TabletopEnv", observation: Mapping[str, Any]) -> None:
+        self._env, self._observations, self._scenes = env, [observation], [env.scene]
+        self._actions: list[Action] = []
+        self._paths: list[np.ndarray] = []
+
+    def step(self, action: Action) -> dict[str, Any]:  # Any: as the environment's info
+        """Execute an action and return the info of the environment."""
+        observation, *_, info = self._env.step(action)
+        self._actions.append(action)
+        self._paths.append(self._env.joint_path)
+        self._observations.append(observation)
+        self._scenes.append(self._env.scene)
+        return info
+
+    def demonstration(self, pick_ids: Sequence[int], place_ids: Sequence[int]) -> Demonstration:
+        """Return the demonstration so far.
+
+        Args:
+            pick_ids: Id of the object that each action picks or sweeps.
+            place_ids: Id of the object relative to which it is placed; see `Demonstration`.
+        """
+        env, episode = self._env, self._env.episode
+        return Demonstration(
+            task=episode.task,
+            level=episode.level,
+            domain=episode.domain,
+            seed=episode.seed,
+            num_redraws=episode.num_redraws,
+            max_steps=episode.max_steps,
+            prompt=env.prompt,
+            rgb=_stacked(self._observations, "rgb"),
+            segm=_stacked(self._observations, "segm"),
+            end_effector=env.scene.end_effector,
+            actions=tuple(self._actions),
+            pick_ids=tuple(pick_ids),
+            place_ids=tuple(place_ids),
+            joint_paths=tuple(self._paths),
+            objects=tuple(ObjectRecord(p.id, p.object, p.texture) for p in env.scene.placements),
+            scenes=tuple(self._scenes),
+            outcome=env.outcome,
+            assets=env.assets.name,
+            versions=package_versions(),
+        )
 
 
 def package_versions() -> dict[str, str]:
@@ -303,5 +333,5 @@ def _images(demo: Demonstration, buffers: ImageBuffers) -> Iterator[tuple[str, n
         yield f"segm_{view}", np.ascontiguousarray(demo.segm[view])
 
 
-def _stacked(observations: list[dict], key: str) -> dict[str, np.ndarray]:
+def _stacked(observations: Sequence[Mapping[str, Any]], key: str) -> dict[str, np.ndarray]:
     return {view: np.stack([o[key][view] for o in observations]) for view in observations[0][key]}

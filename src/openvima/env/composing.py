@@ -13,10 +13,9 @@ from openvima.env.composed_objects import ObjectLike, add_object, scene_objects
 from openvima.env.composed_prompt import ImageMaker, composed_prompt
 from openvima.env.photos import read_photo
 from openvima.errors import SceneError, unknown_name
-from openvima.scene import END_EFFECTORS, EndEffector, Episode, PhotoImage, Placement, Problem
+from openvima.scene import COMPOSED, END_EFFECTORS, EndEffector, Episode, PhotoImage, Placement, Problem
 from openvima.tasks.table import TableSampler
 
-COMPOSED = "composed"  # task of composed episodes
 COMPOSE_KEYS = ("objects", "prompt", "images", "goals", "max_steps", "end_effector")
 DEFAULT_MAX_STEPS, MAX_STEPS_WITHOUT_GOALS = 10, 3
 MAX_STEPS = 1000

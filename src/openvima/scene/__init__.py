@@ -11,7 +11,7 @@ from openvima.scene.constraint import (
     StepContext,
     ZoneKeptClear,
 )
-from openvima.scene.episode import Episode, Outcome, Problem
+from openvima.scene.episode import COMPOSED, Episode, Outcome, Problem
 from openvima.scene.goal import AtPose, Condition, Goal, InZone, Tolerance, Zone, block_points
 from openvima.scene.pose import Pose, angle_difference
 from openvima.scene.prompt import (
@@ -41,6 +41,7 @@ from openvima.scene.scene import (
 __all__ = [
     "ACTION_SHAPES",
     "BACKGROUND_ID",
+    "COMPOSED",
     "END_EFFECTORS",
     "FIRST_OBJECT_ID",
     "FLOOR_ID",

@@ -10,6 +10,8 @@ from openvima.scene.goal import AtPose, Goal, is_condition
 from openvima.scene.prompt import Prompt
 from openvima.scene.scene import Scene
 
+COMPOSED = "composed"  # task of composed episodes
+
 
 @dataclass(frozen=True, slots=True)
 class Problem:

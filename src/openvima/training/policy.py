@@ -229,6 +229,6 @@ class _Stages:
 
 def scene_tasks(dataset: Dataset) -> list[str]:
     """Return the tasks of the data that are defined at level train, or all such tasks if none of them is."""
-    tasks = sorted(set(dataset.index.column("task").to_pylist()))
-    held_out = held_out_tasks()
-    return [t for t in tasks if t not in held_out] or [t for t in list_tasks() if t not in held_out]
+    present, held_out = set(dataset.index.column("task").to_pylist()), held_out_tasks()
+    tasks = [task for task in list_tasks() if task not in held_out]  # composed scenes are of none
+    return sorted(present.intersection(tasks)) or tasks

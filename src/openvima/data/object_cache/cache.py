@@ -30,6 +30,7 @@ from openvima.folder_lock import folder_lock
 from openvima.multiprocess import imap_unordered
 from openvima.perception.objects import ObjectExtractor
 from openvima.perception.preprocessing import KINDS, InputKind
+from openvima.scene import COMPOSED
 
 Report = Callable[[int, int, str], None]
 _RERENDERED = "rerendered-v"  # in front of version and number of a random appearance
@@ -312,7 +313,8 @@ def _write(work: _Work, count: Callable[[int], None]) -> None:
     kept = split_hashes(work.source.index, "boxes/") < (variant.boxes.fraction if variant.boxes else 1.0)
     tasks, seeds = (work.source.index.column(name).to_pylist() for name in ("task", "seed"))
     for row, span in enumerate(spans_of(work.source.index)):
-        if not kept[row]:
+        is_unknown = variant.appearance is not None and tasks[row] == COMPOSED  # its prompt is not sampled
+        if is_unknown or not kept[row]:
             episodes.append(left_out_episode(tasks[row], seeds[row], work.kind))
             count(row + 1)
             continue

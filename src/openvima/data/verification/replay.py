@@ -1,4 +1,8 @@
-"""Replaying stored episodes: seed, oracle and actions must reproduce the same bytes."""
+"""Replaying stored episodes: seed, oracle and actions must reproduce the same bytes.
+
+Demonstrations of users are compared without the oracle. Of composed scenes neither goals nor prompt images are
+stored, so these begin with the stored scene, and prompt and outcome are not compared.
+"""
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,12 +24,13 @@ from openvima.data.verification.shards import ShardFindings
 from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, OpenVimaError
 from openvima.multiprocess import imap_unordered
-from openvima.scene import RenderedPrompt
+from openvima.scene import COMPOSED, Episode, Problem, Prompt, RenderedPrompt
 
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
 
 _REMEDY = "The files are intact, but another machine or other code wrote them. Generate them again."
+_HOST_TASK = "visual_manipulation"  # whose environment plays composed episodes
 _IRRELEVANT = "pyarrow"  # its version decides bytes of files, not of episodes
 
 
@@ -151,11 +156,19 @@ def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
         SamplingError: The task no longer samples an episode for the seed.
         OracleError: The oracle no longer finds an action.
     """
-    observation, _ = env.reset(seed=demo.seed)
-    if (env.episode.num_redraws, env.episode.max_steps) != (demo.num_redraws, demo.max_steps):
-        return "the seed gives another episode"
-    if not _is_same_prompt(env.prompt, demo.prompt):
-        return "the prompt differs"
+    is_composed = demo.task == COMPOSED
+    if is_composed:
+        problem = Problem(demo.scenes[0], Prompt("", ()), ())
+        episode = Episode(
+            COMPOSED, demo.level, demo.domain, demo.seed, problem, demo.max_steps, demo.max_steps
+        )
+        observation, _ = env.reset(options={"episode": episode})
+    else:
+        observation, _ = env.reset(seed=demo.seed)
+        if (env.episode.num_redraws, env.episode.max_steps) != (demo.num_redraws, demo.max_steps):
+            return "the seed gives another episode"
+        if not _is_same_prompt(env.prompt, demo.prompt):
+            return "the prompt differs"
     for step, action in enumerate((*demo.actions, None)):
         if env.scene != demo.scenes[step]:
             return f"object poses differ {_when(step)}"
@@ -163,17 +176,15 @@ def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
             return f"the images differ {_when(step)}"
         if action is None:
             break
-        decision = env.oracle_decision()
-        if (decision.action, decision.pick_id, decision.place_id) != (
-            action,
-            demo.pick_ids[step],
-            demo.place_ids[step],
-        ):
-            return f"the oracle acts differently in step {step}"
+        if demo.domain != "user":
+            decision = env.oracle_decision()
+            acted = action, demo.pick_ids[step], demo.place_ids[step]
+            if (decision.action, decision.pick_id, decision.place_id) != acted:
+                return f"the oracle acts differently in step {step}"
         observation, *_ = env.step(action)
         if not np.array_equal(env.joint_path, demo.joint_paths[step]):
             return f"the joint path differs in step {step}"
-    return "" if env.outcome == demo.outcome else "the outcome differs"
+    return "" if is_composed or env.outcome == demo.outcome else "the outcome differs"
 
 
 def _chosen(
@@ -250,4 +261,4 @@ def _setup(task: ReplayTask) -> EnvConfig:
 
 @lru_cache(maxsize=4)
 def _env(task: str, level: str, domain: str, env_config: EnvConfig) -> "TabletopEnv":
-    return env_config.make(task, level, domain=domain)
+    return env_config.make(_HOST_TASK if task == COMPOSED else task, level, domain=domain)

@@ -1,0 +1,233 @@
+"""Demonstrations by users: their own successes, written to a data folder of the ordinary format.
+
+Only episodes of level "train" and domain "user" are taken, sampled or composed: nothing of an evaluation, and
+nothing of levels L1 to L4, becomes training data.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from openvima.catalog.packs import load_assets
+from openvima.data.encoding import ShardInfo
+from openvima.data.manifest import MANIFEST_NAME, finish_folder, previous_summaries, set_aside
+from openvima.data.reader import read_manifest
+from openvima.data.records import Demonstration, Rollout, package_versions
+from openvima.data.resuming import remove_leftovers, storage_error
+from openvima.data.shard import Shard
+from openvima.data.writer import ShardWriter
+from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
+from openvima.env.tabletop import TabletopEnv
+from openvima.errors import DatasetError, EpisodeError
+from openvima.folder_lock import folder_lock
+from openvima.render.raycast import object_below
+from openvima.scene import COMPOSED, Action, Episode, Scene
+from openvima.scene.goal import object_of
+from openvima.tasks import list_tasks, sample_episode
+from openvima.tasks.oracle import TIED_TO_TABLE
+
+COMMAND = "openvima studio"  # what manifests name as their maker
+DOMAIN, LEVEL = "user", "train"
+SHARD_SIZE = 50  # episodes; the last shard is written anew for each demonstration, 2 MB at most
+_HOST_TASK = "visual_manipulation"  # whose environment plays composed episodes
+_MOVED_M = 0.002
+_LOCK_S = 10.0  # to wait for another session that records
+
+
+def check_recordable(episode: Episode, *, env_config: EnvConfig = DEFAULT_ENV_CONFIG) -> None:
+    """Check that demonstrations of an episode may be recorded.
+
+    Args:
+        episode: The episode.
+        env_config: Settings that it was sampled with.
+
+    Raises:
+        DatasetError: It is of an evaluation level or an evaluation, it has no goals, or its task samples
+            another episode for its seed.
+    """
+    named = f"the episode ({episode.task}, {episode.level}, {episode.domain} seed {episode.seed})"
+    if episode.level != LEVEL:
+        raise DatasetError(
+            f"{named} is of level {episode.level}, which stays unseen; demonstrations are recorded at level "
+            f"{LEVEL} and for composed scenes only."
+        )
+    if episode.domain != DOMAIN:
+        raise DatasetError(
+            f"{named} has a seed of domain {episode.domain!r}; demonstrations are recorded for episodes of "
+            f"domain {DOMAIN!r} and for composed scenes only."
+        )
+    if not episode.problem.goals:
+        raise DatasetError(f"{named} has no goals, so it is never solved; give it some to record it.")
+    if episode.task == COMPOSED:
+        return
+    if episode.task not in list_tasks() or episode != sample_episode(
+        episode.task,
+        level=LEVEL,
+        seed=episode.seed,
+        domain=DOMAIN,
+        assets=env_config.assets,
+        compat=env_config.compat,
+        prompts=env_config.prompts,
+        **env_config.options(episode.task),
+    ):
+        raise DatasetError(f"{named} is not what the task samples for this seed; compose it to record it.")
+
+
+def demonstrate(
+    episode: Episode, actions: Sequence[Action], *, env_config: EnvConfig = DEFAULT_ENV_CONFIG
+) -> Demonstration:
+    """Execute actions and return the demonstration, with the objects that each action refers to.
+
+    Args:
+        episode: A sampled or composed episode.
+        actions: The actions of a user.
+        env_config: Settings that the episode was sampled with.
+
+    Returns:
+        The demonstration; composed ones get their seed from their content, so that no two share one.
+
+    Raises:
+        DatasetError: The actions do not solve the episode, or one of them moves nothing.
+        ActionError: An action is invalid.
+    """
+    is_composed = episode.task == COMPOSED
+    if is_composed:
+        env = TabletopEnv(_HOST_TASK, assets=env_config.assets, compat=env_config.compat)
+    else:
+        env = env_config.make(episode.task, episode.level, domain=episode.domain)
+    observation, _ = env.reset(options={"episode": episode})
+    rollout, pick_ids, place_ids = Rollout(env, observation), [], []
+    for number, action in enumerate(actions, start=1):
+        before, open_goals = env.scene, env.progress.open_goals
+        try:
+            grasped = rollout.step(action)["grasped"]
+        except EpisodeError as error:
+            raise DatasetError(f"action {number} of {len(actions)} is one too many: {error}") from None
+        pick_id = grasped or _moved_most(before, env.scene)
+        if pick_id is None:
+            raise DatasetError(f"action {number} moves nothing; go back and repeat it before recording.")
+        met = [g for g in open_goals if g not in env.progress.open_goals]
+        pick_ids.append(pick_id)
+        place_ids.append(_place_id(env, before, pick_id, met))
+    if not env.outcome.success:
+        reason = env.outcome.reason or f"not solved after {len(actions)} actions"
+        raise DatasetError(f"only successes are recorded, and this episode is not one: {reason}.")
+    demo = rollout.demonstration(pick_ids, place_ids)
+    return replace(demo, seed=int(demo.content_hash()[:15], 16)) if is_composed else demo
+
+
+def record_demonstration(
+    folder: str | Path,
+    episode: Episode,
+    actions: Sequence[Action],
+    *,
+    env_config: EnvConfig = DEFAULT_ENV_CONFIG,
+) -> int:
+    """Append a success of a user to a data folder, which is complete after every call.
+
+    Args:
+        folder: A folder of recorded demonstrations, or one to make.
+        episode: An episode of level "train" and domain "user", or a composed one with goals.
+        actions: The actions that solve it; they are executed again.
+        env_config: Settings that the episode was sampled with.
+
+    Returns:
+        Number of demonstrations in the folder.
+
+    Raises:
+        DatasetError: The episode must not be recorded, the actions do not solve it, the folder holds other
+            data, or a demonstration of the same episode.
+        FolderLockedError: Another process writes to the folder.
+        StorageError: The folder cannot be written to.
+
+    Example:
+        >>> actions = [Action.planar((0.45, -0.25), (0.55, 0.25))]
+        >>> record_demonstration("mine", openvima.load_episode("scene.yaml"), actions)  # doctest: +SKIP
+        1
+    """
+    check_recordable(episode, env_config=env_config)
+    if episode.task == COMPOSED:
+        env_config = EnvConfig(env_config.assets, env_config.compat)  # the others are of tasks
+    demo, folder = demonstrate(episode, actions, env_config=env_config), Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with folder_lock(folder, timeout_s=_LOCK_S):
+            remove_leftovers(folder)
+            return _append(folder, demo, env_config)
+    except OSError as error:
+        raise storage_error(folder, list(folder.glob("*.arrow")), error) from error
+
+
+def _append(folder: Path, demo: Demonstration, env_config: EnvConfig) -> int:
+    shards = _own_shards(folder)
+    settings = {**env_config.record(), "assets": load_assets(env_config.assets).name}
+    info = ShardInfo(demo.task, LEVEL, DOMAIN, 0, SHARD_SIZE, 0, versions=package_versions(), **settings)
+    same = [shard for shard in shards if shard.info.task == demo.task]
+    for shard in same:
+        if shard.info.env_config == info.env_config and demo.seed in _seeds(shard):
+            raise DatasetError(
+                f"{folder} holds a demonstration of this episode already ({demo.task}, seed {demo.seed}); "
+                "go on with another seed or scene."
+            )
+    last = same[-1] if same and len(same[-1]) < SHARD_SIZE else None
+    if last is None or replace(last.info, number=0) != info:  # other settings or versions
+        last, info = None, replace(info, number=len(same))
+    else:
+        info = last.info
+    known = previous_summaries(folder)
+    known.pop(info.file_name, None)
+    set_aside(folder)
+    with ShardWriter(folder / info.file_name, info) as writer:
+        for row in range(0 if last is None else len(last)):
+            assert last is not None  # or there are no rows
+            writer.copy(last.batch(row))
+        writer.write(demo)
+    paths = sorted({*(shard.path for shard in shards), folder / info.file_name})
+    config = {"level": LEVEL, "domain": DOMAIN}
+    finish_folder(folder, paths, command=COMMAND, config=config, versions=package_versions(), known=known)
+    return sum(len(shard) for shard in shards if shard is not last) + (1 if last is None else len(last) + 1)
+
+
+def _own_shards(folder: Path) -> list[Shard]:
+    """Open the shards of a folder, by task and number.
+
+    Raises:
+        DatasetError: It holds other data than recorded demonstrations.
+        ShardError: A shard is damaged.
+    """
+    shards = [Shard(path) for path in sorted(folder.glob("*.arrow"))]
+    made_by = read_manifest(folder)["command"] if (folder / MANIFEST_NAME).is_file() else COMMAND
+    if made_by != COMMAND or any(shard.info.domain != DOMAIN for shard in shards):
+        raise DatasetError(
+            f"{folder} holds other data (`{made_by}`); give a folder of recorded demonstrations or a new one."
+        )
+    return shards
+
+
+def _seeds(shard: Shard) -> list[int]:
+    return shard.table(["seed"]).column("seed").to_pylist()
+
+
+def _moved_most(before: Scene, after: Scene) -> int | None:
+    """The object that moved farthest; None if all are where they were."""
+    pairs = zip(before.placements, after.placements, strict=True)
+    moved = {old.id: old.pose.planar_distance(new.pose) for old, new in pairs}
+    farthest = max(moved, key=moved.__getitem__)
+    return farthest if moved[farthest] > _MOVED_M else None
+
+
+def _place_id(env: TabletopEnv, before: Scene, pick_id: int, met: Sequence[int]) -> int:
+    """The object relative to which another was placed: of a goal that was met, else what lies below it."""
+    goals = env.episode.problem.goals
+    is_sweep = before.end_effector == "spatula"
+    for goal in goals if is_sweep else [goals[number] for number in met]:
+        relative_to = getattr(goal, "relative_to", None)
+        if object_of(goal) == pick_id and relative_to is not None:
+            return relative_to
+    if is_sweep:
+        return TIED_TO_TABLE
+    pose = env.scene[pick_id].pose
+    others = [placement for placement in before.placements if placement.id != pick_id]
+    if below := object_below(others, (pose.x, pose.y), env.assets):
+        return below
+    return pick_id if pose.planar_distance(before[pick_id].pose) < _MOVED_M else TIED_TO_TABLE

@@ -1,0 +1,148 @@
+"""Demonstrations of users: what may be recorded, and that folders are like generated ones."""
+
+import dataclasses
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openvima import compose
+from openvima.catalog import load_assets
+from openvima.data import Dataset, VerifyConfig, record_demonstration, verify
+from openvima.data.user_demonstrations import SHARD_SIZE, demonstrate
+from openvima.env import EnvConfig
+from openvima.errors import DatasetError
+from openvima.render.raycast import first_hit
+from openvima.scene import Action, Episode
+from openvima.tasks import sample_episode
+
+ALL = VerifyConfig(replay=None)
+BOWL = ("bowl", "green", (0.55, 0.25))
+
+
+def scene(*objects: tuple, goals: tuple = (("in", "a", "b"),)) -> Episode:
+    return compose(
+        objects or [("block", "red", (0.45, -0.25)), BOWL], "Put the {a} into the {b}.", goals=goals
+    )
+
+
+def clicked(episode: Episode, rng: random.Random) -> list[Action]:
+    """Click somewhere on the object of each goal, seen from the front, and somewhere in the middle of its base."""
+    actions = []
+    for goal in episode.problem.goals:
+        target, base = (episode.problem.scene[i] for i in (goal.object_id, goal.relative_to))
+        x, y, z = target.pose.position
+        aim = np.array([x + rng.uniform(-0.01, 0.01), y + rng.uniform(-0.01, 0.01), z])
+        hit = first_hit(
+            episode.problem.scene, aim + (0.6, 0.0, 0.8), (-0.6, 0.0, -0.8), load_assets("procedural")
+        )
+        assert hit is not None and hit.object_id == target.id
+        place = (base.pose.x + rng.uniform(-0.01, 0.01), base.pose.y + rng.uniform(-0.01, 0.01))
+        actions.append(Action.planar(hit.point[:2], place))
+    return actions
+
+
+def refusal(folder: Path, episode: Episode, actions: list[Action], **options: object) -> str:
+    with pytest.raises(DatasetError) as caught:
+        record_demonstration(folder, episode, actions, **options)
+    return str(caught.value)
+
+
+def test_sampled_and_composed_successes_make_one_data_set(tmp_path: Path) -> None:
+    rng = random.Random(0)
+    episode = sample_episode("visual_manipulation", seed=0)
+    assert record_demonstration(tmp_path, episode, clicked(episode, rng)) == 1
+    assert record_demonstration(tmp_path, scene(), clicked(scene(), rng)) == 2
+    assert record_demonstration(tmp_path, scene(), clicked(scene(), rng)) == 3  # by other clicks
+    dataset = Dataset(tmp_path)
+    assert dataset.index.column("task").to_pylist() == ["composed", "composed", "visual_manipulation"]
+    assert set(dataset.index.column("domain").to_pylist()) == {"user"}
+    demo = dataset[0]
+    assert (demo.pick_ids, demo.place_ids) == ((5,), (6,)) and demo.outcome.success
+    found = verify(tmp_path, ALL)
+    assert found.is_clean and found.num_replayed == 3 and not found.notes, (found.problems, found.notes)
+
+
+def test_a_changed_pose_of_a_composed_demonstration_does_not_replay(tmp_path: Path) -> None:
+    from openvima.data.verification.replay import first_difference
+    from openvima.env import TabletopEnv
+
+    demo = demonstrate(scene(), clicked(scene(), random.Random(0)))
+    env = TabletopEnv("rotate")
+    assert first_difference(env, demo) == ""
+    other = dataclasses.replace(demo, actions=(Action.planar((0.45, -0.25), (0.3, 0.0)),))
+    assert first_difference(env, other) == "the joint path differs in step 0"
+
+
+def test_nothing_of_an_evaluation_is_recorded(tmp_path: Path) -> None:
+    out = tmp_path / "mine"
+    held_out = sample_episode("visual_manipulation", level="L3", seed=0)
+    assert "is of level L3, which stays unseen" in refusal(out, held_out, [])
+    relabelled = dataclasses.replace(held_out, level="train")
+    assert "not what the task samples" in refusal(out, relabelled, [])
+    evaluated = sample_episode("visual_manipulation", seed=0, domain="eval")
+    assert "domain 'eval'" in refusal(out, evaluated, [])
+    assert "has no goals" in refusal(out, scene(goals=()), [])
+    optional = sample_episode("rotate", seed=0, difficulty="hard")
+    assert "not what the task samples" in refusal(out, optional, [])
+    options = EnvConfig(task_options="rotate.difficulty=hard")
+    assert "only successes" in refusal(out, optional, [], env_config=options)
+    assert not out.exists()
+
+
+def test_actions_that_solve_nothing_are_not_recorded(tmp_path: Path) -> None:
+    solution = clicked(scene(), random.Random(0))
+    assert "action 1 moves nothing" in refusal(tmp_path, scene(), [Action.planar((0.3, 0.4), (0.5, 0.0))])
+    assert "is not one" in refusal(tmp_path, scene(), [Action.planar((0.45, -0.25), (0.4, 0.0))])
+    assert "action 2 of 2 is one too many" in refusal(tmp_path, scene(), solution * 2)
+    assert not any(tmp_path.glob("*.arrow"))
+
+
+def test_the_same_demonstration_is_recorded_once(tmp_path: Path) -> None:
+    solution = clicked(scene(), random.Random(0))
+    record_demonstration(tmp_path, scene(), solution)
+    before = (tmp_path / "dataset.json").read_bytes()
+    assert "already (composed, seed" in refusal(tmp_path, scene(), solution)
+    assert (tmp_path / "dataset.json").read_bytes() == before
+
+
+def test_a_folder_of_other_data_is_left_alone(tmp_path: Path, data_folder: Path) -> None:
+    before = {path: path.read_bytes() for path in data_folder.glob("*.*")}
+    assert "holds other data" in refusal(data_folder, scene(), clicked(scene(), random.Random(0)))
+    assert {path: path.read_bytes() for path in data_folder.glob("*.*")} == before
+
+
+def test_a_killed_session_leaves_a_folder_that_the_next_one_finishes(tmp_path: Path) -> None:
+    rng = random.Random(0)
+    record_demonstration(tmp_path, scene(), clicked(scene(), rng))
+    (tmp_path / "dataset.json").rename(tmp_path / ".dataset.json.old")  # as while a shard is written
+    assert record_demonstration(tmp_path, scene(), clicked(scene(), rng)) == 2
+    assert verify(tmp_path, ALL).is_clean and len(Dataset(tmp_path)) == 2
+
+
+def test_shards_of_users_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert SHARD_SIZE > 2
+    monkeypatch.setattr("openvima.data.user_demonstrations.SHARD_SIZE", 2)
+    rng = random.Random(0)
+    for _ in range(3):
+        record_demonstration(tmp_path, scene(), clicked(scene(), rng))
+    assert [path.name for path in sorted(tmp_path.glob("*.arrow"))] == [
+        "composed-train-00000.arrow",
+        "composed-train-00001.arrow",
+    ]
+    assert len(Dataset(tmp_path)) == 3
+
+
+def test_sweeps_name_the_block_and_its_zone(tmp_path: Path) -> None:
+    objects = [("small block", "red", (0.5, 0.1)), ("three-sided rectangle", "blue", (0.5, -0.2))]
+    episode = compose(objects, "Sweep {a}.", goals=[("swept_into", "a", "b")], end_effector="spatula")
+    demo = demonstrate(episode, [Action.planar((0.5, 0.106), (0.5, -0.2325))])
+    assert demo.outcome.success and (demo.pick_ids, demo.place_ids) == ((4,), (5,))
+
+
+@pytest.fixture
+def data_folder(tmp_path: Path, made_up, info) -> Path:
+    from small_data_sets import with_plain_images, write_folder
+
+    return write_folder(tmp_path / "other", info, [[with_plain_images(made_up(1))]])
