@@ -4,7 +4,6 @@ import dataclasses
 import random
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from openvima import compose
@@ -28,15 +27,13 @@ def scene(*objects: tuple, goals: tuple = (("in", "a", "b"),)) -> Episode:
 
 
 def clicked(episode: Episode, rng: random.Random) -> list[Action]:
-    """Click somewhere on the object of each goal, seen from the front, and somewhere in the middle of its base."""
+    """Click on the object of each goal, seen from the front, and near the middle of its base."""
     actions = []
     for goal in episode.problem.goals:
         target, base = (episode.problem.scene[i] for i in (goal.object_id, goal.relative_to))
         x, y, z = target.pose.position
-        aim = np.array([x + rng.uniform(-0.01, 0.01), y + rng.uniform(-0.01, 0.01), z])
-        hit = first_hit(
-            episode.problem.scene, aim + (0.6, 0.0, 0.8), (-0.6, 0.0, -0.8), load_assets("procedural")
-        )
+        origin = x + rng.uniform(-0.01, 0.01) + 0.6, y + rng.uniform(-0.01, 0.01), z + 0.8
+        hit = first_hit(episode.problem.scene, origin, (-0.6, 0.0, -0.8), load_assets("procedural"))
         assert hit is not None and hit.object_id == target.id
         place = (base.pose.x + rng.uniform(-0.01, 0.01), base.pose.y + rng.uniform(-0.01, 0.01))
         actions.append(Action.planar(hit.point[:2], place))

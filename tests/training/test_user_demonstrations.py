@@ -12,7 +12,7 @@ from openvima.tasks import sample_episode
 
 pytest.importorskip("torch")
 
-from openvima.training import TrainingConfig, train  # noqa: E402
+from openvima.training import TrainingConfig, train
 
 
 def record_clicks(folder: Path, count: int) -> None:

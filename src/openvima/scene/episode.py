@@ -94,6 +94,12 @@ class Episode:
 
     __repr__ = brief_repr
 
+    @staticmethod
+    def of_scene(scene: Scene, *, seed: int, max_steps: int) -> "Episode":
+        """Return an episode of a composed scene without prompt and goals."""
+        problem = Problem(scene, Prompt("", ()), ())
+        return Episode(COMPOSED, "train", "user", seed, problem, max_steps, max_steps)
+
     def _repr_html_(self) -> str | None:
         return notebook_html("episode", episode=self, parts=self.problem.prompt.described_parts())
 

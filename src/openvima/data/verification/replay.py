@@ -1,7 +1,7 @@
 """Replaying stored episodes: seed, oracle and actions must reproduce the same bytes.
 
-Demonstrations of users are compared without the oracle. Of composed scenes neither goals nor prompt images are
-stored, so these begin with the stored scene, and prompt and outcome are not compared.
+Demonstrations of users are compared without the oracle. Of composed scenes goals and prompt are not stored:
+these begin with the stored scene, and prompt and outcome are not compared.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from openvima.data.verification.shards import ShardFindings
 from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, OpenVimaError
 from openvima.multiprocess import imap_unordered
-from openvima.scene import COMPOSED, Episode, Problem, Prompt, RenderedPrompt
+from openvima.scene import COMPOSED, Episode, RenderedPrompt
 
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
@@ -158,10 +158,7 @@ def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
     """
     is_composed = demo.task == COMPOSED
     if is_composed:
-        problem = Problem(demo.scenes[0], Prompt("", ()), ())
-        episode = Episode(
-            COMPOSED, demo.level, demo.domain, demo.seed, problem, demo.max_steps, demo.max_steps
-        )
+        episode = Episode.of_scene(demo.scenes[0], seed=demo.seed, max_steps=demo.max_steps)
         observation, _ = env.reset(options={"episode": episode})
     else:
         observation, _ = env.reset(seed=demo.seed)
