@@ -28,6 +28,7 @@ ORDER = (
     "evaluation",
     "report",
     "studies",
+    "studio",
     "cli",
 )
 FORBIDDEN = {

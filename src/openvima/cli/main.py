@@ -30,6 +30,7 @@ VERBS = {
     "verify-results": "confirm an evaluation from its recorded actions",
     "study": "run an experiment of the papers: train, evaluate, plot",
     "serve": "serve a policy over WebSockets",
+    "studio": "step through episodes, ask policies why, compose and act, in a browser",
     "report": "write the HTML report of an evaluation",
 }
 
@@ -48,9 +49,12 @@ _RESUMES = "interrupted; complete files were kept, and the same command resumes.
 _INTERRUPTED = {
     **dict.fromkeys(("generate", "data", "train", "detector", "evaluate", "study", "quickstart"), _RESUMES),
     "serve": "the policy is no longer served; goodbye.",
+    "studio": "the studio is closed; goodbye.",
 }
 # Least address space of the verbs that simulate or train, in 2**20 bytes.
-_LEAST_MB = dict.fromkeys(("demo", "generate", "train", "detector", "evaluate", "study", "quickstart"), 1000)
+_LEAST_MB = dict.fromkeys(
+    ("demo", "generate", "train", "detector", "evaluate", "study", "quickstart", "studio"), 1000
+)
 
 OVERVIEW = """openvima {version}: robot manipulation from multimodal prompts
 

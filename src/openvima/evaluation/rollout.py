@@ -17,8 +17,13 @@ OUT_OF_STEPS = "not done within the step limit"
 NO_ORACLE_ACTION = "the oracle has no action"
 
 
-class _EpisodeSlot:
-    """One environment of a batch and the state of its episode."""
+class EpisodeSlot:
+    """One environment of a batch and the state of its episode.
+
+    Args:
+        env: The environment; it is reset.
+        start: The episode, or its seed.
+    """
 
     def __init__(self, env: TabletopEnv, start: int | Episode) -> None:
         self.env = env
@@ -111,7 +116,7 @@ def play(
     if (modalities := getattr(policy, "modalities", None)) is not None:
         for env in envs:
             env.modalities = modalities
-    slots = [_EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
+    slots = [EpisodeSlot(env, start) for env, start in zip(envs, starts, strict=True)]
     policy.begin(envs)
     while any(slot.outcome is None for slot in slots):
         decisions = policy.decide([slot.observation for slot in slots])

@@ -11,8 +11,8 @@ from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning
 from openvima.evaluation.ablations import AblatedInput, ablate
-from openvima.evaluation.config import Batch
-from openvima.evaluation.sources import ORACLE, RANDOM
+from openvima.evaluation.config import DEFAULT_DEVICE, Batch
+from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource
 from openvima.policies.base import POLICIES_THAT_EXPLAIN
 from openvima.policies.own_code import checked_policy
 from openvima.policies.sources import is_own_code
@@ -212,20 +212,63 @@ def one_thread(batch: Batch) -> Iterator[None]:
         yield
 
 
+def load_own_rollout_policy(
+    source: str,
+    *,
+    device: str = DEFAULT_DEVICE,
+    boxes: str = "",
+    trust_code: bool = False,
+    temperature: float = 0.0,
+    seed: int = 0,
+) -> RolloutPolicy:
+    """Load a policy that nobody else has a reference to, with episodes of its own.
+
+    Args:
+        source: As for `openvima evaluate --policy`.
+        device: Where a network computes.
+        boxes: Detector, as in `EvaluationConfig`; empty for boxes of the segmentation.
+        trust_code: Run the code that a run folder names.
+        temperature: 0 for greedy decoding. Above 0 actions of networks are sampled, with logits divided by
+            it.
+        seed: Of the sampling.
+
+    Raises:
+        UnknownPolicyError, CheckpointError, ConfigError, ServerError: As for `load_rollout_policy`.
+    """
+    PolicySource(source, source, trust_code).check()
+    if source == ORACLE:
+        return OracleRolloutPolicy()
+    options: dict[str, Any] = {}  # Any: of several kinds
+    if temperature and source != RANDOM and not is_remote(source) and not is_own_code(source):
+        from openvima.policies.base import require_torch
+
+        require_torch(f"policy {source!r}")
+        import torch
+
+        options = {"temperature": temperature, "generator": torch.Generator().manual_seed(seed)}
+    policy = _build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
+    return PromptedRolloutPolicy(policy, name=source)
+
+
 @lru_cache(maxsize=1)
 def _load_policy(
     source: str, fingerprint: str, device: str, precision: str, boxes: str, trust_code: bool
 ) -> Any:  # Any: see `PromptedRolloutPolicy`
-    from openvima.policies import load_policy
-
     if is_remote(source):
         _load_policy.cache_clear()  # ends the connection before: a server may let in one client only
-        return RemotePolicy(source)
-    options: dict[str, Any] = {"device": device, "trust_code": trust_code}  # Any: of several kinds
+    options: dict[str, Any] = {}  # Any: of several kinds
     if precision:
         import torch
 
         options["dtype"] = getattr(torch, precision)
+    return _build_policy(source, device=device, boxes=boxes, trust_code=trust_code, **options)
+
+
+def _build_policy(source: str, *, boxes: str, **options: Any) -> Any:  # Any: see `PromptedRolloutPolicy`
+    from openvima.policies import load_policy
+
+    if is_remote(source):
+        return RemotePolicy(source)
     if boxes:
         options["extractor"] = plugged_extractor(boxes)
     return load_policy(source, **options)

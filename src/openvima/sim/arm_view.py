@@ -110,6 +110,18 @@ def arm_drawables(joints: np.ndarray, end_effector: EndEffector) -> tuple[Drawab
     )
 
 
+def arm_parts(end_effector: EndEffector) -> tuple[tuple[int, tuple[int, int, int], TriangleMesh], ...]:
+    """Return the meshes of the arm with its tool, for viewers that pose them.
+
+    Args:
+        end_effector: The tool at the flange.
+
+    Returns:
+        Of each part the index of its link in `link_frames`, its colour, and its mesh in the link's frame.
+    """
+    return tuple((link, rgb, mesh) for (_, rgb), parts in _parts(end_effector) for link, mesh in parts)
+
+
 _Parts = tuple[tuple[int, TriangleMesh], ...]
 
 

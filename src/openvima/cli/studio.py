@@ -1,0 +1,82 @@
+"""`openvima studio`: episodes, policies and data in a browser."""
+
+import logging
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def main(
+    path: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PATH")] = None,
+    *,
+    port: int = 0,
+    open: bool = False,
+    policies: str = "",
+    record_demonstrations: Path | None = None,
+    assets: str = "procedural",
+    compat: bool = False,
+    prompts: str = "multimodal",
+    task_options: str = "",
+    device: str = "cpu",
+    trust_code: bool = False,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+) -> int:
+    """Open the studio until Ctrl-C: step through episodes, ask policies why, compose, act, browse.
+
+    Every browser has a session of its own. Nothing leaves this machine.
+
+    Example: openvima studio --open
+
+    Args:
+        path: Folder of an evaluation or of demonstrations to browse.
+        port: TCP port; 0 takes a free one. The address is printed once the server answers.
+        open: Open the page in a browser.
+        policies: Policies to offer besides openvima-small, oracle, random and you, with commas between them:
+            what `openvima evaluate --policy` takes.
+        record_demonstrations: Folder to which own successes are written as demonstrations of domain "user".
+        assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
+            or FILE.py:FUNCTION, which registers assets of your own.
+        compat: Follow the original benchmark also where it is odd.
+        prompts: multimodal, text or mixed, as for `openvima demo`.
+        task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them.
+        device: Where networks compute: cpu, in float64, or cuda, in float32.
+        trust_code: Run the code that run folders name, as those of learners of your own do.
+        host: Interface to listen on. Any but the loopback interface needs a token.
+        token: Word that the page asks for; by default that of the environment variable OPENVIMA_SERVE_TOKEN.
+            Who knows it can run code on this machine.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.extras import import_extra
+    from openvima.serving.protocol import TOKEN_VARIABLE
+
+    for module in ("viser", "trimesh"):
+        import_extra(module, f"the studio needs {module}; install it with: pip install 'openvima[studio]'")
+    from openvima.env import EnvConfig
+    from openvima.studio.app import Studio
+    from openvima.studio.browser_session import StudioConfig
+
+    config = StudioConfig(
+        path,
+        tuple(name.strip() for name in policies.split(",") if name.strip()),
+        record_demonstrations,
+        EnvConfig(assets, compat, prompts, task_options),
+        device,
+        trust_code,
+        host,
+        port,
+        token or os.environ.get(TOKEN_VARIABLE) or None,
+    )
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    with Studio(config) as studio:
+        print(studio.url, flush=True)
+        if open:
+            webbrowser.open(studio.url)
+        studio.wait()
+    return 0

@@ -1,0 +1,283 @@
+"""Episodes that are stepped, taken back and inspected; the studio and `play` are made of them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from openvima.brief import brief_repr
+from openvima.catalog.geometry import Assets
+from openvima.env.tabletop import TabletopEnv, VideoFrame
+from openvima.errors import EpisodeError, OpenVimaError, OracleError, PolicyError
+from openvima.evaluation.results import EpisodeOutcome
+from openvima.evaluation.rollout import EpisodeSlot
+from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
+from openvima.policies.base import Policy
+from openvima.scene import Action, Episode, RenderedPrompt, Scene
+from openvima.scene.explanation import Explanation
+from openvima.user_code import described
+
+_HOST_TASK = "visual_manipulation"  # an environment of any task plays all episodes
+SAME_POSITION_M, SAME_YAW_RAD = 0.02, math.radians(10)  # actions that differ by less count as equal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """What the policy would do next.
+
+    Args:
+        action: Its action; None if there is no policy, or it gave none.
+        explanation: What it considered, for policies that explain.
+        error: Why there is no action, or no explanation.
+    """
+
+    action: Action | None = None
+    explanation: Explanation | None = None
+    error: OpenVimaError | None = None
+
+    __repr__ = brief_repr
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionStep:
+    """One executed step.
+
+    Args:
+        action: The action.
+        proposal: What the policy proposed; its action is another one where a user acted.
+        before: The scene before the step.
+        scene: The scene after it.
+        frames: Scenes and joint angles while it ran, 30 a second, if the session records them.
+    """
+
+    action: Action
+    proposal: Proposal
+    before: Scene
+    scene: Scene
+    frames: tuple[VideoFrame, ...] = field(repr=False)
+
+    __repr__ = brief_repr
+
+
+class EpisodeSession:
+    """An episode, a policy and the steps taken so far.
+
+    The policy is asked at every step, also where a user acts, so that its history is whole. What it raises is
+    a value, `Proposal.error`, and leaves the session usable.
+
+    Args:
+        episode: The episode, sampled or composed.
+        policy: Decides where `step` is given no action; None: a user acts.
+        assets: Asset pack.
+        compat: Reproduce VIMA-Bench's quirks.
+        record: Whether steps record frames, for videos and the studio.
+        explain: Whether to ask the policy for explanations.
+
+    Example:
+        >>> from openvima.evaluation.rollout_policies import OracleRolloutPolicy
+        >>> from openvima.tasks import sample_episode
+        >>> session = EpisodeSession(sample_episode("rotate", seed=0), OracleRolloutPolicy())
+        >>> step = session.step()
+        >>> session.outcome.success
+        True
+        >>> session.back(0)
+        >>> session.num_steps
+        0
+    """
+
+    def __init__(
+        self,
+        episode: Episode,
+        policy: Policy | RolloutPolicy | None = None,
+        *,
+        assets: str | Path | Assets = "procedural",
+        compat: bool = False,
+        record: bool = True,
+        explain: bool = True,
+    ) -> None:
+        self.episode = episode
+        self.env = TabletopEnv(_HOST_TASK, assets=assets, compat=compat, realtime=record)
+        self._policy = _as_rollout_policy(policy)
+        self._record, self._explains = record, explain
+        self.steps: list[SessionStep] = []
+        self._restart()
+
+    @property
+    def num_steps(self) -> int:
+        """Number of steps taken."""
+        return len(self.steps)
+
+    @property
+    def outcome(self) -> EpisodeOutcome | None:
+        """How the episode ended; None while it runs."""
+        return self._slot.outcome
+
+    @property
+    def scene(self) -> Scene:
+        """The current scene."""
+        return self.env.scene
+
+    @property
+    def prompt(self) -> RenderedPrompt:
+        """The prompt, with its images."""
+        return self.env.prompt
+
+    @property
+    def policy(self) -> RolloutPolicy | None:
+        """The policy; one that is assigned reads the steps so far and decides the next."""
+        return self._policy
+
+    @policy.setter
+    def policy(self, policy: Policy | RolloutPolicy | None) -> None:
+        self._policy = _as_rollout_policy(policy)
+        self.back(self.num_steps)
+
+    def frame(self) -> VideoFrame:
+        """Return the current scene with the arm's joint angles, for drawing."""
+        return VideoFrame(self.scene, self.env.joints)
+
+    def propose(self) -> Proposal:
+        """Ask the policy what it would do next; it is asked once a step."""
+        if self._proposal is None:
+            self._proposal = self._ask(explain=self._explains)
+        return self._proposal
+
+    def step(self, action: Action | None = None) -> SessionStep | None:
+        """Take a step.
+
+        Args:
+            action: The action of a user; None: that of the policy.
+
+        Returns:
+            The step; None if nothing was executed, as `propose` explains.
+
+        Raises:
+            EpisodeError: The episode is over.
+            ActionError: The given action is invalid; nothing was moved.
+        """
+        if self.outcome is not None:
+            raise EpisodeError(f"the episode ended after {self.num_steps} steps; go back, or start another.")
+        checked = None if action is None else Action.from_arrays(action.to_arrays())
+        proposal = self.propose()
+        decision = checked or self._decision
+        if decision is None:
+            return None
+        before = self.scene
+        self._slot.step(decision)
+        if self._slot.steps == self.num_steps:  # not executed: the policy's action is invalid
+            return None
+        done = checked or proposal.action
+        assert done is not None  # as executed
+        step = SessionStep(done, proposal, before, self.scene, self.env.frames)
+        self.steps.append(step)
+        self._proposal = None
+        return step
+
+    def run(self) -> EpisodeOutcome | None:
+        """Step until the episode is over, or the policy gives no action."""
+        while self.outcome is None and self.step() is not None:
+            pass
+        return self.outcome
+
+    def back(self, num_steps: int) -> None:
+        """Go back to the state after some steps, by replaying their actions: the simulation is deterministic.
+
+        Args:
+            num_steps: How many of the steps to keep.
+
+        Raises:
+            EpisodeError: There are not so many steps.
+        """
+        if not 0 <= num_steps <= self.num_steps:
+            raise EpisodeError(f"num_steps is {num_steps}; the episode has taken {self.num_steps}.")
+        kept = self.steps[:num_steps]
+        self._restart()
+        self.env.realtime = False  # the frames are known
+        for step in kept:
+            self._ask(explain=False)
+            self._slot.step(step.action)
+        self.env.realtime = self._record
+        self.steps = kept
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self.env.close()
+
+    def _restart(self) -> None:
+        if modalities := getattr(self._policy, "modalities", None):
+            self.env.modalities = modalities
+        self._slot = EpisodeSlot(self.env, self.episode)
+        self.steps = []
+        self._proposal: Proposal | None = None
+        self._decision: Decision = None
+        self._begun = False
+
+    def _ask(self, *, explain: bool) -> Proposal:
+        """Ask the policy, and keep what it decided."""
+        self._decision = None
+        if self._policy is None or self.outcome is not None:
+            return Proposal()
+        action = None
+        try:
+            if not self._begun:
+                self._policy.begin([self.env])
+                self._begun = True
+            (self._decision,) = self._policy.decide([self._slot.observation])
+            if isinstance(self._decision, OracleError):
+                return Proposal(error=self._decision)
+            assert self._decision is not None  # rollout policies have checked it
+            given = self._decision
+            action = given if isinstance(given, Action) else Action.from_arrays(given)
+            return Proposal(action, self._explanation() if explain else None)
+        except OpenVimaError as error:
+            return Proposal(action, error=error)
+        except Exception as error:  # of the policy's own `explain`
+            return Proposal(action, error=PolicyError(f"the policy raised {described(error)}."))
+
+    def _explanation(self) -> Explanation | None:
+        assert self._policy is not None  # it has decided
+        try:
+            explain = self._policy.explainer()
+        except PolicyError:  # it explains nothing
+            return None
+        (explanation,) = explain()
+        return explanation
+
+
+def first_difference(
+    first: Sequence[SessionStep],
+    second: Sequence[SessionStep],
+    *,
+    position_m: float = SAME_POSITION_M,
+    yaw_rad: float = SAME_YAW_RAD,
+) -> int | None:
+    """Return the index of the first step at which two runs of an episode differ.
+
+    Args:
+        first: Steps of one session.
+        second: Steps of the other.
+        position_m: Pick or place positions that are farther apart differ.
+        yaw_rad: Rotations that are farther apart differ.
+
+    Returns:
+        Index of the step; None if the steps that both have taken are equal.
+    """
+    for index, (one, other) in enumerate(zip(first, second, strict=False)):
+        far = max(
+            math.dist(one.action.pose0_position, other.action.pose0_position),
+            math.dist(one.action.pose1_position, other.action.pose1_position),
+        )
+        turned = _rotation(one.action) - _rotation(other.action)
+        if far > position_m or abs(math.remainder(turned, 2 * math.pi)) > yaw_rad:
+            return index
+    return None
+
+
+def _rotation(action: Action) -> float:
+    return action.yaw1_rad - action.yaw0_rad
+
+
+def _as_rollout_policy(policy: Policy | RolloutPolicy | None) -> RolloutPolicy | None:
+    if policy is None or hasattr(policy, "decide"):
+        return policy  # type: ignore[return-value]  # told apart by the method
+    return PromptedRolloutPolicy(policy)

@@ -1,0 +1,1 @@
+"""The studio: episodes, policies and data in a browser, on viser."""

@@ -1,0 +1,123 @@
+"""The studio's server: every browser gets a session of its own, with its own episodes and scene."""
+
+import hmac
+import socket
+import threading
+from urllib.parse import urlsplit
+
+import rich
+import viser
+from viser.infra import ClientId
+
+from openvima.errors import ConfigError
+from openvima.serving.config import is_loopback
+from openvima.studio.browser_session import BrowserSession, StudioConfig
+from openvima.studio.play_panel import PlayPanel
+
+PANELS = (PlayPanel,)  # in the order of their tabs
+
+
+class Studio:
+    """The server; a context manager.
+
+    Args:
+        config: Settings.
+
+    Raises:
+        ConfigError: The address cannot be listened on.
+    """
+
+    def __init__(self, config: StudioConfig) -> None:
+        self.config = config
+        _check_free(config.host, config.port)
+        rich.get_console().quiet = True  # viser prints addresses of its own
+        self._server = _Server(config.host, config.port, label="openvima studio", verbose=False)
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.sessions: dict[int, BrowserSession] = {}
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(self._gone)
+
+    @property
+    def url(self) -> str:
+        """The address to open in a browser."""
+        host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
+        return f"http://{host}:{self._server.get_port()}"
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        threading.Event().wait()
+
+    def close(self) -> None:
+        """End all sessions and the server."""
+        for session in [*self.sessions.values()]:
+            session.close()
+        self.sessions.clear()
+        self._server.stop()
+
+    def __enter__(self) -> "Studio":
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        if not self._server.is_own_page(client.client_id, any_host=self.config.token is not None):
+            client.add_notification("No entry", "Open the address that openvima studio printed.", color="red")
+        elif self.config.token is None:
+            self._begin(client)
+        else:
+            self._ask_token(client, self.config.token)
+
+    def _ask_token(self, client: viser.ClientHandle, token: str) -> None:
+        """Show nothing but a field for the token until it is right: viser's pages do not send the address."""
+        entry = client.gui.add_text("token", "", hint="the word given to openvima studio --token")
+
+        @entry.on_update
+        def _(_: viser.GuiEvent) -> None:
+            if hmac.compare_digest(entry.value.encode(), token.encode()):
+                entry.remove()
+                self._begin(client)
+
+    def _begin(self, client: viser.ClientHandle) -> None:
+        session = self.sessions[client.client_id] = BrowserSession(client, self.config)
+        for panel in PANELS:
+            panel(session)
+
+    def _gone(self, client: viser.ClientHandle) -> None:
+        session = self.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+
+
+class _Server(viser.ViserServer):
+    """A server that knows who connects, and offers no tunnel to other machines."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Refuse: the studio stays on this machine."""
+
+    def is_own_page(self, client_id: int, *, any_host: bool) -> bool:
+        """Whether a connection comes from a page of this server.
+
+        Pages of other sites could open a WebSocket to the loopback interface, or give a name of theirs its
+        address; what they are shown are empty pages, since scene and panels are those of sessions.
+        """
+        connection = self._websock_server._live_connections.get(ClientId(client_id))
+        request = None if connection is None else connection.request
+        if request is None:
+            return False
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return False
+        return any_host or is_loopback(urlsplit(f"//{host}").hostname or "")
+
+
+def _check_free(host: str, port: int) -> None:
+    """Check that an address can be listened on: viser would try other ports, or wait for ever."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"cannot listen on {host}:{port} ({error.strerror}); give another --host or --port."
+        ) from None

@@ -1,0 +1,146 @@
+"""*Play*: choose an episode and a policy, and step through it."""
+
+import numpy as np
+import viser
+
+from openvima.catalog.partitions import LEVELS
+from openvima.errors import ConfigError
+from openvima.evaluation.rollout_policies import RolloutPolicy
+from openvima.policies.bundled import SMALL
+from openvima.render import channels_last
+from openvima.render.camera import VIEWS
+from openvima.render.rasteriser import Rasteriser
+from openvima.studio.browser_session import YOU, BrowserSession
+from openvima.tasks import list_tasks, sample_episode, task_spec
+from openvima.tasks.seeding import MAX_SEED
+from openvima.video.prompt_strip import draw_prompt_strip
+
+_FIRST_TASK = "rearrange"
+_PROMPT_WIDTH = 720  # pixels that the prompt is drawn in
+_OTHER = "other …"
+
+
+class PlayPanel:
+    """The tab *Play*, and the window with the prompt.
+
+    Args:
+        session: The browser's session.
+    """
+
+    def __init__(self, session: BrowserSession) -> None:
+        self.session, self._policy = session, None
+        self._loaded: tuple[object, ...] = ()
+        self._rasteriser = Rasteriser(session.assets)
+        gui = session.gui
+        with session.tabs.add_tab("Play", viser.Icon.ROBOT):
+            self._add_choices(gui)
+            self._outcome = gui.add_markdown("")
+            self._add_controls(gui)
+            self._views = gui.add_image(np.zeros((1, 1, 3), np.uint8), label="what the policy sees")
+        window = gui.add_panel()
+        with window.add_tab("Prompt", viser.Icon.MESSAGE):
+            self._prompt = gui.add_image(np.full((1, 1, 3), 255, np.uint8))
+        window.float(x=12, y=-12, width=560)  # messages are shown above
+        session.on_change(self._show)
+        session.submit(self._open)
+
+    def _add_choices(self, gui: viser.GuiApi) -> None:
+        self._task = gui.add_dropdown("task", list_tasks(), initial_value=_FIRST_TASK)
+        self._level = gui.add_dropdown("level", LEVELS, initial_value="train")
+        self._seed = gui.add_number("seed", 0, min=0, max=2**53, step=1)
+        names = (SMALL, "oracle", "random", YOU, *self.session.config.policies, _OTHER)
+        self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
+        hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
+        self._source = gui.add_text("source", "", hint=hint, visible=False)
+        self._task.on_update(lambda _: self.session.interrupt(self._choose_task))
+        for choice in (self._level, self._seed):
+            choice.on_update(lambda _: self.session.interrupt(self._open))
+        self._name.on_update(lambda _: self.session.interrupt(self._choose_policy))
+        self._source.on_update(lambda _: self.session.interrupt(self._choose_policy))
+
+    def _add_controls(self, gui: viser.GuiApi) -> None:
+        session = self.session
+        self._buttons = gui.add_button_group("", ("step", "play", "pause", "next seed"))
+        self._time = gui.add_slider("after step", 0, 1, 1, 0)
+        self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
+
+        @self._buttons.on_click
+        def _(_: viser.GuiEvent) -> None:
+            work = {"step": session.step, "play": self._run, "next seed": self._next_seed}
+            chosen = work.get(self._buttons.value)
+            session.stopped.set() if chosen is None else session.interrupt(chosen)
+
+        @self._time.on_update
+        def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:  # not set by `_show`
+                session.interrupt(lambda: session.back(self._time.value))
+
+        @self._speed.on_update
+        def _(_: viser.GuiEvent) -> None:
+            session.speed = self._speed.value
+
+    def policy(self) -> RolloutPolicy | None:
+        """Load the chosen policy, unless it is loaded."""
+        name = self._source.value.strip() if self._name.value == _OTHER else self._name.value
+        if not name:
+            raise ConfigError("source is empty; name a policy, such as a run folder.")
+        if self._loaded != (name,):
+            self._policy, self._loaded = self.session.load_policy(name), (name,)
+        return self._policy
+
+    def _choose_task(self) -> None:
+        levels = task_spec(self._task.value).levels
+        level = self._level.value
+        self._level.options = levels
+        self._level.value = level if level in levels else levels[0]
+        self._open()
+
+    def _choose_policy(self) -> None:
+        self._source.visible = self._name.value == _OTHER
+        current = self.session.current
+        if current is not None and (self._source.value or not self._source.visible):
+            current.policy = self.policy()
+            self.session.changed()
+
+    def _open(self) -> None:
+        """Show the episode before the policy, which takes longer to load."""
+        config = self.session.config.env_config
+        episode = sample_episode(
+            self._task.value,
+            level=self._level.value,
+            seed=min(int(self._seed.value), MAX_SEED),
+            domain="user",
+            assets=self.session.assets,
+            compat=config.compat,
+            prompts=config.prompts,
+            **config.options(self._task.value),
+        )
+        self.session.open(episode, None)
+        self._choose_policy()
+
+    def _run(self) -> None:
+        while not self.session.stopped.is_set() and self.session.step():
+            pass
+
+    def _next_seed(self) -> None:
+        self._seed.value = int(self._seed.value) + 1
+
+    def _show(self) -> None:
+        """Show the prompt, the camera views, how far the episode is, and how it ended."""
+        current = self.session.current
+        if current is None:
+            return
+        self._prompt.image = draw_prompt_strip(current.prompt, width=_PROMPT_WIDTH)
+        images = self._rasteriser.scene(current.scene)
+        self._views.image = np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
+        self._time.max = max(1, current.num_steps)
+        self._time.value = current.num_steps
+        self._outcome.content = _sentence(current)
+
+
+def _sentence(current) -> str:
+    outcome, steps = current.outcome, current.num_steps
+    taken = "1 step" if steps == 1 else f"{steps} steps"
+    if outcome is None:
+        return f"{taken} of at most {current.episode.max_steps}"
+    return f"**Solved** in {taken}." if outcome.success else f"**Not solved**: {outcome.reason} ({taken})."

@@ -1,0 +1,168 @@
+"""The table in 3D: meshes and textures of the asset pack, and the arm, as nodes of one browser's scene."""
+
+import io
+import time
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import numpy as np
+import trimesh
+import viser
+from PIL import Image
+
+from openvima.catalog.geometry import Assets, TriangleMesh, Vector3
+from openvima.env.tabletop import FRAMES_PER_SECOND, VideoFrame
+from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
+from openvima.scene import EndEffector, Placement, Pose, Scene
+from openvima.sim.arm_view import arm_parts
+from openvima.sim.ur5 import link_frames
+from openvima.video.prompt_strip import Colour
+
+CAMERA_M, LOOK_AT_M = (1.36, 0.0, 1.0), (0.42, 0.0, 0.08)  # near the axis of the front camera
+_LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
+_AMBIENT, _DIRECTIONAL = 0.35, 0.65  # such that colours are those of the front camera, by eye
+_Shape = tuple[str, str, Vector3, Vector3]
+
+
+class Table:
+    """Table, objects and arm in the scene of one browser; a frame changes nothing but poses.
+
+    Args:
+        scene: The scene graph of the browser.
+        assets: Asset pack.
+    """
+
+    def __init__(self, scene: viser.SceneApi, assets: Assets) -> None:
+        self.scene_api, self.assets = scene, assets
+        self.objects: dict[int, viser.GlbHandle] = {}
+        self.shown: VideoFrame | None = None
+        self._shapes: dict[int, _Shape] = {}
+        self._arm: tuple[EndEffector, list[viser.FrameHandle]] | None = None
+        scene.configure_default_lights(enabled=False)
+        scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
+        scene.add_light_directional("/lights/sun", intensity=_DIRECTIONAL, position=_LIGHT_M)
+        size = (*SHEET_SIZE, 0.002)
+        scene.add_box("/table", color=SHEET_RGB, dimensions=size, position=(0.5, 0.0, -0.0011))
+
+    def show(self, frame: VideoFrame) -> None:
+        """Show a scene and the arm; objects that are shown already are moved only."""
+        self._show_objects(frame.scene)
+        for node, pose in zip(self._links(frame.scene.end_effector), link_frames(frame.joints), strict=True):
+            _move(node, pose)
+        self.shown = frame
+
+    def animate(
+        self, frames: Sequence[VideoFrame], *, speed: float = 1.0, stops: Callable[[], bool] | None = None
+    ) -> None:
+        """Show the frames of a step, 30 a second; the last one at once if `stops` says so."""
+        start = time.perf_counter()
+        for number, frame in enumerate(frames):
+            if stops is not None and stops():
+                self.show(frames[-1])
+                return
+            wait = start + number / (FRAMES_PER_SECOND * speed) - time.perf_counter()
+            if wait < -1 / FRAMES_PER_SECOND and number % 2:
+                continue  # late: half of the frames suffice
+            time.sleep(max(0.0, wait))
+            self.show(frame)
+        if frames:
+            self.show(frames[-1])
+
+    def add_ghost(
+        self,
+        name: str,
+        placement: Placement,
+        *,
+        pose: Pose | None = None,
+        colour: Colour = (0, 104, 201),
+        opacity: float = 0.3,
+        grow: float = 1.0,
+    ) -> viser.MeshHandle:
+        """Add a translucent copy of an object.
+
+        Args:
+            name: Name of the node.
+            placement: The object.
+            pose: Where; by default where the object is.
+            colour: Its colour.
+            opacity: From 0 to 1.
+            grow: Factor on its size, such that it can cover the object.
+        """
+        mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
+        centre = mesh.vertices.reshape(-1, 3).mean(axis=0)
+        vertices = (mesh.vertices.reshape(-1, 3) - centre) * grow + centre
+        node = self.scene_api.add_mesh_simple(
+            name,
+            vertices,
+            np.arange(len(vertices)).reshape(-1, 3),
+            color=colour,
+            opacity=opacity,
+            flat_shading=True,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        _move(node, placement.pose if pose is None else pose)
+        return node
+
+    def _show_objects(self, scene: Scene) -> None:
+        placements = {placement.id: placement for placement in scene.placements}
+        for object_id in [*self.objects]:
+            placement = placements.get(object_id)
+            if placement is None or _shape(placement) != self._shapes[object_id]:
+                self.objects.pop(object_id).remove()
+                del self._shapes[object_id]
+        for object_id, placement in placements.items():
+            if object_id not in self.objects:
+                self._shapes[object_id] = _shape(placement)
+                data = _object_glb(self.assets, *_shape(placement))
+                self.objects[object_id] = self.scene_api.add_glb(
+                    f"/objects/{object_id}", data, cast_shadow=False, receive_shadow=False
+                )
+            _move(self.objects[object_id], placement.pose)
+
+    def _links(self, end_effector: EndEffector) -> list[viser.FrameHandle]:
+        if self._arm is None or self._arm[0] != end_effector:
+            for node in self._arm[1] if self._arm else ():
+                node.remove()
+            nodes = [self.scene_api.add_frame(f"/arm/{link}", show_axes=False) for link in range(8)]
+            for number, (link, rgb, mesh) in enumerate(arm_parts(end_effector)):
+                data = _part_glb(mesh, rgb)
+                self.scene_api.add_glb(f"/arm/{link}/{number}", data, cast_shadow=False, receive_shadow=False)
+            self._arm = (end_effector, nodes)
+        return self._arm[1]
+
+
+def _shape(placement: Placement) -> _Shape:
+    return placement.object, placement.texture, placement.size, placement.scale
+
+
+def _move(node: viser.SceneNodeHandle, pose: Pose) -> None:
+    """Pose a node; viser sends nothing where nothing changed."""
+    x, y, z, w = pose.quaternion
+    node.position, node.wxyz = pose.position, (w, x, y, z)
+
+
+@lru_cache(maxsize=512)
+def _object_glb(assets: Assets, name: str, texture: str, size: Vector3, scale: Vector3) -> bytes:
+    return _glb(assets.geometry(name, size, scale).visual, assets.texture(texture))
+
+
+@lru_cache(maxsize=64)
+def _part_glb(mesh: TriangleMesh, rgb: Colour) -> bytes:
+    return _glb(mesh, np.array(rgb, np.uint8).reshape(1, 1, 3))
+
+
+def _glb(mesh: TriangleMesh, texture: np.ndarray) -> bytes:
+    """Encode a mesh with its texture as binary glTF."""
+    material = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0)
+    material.baseColorTexture = Image.fromarray(np.ascontiguousarray(texture))
+    body = trimesh.Trimesh(
+        mesh.vertices.reshape(-1, 3),
+        np.arange(3 * len(mesh.vertices)).reshape(-1, 3),
+        vertex_normals=mesh.normals.reshape(-1, 3),
+        visual=trimesh.visual.TextureVisuals(uv=mesh.uvs.reshape(-1, 2), material=material),
+        process=False,
+    )
+    with io.BytesIO() as stream:
+        body.export(stream, file_type="glb", include_normals=True)
+        return stream.getvalue()
