@@ -80,13 +80,23 @@ def save_episode(episode: Episode, path: str | Path) -> Path:
         InputFileError: The path ends in none of these, or the episode has a goal of a class of one's own.
     """
     path = Path(path)
-    suffix = _checked_suffix(path)
-    values = _encode(episode, Episode)
-    if suffix == ".json":
-        text = json.dumps(values, indent=1, ensure_ascii=False) + "\n"
-    else:
-        text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
+    is_json, values = _checked_suffix(path) == ".json", episode_values(episode)
+    text = json.dumps(values, indent=1, ensure_ascii=False) + "\n" if is_json else yaml_text(values)
     return atomic_write_file(path, text)
+
+
+def episode_values(episode: Episode) -> dict[str, Any]:
+    """Return an episode as the plain values of a file; the inverse of `episode_from_values`.
+
+    Raises:
+        InputFileError: The episode has a goal of a class of one's own.
+    """
+    return _encode(episode, Episode)
+
+
+def yaml_text(values: Mapping[str, Any]) -> str:
+    """Return plain values as the text of a YAML file."""
+    return yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
 
 
 def load_episode(path: str | Path, *, assets: str | Path | Assets = "procedural") -> Episode:
