@@ -23,7 +23,7 @@ from openvima.folder_lock import folder_lock
 from openvima.render.raycast import object_below
 from openvima.scene import COMPOSED, Action, Episode, Scene
 from openvima.scene.goal import object_of
-from openvima.tasks import list_tasks, sample_episode
+from openvima.tasks import list_tasks
 from openvima.tasks.oracle import TIED_TO_TABLE
 
 COMMAND = "openvima studio"  # what manifests name as their maker
@@ -60,16 +60,8 @@ def check_recordable(episode: Episode, *, env_config: EnvConfig = DEFAULT_ENV_CO
         raise DatasetError(f"{named} has no goals, so it is never solved; give it some to record it.")
     if episode.task == COMPOSED:
         return
-    if episode.task not in list_tasks() or episode != sample_episode(
-        episode.task,
-        level=LEVEL,
-        seed=episode.seed,
-        domain=DOMAIN,
-        assets=env_config.assets,
-        compat=env_config.compat,
-        prompts=env_config.prompts,
-        **env_config.options(episode.task),
-    ):
+    known = episode.task in list_tasks()
+    if not known or env_config.sample(episode.task, LEVEL, episode.seed, domain=DOMAIN) != episode:
         raise DatasetError(f"{named} is not what the task samples for this seed; compose it to record it.")
 
 

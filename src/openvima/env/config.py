@@ -5,13 +5,14 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
 from openvima.errors import ConfigError, echo
-from openvima.tasks import task_spec
+from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts
 from openvima.user_code import is_code, without_folder
 
 if TYPE_CHECKING:
     from openvima.env.tabletop import TabletopEnv
+    from openvima.scene import Episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,19 @@ class EnvConfig:
             compat=self.compat,
             prompts=self.prompts,
             realtime=realtime,
+            **self.options(task),
+        )
+
+    def sample(self, task: str, level: str, seed: int, *, domain: str) -> "Episode":
+        """Sample an episode; see `openvima.tasks.sample_episode`."""
+        return sample_episode(
+            task,
+            level=level,
+            seed=seed,
+            domain=domain,
+            assets=self.assets,
+            compat=self.compat,
+            prompts=self.prompts,
             **self.options(task),
         )
 

@@ -13,7 +13,6 @@ from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.env.episode_file import episode_values, yaml_text
 from openvima.errors import OpenVimaError, SceneError
 from openvima.scene import COMPOSED, AtPose, Episode, ObjectImage, PhotoImage, Placement, PromptFill
-from openvima.tasks import sample_episode
 
 POLICY = "openvima-small"
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
@@ -118,16 +117,7 @@ def _is_sampled(episode: Episode, env_config: EnvConfig) -> bool:
     if episode.task == COMPOSED:
         return False
     try:
-        return episode == sample_episode(
-            episode.task,
-            level=episode.level,
-            seed=episode.seed,
-            domain=episode.domain,
-            assets=env_config.assets,
-            compat=env_config.compat,
-            prompts=env_config.prompts,
-            **env_config.options(episode.task),
-        )
+        return episode == env_config.sample(episode.task, episode.level, episode.seed, domain=episode.domain)
     except OpenVimaError:
         return False
 

@@ -95,7 +95,7 @@ def verify_results(
     try:
         problems = [*_text_problems(file), *_row_problems(results)]
         _check_simulator(path, results.versions)
-        env_config = _env_config(results, assets)
+        env_config = recorded_env_config(results, assets)
         actions, sha256 = read_actions(folder, results.rows)
     except (TypeError, AttributeError, LookupError, ValueError, ArithmeticError, RecursionError) as error:
         if isinstance(error, OpenVimaError):
@@ -188,8 +188,16 @@ def _check_simulator(path: Path, found: Mapping[str, str]) -> None:
             )
 
 
-def _env_config(results: Results, assets: str | None) -> EnvConfig:
-    """Settings of the environments; assets are recorded without their path, and functions are not run."""
+def recorded_env_config(results: Results, assets: str | None) -> EnvConfig:
+    """Return the settings of the environments; assets are recorded without their path.
+
+    Args:
+        results: The results.
+        assets: As for `verify_results`.
+
+    Raises:
+        AssetError: The results name a function as their assets, which is not run.
+    """
     given = EnvConfig.from_record(results.config)
     return replace(given, assets=recorded_assets(given.assets) if assets is None else assets)
 

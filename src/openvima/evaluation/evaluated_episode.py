@@ -1,0 +1,159 @@
+"""One episode of an evaluation, with the exact settings to play it again live."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from openvima.brief import brief_repr
+from openvima.errors import DatasetError, OpenVimaError, PolicyError, unknown_name
+from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
+from openvima.evaluation.actions import ACTIONS_NAME, action_arrays, read_actions
+from openvima.evaluation.config import DEFAULT_DEVICE, Batch
+from openvima.evaluation.results import EpisodeOutcome, Results
+from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
+from openvima.evaluation.sources import PolicySource, weights_hash
+from openvima.evaluation.verification import recorded_env_config
+from openvima.policies.file_names import CHECKPOINTS_FOLDER
+from openvima.scene import Action, Episode
+
+_SEED_DOMAIN = "eval"
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedEpisode:
+    """An episode of an evaluation.
+
+    Args:
+        batch: Policy, task, level, seed and all settings that decide the episode.
+        outcome: How it ended.
+        actions: The recorded actions; None if the evaluation kept none.
+    """
+
+    batch: Batch
+    outcome: EpisodeOutcome
+    actions: tuple[Action, ...] | None = field(repr=False)
+
+    __repr__ = brief_repr
+
+    def sample(self) -> Episode:
+        """Sample the episode."""
+        batch = self.batch
+        return batch.env_config.sample(batch.task, batch.level, batch.first_seed, domain=_SEED_DOMAIN)
+
+    def load_policy(self) -> RolloutPolicy:
+        """Load the policy, with its input ablation, detector and precision.
+
+        Raises:
+            PolicyError: Nobody knows where the policy is.
+            UnknownPolicyError, CheckpointError, ServerError: As for `load_rollout_policy`.
+        """
+        if not self.batch.source:
+            raise PolicyError(
+                f"no folder near the results has the weights of {self.batch.policy!r}; name its run folder. "
+                "The recorded actions can be played without."
+            )
+        PolicySource(self.batch.policy, self.batch.source, self.batch.trust_code).check()
+        return load_rollout_policy(self.batch)
+
+
+def evaluated_episode(
+    folder: str | Path,
+    policy: str,
+    task: str,
+    level: str,
+    seed: int,
+    *,
+    ablation: str = "",
+    source: str | None = None,
+    assets: str | None = None,
+    trust_code: bool = False,
+) -> EvaluatedEpisode:
+    """Return an episode of an evaluation and the settings to play it again.
+
+    Args:
+        folder: Folder of the evaluation, with `results.json`.
+        policy: Name of the policy in the results.
+        task: Name of the task.
+        level: Level of the episode.
+        seed: Seed of the episode.
+        ablation: Input ablation; empty for the plain score.
+        source: Where the policy is, as for `openvima evaluate --policy`; None: as `find_source` finds it.
+        assets: Assets, where the results were obtained with a function of one's own.
+        trust_code: Run the code that a run folder names.
+
+    Raises:
+        DatasetError: There are no such results, or no such episode in them.
+        AssetError: The results name a function as their assets; pass it as `assets`.
+    """
+    folder = Path(folder)
+    results = Results.read(folder)
+    row = results.row(policy, task, level, ablation)
+    if row is None:
+        cells = [
+            f"{r.policy}, {r.task}, {r.level}{f', {r.ablation}' if r.ablation else ''}" for r in results.rows
+        ]
+        asked = f"{policy}, {task}, {level}{f', {ablation}' if ablation else ''}"
+        raise DatasetError(unknown_name(f"row in {folder} of", asked, cells))
+    numbers = [outcome.seed for outcome in row.outcomes]
+    if seed not in numbers:
+        raise DatasetError(f"{folder} has no seed {seed} there; it has {numbers[0]} to {numbers[-1]}.")
+    place, config = numbers.index(seed), results.config
+    batch = Batch(
+        policy,
+        (find_source(folder, results, policy) or "") if source is None else source,
+        task,
+        level,
+        first_seed=seed,
+        episodes=1,
+        env_config=ablated_environment(ablation, recorded_env_config(results, assets)),
+        device=str(config.get("device", DEFAULT_DEVICE)),
+        ablation=ablation,
+        precision=str(config.get("precision") or ""),
+        boxes=str(config.get("boxes") or "") if DETECTED_BOXES in ablation else "",
+        trust_code=trust_code,
+    )
+    return EvaluatedEpisode(
+        batch, row.outcomes[place], _actions(folder, results, results.rows.index(row), place)
+    )
+
+
+def find_source(folder: Path, results: Results, policy: str) -> str | None:
+    """Find the policy that was evaluated: by name where the package has it, else by the hash of its weights.
+
+    Args:
+        folder: Folder of the evaluation; folders in and beside it are searched for a training run.
+        results: Its results.
+        policy: Name of the policy in the results.
+
+    Returns:
+        As for `openvima evaluate --policy`; None if it is not found.
+    """
+    what = results.policies.get(policy, {})
+    for key in ("bundled", "preset"):
+        if isinstance(what.get(key), str):
+            return what[key]
+    kind, sha256 = what.get("kind"), what.get("sha256")
+    if kind in ("oracle", "random", "untrained"):
+        return str(kind)
+    if kind != "run" or not sha256:
+        return None
+    for run in _runs_near(folder.resolve()):
+        try:
+            if weights_hash(run) == sha256:
+                return str(run)
+        except (OpenVimaError, OSError):
+            continue
+    return None
+
+
+def _runs_near(folder: Path) -> Iterator[Path]:
+    for place in (folder, folder.parent):
+        yield from sorted(path.parent for path in place.glob(f"*/{CHECKPOINTS_FOLDER}"))
+
+
+def _actions(folder: Path, results: Results, row: int, place: int) -> tuple[Action, ...] | None:
+    folder = folder if folder.is_dir() else folder.parent
+    if not (folder / ACTIONS_NAME).is_file():
+        return None
+    steps = read_actions(folder, results.rows)[0][row][place]
+    return tuple(Action.from_arrays(action_arrays(step)) for step in steps)
