@@ -77,12 +77,12 @@ class Push:
         """Variants with the spatula centred, to the left and to the right, within the bounds of actions."""
         for aside_m in (0.0, _ASIDE_M, -_ASIDE_M):
             push = replace(self, aside_m=aside_m)
-            if is_inside(push._first(), -STANDOFF_M) and is_inside(push._last(), 0.0):
+            if is_inside(push.behind(), -STANDOFF_M) and is_inside(push._last(), 0.0):
                 yield push
 
     def sweep(self, goal: InZone) -> Sweep:
         """Return the sweep that performs this push of the goal's block."""
-        return Sweep(goal, self._first(), self._last())
+        return Sweep(goal, self.behind(), self._last())
 
     def spatula_at_start(self) -> Rectangle:
         """Footprint of the spatula when it is lowered."""
@@ -105,7 +105,8 @@ class Push:
         """Areas of spatula and block."""
         return self.spatula_area(), self.block_area()
 
-    def _first(self) -> Point:
+    def behind(self) -> Point:
+        """Return where a sweep starts: behind the block, clear of its corners."""
         return self._point(-STANDOFF_M)
 
     def _last(self) -> Point:
