@@ -1,11 +1,14 @@
 """What a policy considered when it decided: probabilities, and attention to the prompt. Needs no torch."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from openvima.scene.action import WORKSPACE_HIGH, WORKSPACE_LOW
+
+SAME_PLACE_M = 0.02  # place candidates this near to each other count as one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +73,36 @@ class Explanation:
     yaw_rad: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     yaw_probabilities: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
     bins: Mapping[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def distinct_places(self) -> list[PlaceProbability]:
+        """Join candidates at one place under the most probable one's kind, the most probable first."""
+        joined: list[PlaceProbability] = []
+        for each in sorted(self.places, key=lambda each: -each.probability):
+            for index, other in enumerate(joined):
+                if math.dist(each.position, other.position) < SAME_PLACE_M:
+                    total = each.probability + other.probability
+                    joined[index] = PlaceProbability(other.kind, other.position, total)
+                    break
+            else:
+                joined.append(each)
+        return sorted(joined, key=lambda each: -each.probability)
+
+    def second_choice(self) -> tuple[ObjectProbability, PlaceProbability | None, float] | None:
+        """Return the second most probable action of a policy that points.
+
+        Returns:
+            The object that it picks, where it places it, and its probability. The place is None if it picks
+            another object than the action: place candidates are scored for the picked object alone. None if
+            there is no second choice.
+        """
+        picks = sorted(self.objects, key=lambda each: -each.probability)
+        places = self.distinct_places()
+        choices: list[tuple[ObjectProbability, PlaceProbability | None, float]] = []
+        if picks and len(places) > 1:
+            choices.append((picks[0], places[1], picks[0].probability * places[1].probability))
+        if len(picks) > 1:
+            choices.append((picks[1], None, picks[1].probability))
+        return max(choices, key=lambda choice: choice[-1], default=None)
 
     def heat_map(self, pose: str) -> np.ndarray:
         """Return the probabilities of the positions of one pose, for policies over bins.

@@ -13,8 +13,9 @@ from openvima.errors import ConfigError
 from openvima.serving.config import is_loopback
 from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.play_panel import PlayPanel
+from openvima.studio.why_panel import WhyPanel
 
-PANELS = (PlayPanel,)  # in the order of their tabs
+PANELS = (PlayPanel, WhyPanel)  # in the order of their tabs
 
 
 class Studio:

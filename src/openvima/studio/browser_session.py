@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import viser
 
 from openvima.catalog.packs import load_assets
@@ -18,11 +19,13 @@ from openvima.evaluation.session import EpisodeSession
 from openvima.scene import Action, Episode
 from openvima.serving.config import is_loopback
 from openvima.serving.protocol import check_token
-from openvima.studio.table import CAMERA_M, LOOK_AT_M, Table
+from openvima.studio.table import CAMERA_M, LOOK_AT_M, Table, animate
+from openvima.video.prompt_strip import Colour, draw_prompt_strip
 
 _LOG = logging.getLogger(__name__)
 YOU = "you"  # the policy that is none: a user acts
-_PANEL_WIDTH = 400
+_PANEL_WIDTH, _PROMPT_WIDTH = 400, 560  # pixels
+_SECOND_TABLE_Y_M = 1.15  # beside the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,14 +84,24 @@ class BrowserSession:
         self.assets = load_assets(config.env_config.assets)
         self.table = Table(client.scene, self.assets)
         self.current: EpisodeSession | None = None
-        self.speed = 1.0
+        self.compared: EpisodeSession | None = None  # the same episode by another policy, in lockstep
+        self.policy: RolloutPolicy | None = None  # the chosen one
+        self.policy_name, self.temperature, self.speed = YOU, 0.0, 1.0
         self.stopped = threading.Event()  # ends animations and runs
+        self.prompt_weights: list[tuple[Colour, np.ndarray]] = []  # attention to draw below the prompt
+        self._other_policy: RolloutPolicy | None = None
+        self._other_table: Table | None = None
+        self._compat = config.env_config.compat
         self._changed: list[Callable[[], None]] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
         client.camera.position, client.camera.look_at = CAMERA_M, LOOK_AT_M
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(_PANEL_WIDTH)
         self.tabs = self.gui.add_tab_group()
+        window = self.gui.add_panel()
+        with window.add_tab("Prompt", viser.Icon.MESSAGE):
+            self._prompt = self.gui.add_image(np.full((1, 1, 3), 255, np.uint8))
+        window.float(x=12, y=-12, width=_PROMPT_WIDTH)  # messages are shown above
 
     def on_change(self, function: Callable[[], None]) -> None:
         """Call a function whenever the current episode or its state has changed."""
@@ -108,7 +121,7 @@ class BrowserSession:
 
         return self.submit(begin)
 
-    def load_policy(self, name: str, *, temperature: float = 0.0) -> RolloutPolicy | None:
+    def load_policy(self, name: str) -> RolloutPolicy | None:
         """Load a policy for this browser alone; `YOU` gives None.
 
         Raises:
@@ -118,43 +131,88 @@ class BrowserSession:
             return None
         config = self.config
         return load_own_rollout_policy(
-            name, device=config.device, trust_code=config.trust_code, temperature=temperature
+            name, device=config.device, trust_code=config.trust_code, temperature=self.temperature
         )
+
+    def choose_policy(self, name: str, *, temperature: float | None = None) -> None:
+        """Let a policy decide from here on.
+
+        Args:
+            name: As for `openvima evaluate --policy`, or `YOU`.
+            temperature: 0 for greedy decoding; None: as before.
+        """
+        before = self.policy_name, self.temperature
+        self.policy_name, self.temperature = name, self.temperature if temperature is None else temperature
+        try:
+            self.policy = self.load_policy(name)
+        except OpenVimaError:
+            self.policy_name, self.temperature = before
+            raise
+        if self.current is not None:
+            self.current.policy = self.policy
+            self.changed()
 
     def open(self, episode: Episode, policy: RolloutPolicy | None, *, compat: bool | None = None) -> None:
         """Start an episode, sampled or composed, and show it."""
-        compat = self.config.env_config.compat if compat is None else compat
-        opened = EpisodeSession(episode, policy, assets=self.assets, compat=compat)
+        self._compat = self.config.env_config.compat if compat is None else compat
+        opened = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
         self.close_episode()
         self.current = opened
-        self.table.show(opened.frame())
-        self.changed()
+        self.compare(self._other_policy)
+
+    def compare(self, policy: RolloutPolicy | None) -> None:
+        """Show beside the current episode how another policy does it, from the start; None: nothing."""
+        self._other_policy = policy
+        if self.compared is not None:
+            self.compared.close()
+            self.compared = None
+        if self._other_table is not None:
+            self._other_table.remove()
+            self._other_table = None
+        if policy is not None and self.current is not None:
+            episode = self.current.episode
+            self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
+            self._other_table = Table(
+                self.client.scene, self.assets, root="/second", offset_y_m=_SECOND_TABLE_Y_M
+            )
+        self.back(0)
 
     def step(self, action: Action | None = None) -> bool:
         """Take a step with an action, or the policy's, and show it; return whether there was one."""
-        current = self.current
-        if current is None or current.outcome is not None:
-            return False
-        step = current.step(action)
-        if step is None:
-            if error := current.propose().error:
+        frames = {}
+        for table, run in self.runs():
+            if run.outcome is not None:
+                continue
+            step = run.step(action if run is self.current else None)
+            if step is not None:
+                frames[table] = step.frames
+            elif error := run.propose().error:
                 self.warn(str(error))
-        else:
-            self.table.animate(step.frames, speed=self.speed, stops=self.stopped.is_set)
+        animate(frames, speed=self.speed, stops=self.stopped.is_set)
         self.changed()
-        return step is not None
+        return bool(frames)
 
     def back(self, num_steps: int) -> None:
         """Go back to the state after some steps."""
-        if self.current is not None:
-            self.current.back(num_steps)
-            self.table.show(self.current.frame())
-            self.changed()
+        for table, run in self.runs():
+            run.back(min(num_steps, run.num_steps))
+            table.show(run.frame())
+        self.changed()
+
+    def runs(self) -> list[tuple[Table, EpisodeSession]]:
+        """Return the tables with their episodes: the current one, and the one that is compared."""
+        pairs = ((self.table, self.current), (self._other_table, self.compared))
+        return [(table, run) for table, run in pairs if table is not None and run is not None]
 
     def changed(self) -> None:
-        """Tell the panels that the current episode has changed."""
+        """Tell the panels that the current episode has changed, and show the prompt."""
         for function in self._changed:
             self._reported(function)
+        if self.current is not None:
+            size = {"image_height": 2 * 64, "font_size": 2 * 19}  # twice as large as shown, to be sharp
+            self._prompt.image = draw_prompt_strip(
+                self.current.prompt, width=2 * _PROMPT_WIDTH, weights=self.prompt_weights, **size
+            )
 
     def warn(self, message: str, *, title: str = "That did not work") -> None:
         """Show a message over the page."""
@@ -162,9 +220,9 @@ class BrowserSession:
 
     def close_episode(self) -> None:
         """Free the current episode."""
-        if self.current is not None:
-            self.current.close()
-            self.current = None
+        for _, run in self.runs():
+            run.close()
+        self.current = self.compared = None
 
     def close(self) -> None:
         """End the session: the browser has gone."""

@@ -4,8 +4,7 @@ import numpy as np
 import viser
 
 from openvima.catalog.partitions import LEVELS
-from openvima.errors import ConfigError
-from openvima.evaluation.rollout_policies import RolloutPolicy
+from openvima.evaluation.session import EpisodeSession
 from openvima.policies.bundled import SMALL
 from openvima.render import channels_last
 from openvima.render.camera import VIEWS
@@ -13,23 +12,20 @@ from openvima.render.rasteriser import Rasteriser
 from openvima.studio.browser_session import YOU, BrowserSession
 from openvima.tasks import list_tasks, sample_episode, task_spec
 from openvima.tasks.seeding import MAX_SEED
-from openvima.video.prompt_strip import draw_prompt_strip
 
 _FIRST_TASK = "rearrange"
-_PROMPT_WIDTH = 720  # pixels that the prompt is drawn in
 _OTHER = "other …"
 
 
 class PlayPanel:
-    """The tab *Play*, and the window with the prompt.
+    """The tab *Play*.
 
     Args:
         session: The browser's session.
     """
 
     def __init__(self, session: BrowserSession) -> None:
-        self.session, self._policy = session, None
-        self._loaded: tuple[object, ...] = ()
+        self.session = session
         self._rasteriser = Rasteriser(session.assets)
         gui = session.gui
         with session.tabs.add_tab("Play", viser.Icon.ROBOT):
@@ -37,10 +33,6 @@ class PlayPanel:
             self._outcome = gui.add_markdown("")
             self._add_controls(gui)
             self._views = gui.add_image(np.zeros((1, 1, 3), np.uint8), label="what the policy sees")
-        window = gui.add_panel()
-        with window.add_tab("Prompt", viser.Icon.MESSAGE):
-            self._prompt = gui.add_image(np.full((1, 1, 3), 255, np.uint8))
-        window.float(x=12, y=-12, width=560)  # messages are shown above
         session.on_change(self._show)
         session.submit(self._open)
 
@@ -79,15 +71,6 @@ class PlayPanel:
         def _(_: viser.GuiEvent) -> None:
             session.speed = self._speed.value
 
-    def policy(self) -> RolloutPolicy | None:
-        """Load the chosen policy, unless it is loaded."""
-        name = self._source.value.strip() if self._name.value == _OTHER else self._name.value
-        if not name:
-            raise ConfigError("source is empty; name a policy, such as a run folder.")
-        if self._loaded != (name,):
-            self._policy, self._loaded = self.session.load_policy(name), (name,)
-        return self._policy
-
     def _choose_task(self) -> None:
         levels = task_spec(self._task.value).levels
         level = self._level.value
@@ -97,10 +80,9 @@ class PlayPanel:
 
     def _choose_policy(self) -> None:
         self._source.visible = self._name.value == _OTHER
-        current = self.session.current
-        if current is not None and (self._source.value or not self._source.visible):
-            current.policy = self.policy()
-            self.session.changed()
+        name = self._source.value.strip() if self._source.visible else self._name.value
+        if name and name != self.session.policy_name:
+            self.session.choose_policy(name)
 
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
@@ -115,7 +97,7 @@ class PlayPanel:
             prompts=config.prompts,
             **config.options(self._task.value),
         )
-        self.session.open(episode, None)
+        self.session.open(episode, self.session.policy)
         self._choose_policy()
 
     def _run(self) -> None:
@@ -126,11 +108,10 @@ class PlayPanel:
         self._seed.value = int(self._seed.value) + 1
 
     def _show(self) -> None:
-        """Show the prompt, the camera views, how far the episode is, and how it ended."""
+        """Show the camera views, how far the episode is, and how it ended."""
         current = self.session.current
         if current is None:
             return
-        self._prompt.image = draw_prompt_strip(current.prompt, width=_PROMPT_WIDTH)
         images = self._rasteriser.scene(current.scene)
         self._views.image = np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
         self._time.max = max(1, current.num_steps)
@@ -138,7 +119,7 @@ class PlayPanel:
         self._outcome.content = _sentence(current)
 
 
-def _sentence(current) -> str:
+def _sentence(current: EpisodeSession) -> str:
     outcome, steps = current.outcome, current.num_steps
     taken = "1 step" if steps == 1 else f"{steps} steps"
     if outcome is None:

@@ -2,7 +2,7 @@
 
 import io
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -20,7 +20,7 @@ from openvima.video.prompt_strip import Colour
 
 CAMERA_M, LOOK_AT_M = (1.36, 0.0, 1.0), (0.42, 0.0, 0.08)  # near the axis of the front camera
 _LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
-_AMBIENT, _DIRECTIONAL = 0.35, 0.65  # such that colours are those of the front camera, by eye
+_AMBIENT, _DIRECTIONAL = 1.2, 2.3  # such that colours are those of the front camera, by eye
 _Shape = tuple[str, str, Vector3, Vector3]
 
 
@@ -30,19 +30,26 @@ class Table:
     Args:
         scene: The scene graph of the browser.
         assets: Asset pack.
+        root: Name of the node that all others are below.
+        offset_y_m: How far to the left of the robot's usual place all is shown.
     """
 
-    def __init__(self, scene: viser.SceneApi, assets: Assets) -> None:
-        self.scene_api, self.assets = scene, assets
+    def __init__(
+        self, scene: viser.SceneApi, assets: Assets, *, root: str = "/first", offset_y_m: float = 0.0
+    ) -> None:
+        self.scene_api, self.assets, self.root = scene, assets, root
         self.objects: dict[int, viser.GlbHandle] = {}
         self.shown: VideoFrame | None = None
         self._shapes: dict[int, _Shape] = {}
         self._arm: tuple[EndEffector, list[viser.FrameHandle]] | None = None
         scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(hdri=None)
         scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
         scene.add_light_directional("/lights/sun", intensity=_DIRECTIONAL, position=_LIGHT_M)
-        size = (*SHEET_SIZE, 0.002)
-        scene.add_box("/table", color=SHEET_RGB, dimensions=size, position=(0.5, 0.0, -0.0011))
+        self._node = scene.add_frame(root, show_axes=False, position=(0.0, offset_y_m, 0.0))
+        self.sheet = scene.add_box(
+            f"{root}/table", SHEET_RGB, (*SHEET_SIZE, 0.002), position=(0.5, 0.0, -0.0011)
+        )
 
     def show(self, frame: VideoFrame) -> None:
         """Show a scene and the arm; objects that are shown already are moved only."""
@@ -51,22 +58,9 @@ class Table:
             _move(node, pose)
         self.shown = frame
 
-    def animate(
-        self, frames: Sequence[VideoFrame], *, speed: float = 1.0, stops: Callable[[], bool] | None = None
-    ) -> None:
-        """Show the frames of a step, 30 a second; the last one at once if `stops` says so."""
-        start = time.perf_counter()
-        for number, frame in enumerate(frames):
-            if stops is not None and stops():
-                self.show(frames[-1])
-                return
-            wait = start + number / (FRAMES_PER_SECOND * speed) - time.perf_counter()
-            if wait < -1 / FRAMES_PER_SECOND and number % 2:
-                continue  # late: half of the frames suffice
-            time.sleep(max(0.0, wait))
-            self.show(frame)
-        if frames:
-            self.show(frames[-1])
+    def remove(self) -> None:
+        """Take all out of the scene."""
+        self._node.remove()
 
     def add_ghost(
         self,
@@ -81,7 +75,7 @@ class Table:
         """Add a translucent copy of an object.
 
         Args:
-            name: Name of the node.
+            name: Name of the node, below the table's root.
             placement: The object.
             pose: Where; by default where the object is.
             colour: Its colour.
@@ -92,7 +86,7 @@ class Table:
         centre = mesh.vertices.reshape(-1, 3).mean(axis=0)
         vertices = (mesh.vertices.reshape(-1, 3) - centre) * grow + centre
         node = self.scene_api.add_mesh_simple(
-            name,
+            f"{self.root}/{name}",
             vertices,
             np.arange(len(vertices)).reshape(-1, 3),
             color=colour,
@@ -116,7 +110,7 @@ class Table:
                 self._shapes[object_id] = _shape(placement)
                 data = _object_glb(self.assets, *_shape(placement))
                 self.objects[object_id] = self.scene_api.add_glb(
-                    f"/objects/{object_id}", data, cast_shadow=False, receive_shadow=False
+                    f"{self.root}/objects/{object_id}", data, cast_shadow=False, receive_shadow=False
                 )
             _move(self.objects[object_id], placement.pose)
 
@@ -124,12 +118,40 @@ class Table:
         if self._arm is None or self._arm[0] != end_effector:
             for node in self._arm[1] if self._arm else ():
                 node.remove()
-            nodes = [self.scene_api.add_frame(f"/arm/{link}", show_axes=False) for link in range(8)]
+            nodes = [
+                self.scene_api.add_frame(f"{self.root}/arm/{link}", show_axes=False) for link in range(8)
+            ]
             for number, (link, rgb, mesh) in enumerate(arm_parts(end_effector)):
                 data = _part_glb(mesh, rgb)
-                self.scene_api.add_glb(f"/arm/{link}/{number}", data, cast_shadow=False, receive_shadow=False)
+                self.scene_api.add_glb(
+                    f"{self.root}/arm/{link}/{number}", data, cast_shadow=False, receive_shadow=False
+                )
             self._arm = (end_effector, nodes)
         return self._arm[1]
+
+
+def animate(tables: Mapping[Table, Sequence[VideoFrame]], *, speed: float, stops: Callable[[], bool]) -> None:
+    """Show the frames of steps, 30 a second.
+
+    Args:
+        tables: Frames by table; all start at once.
+        speed: Factor on the speed of the arm.
+        stops: Asked before each frame; once it says so, the last frames are shown.
+    """
+    start = time.perf_counter()
+    for number in range(max(map(len, tables.values()), default=0)):
+        wait = start + number / (FRAMES_PER_SECOND * speed) - time.perf_counter()
+        if stops():
+            break
+        if wait < -1 / FRAMES_PER_SECOND and number % 2:
+            continue  # late: half of the frames suffice
+        time.sleep(max(0.0, wait))
+        for table, frames in tables.items():
+            if number < len(frames):
+                table.show(frames[number])
+    for table, frames in tables.items():
+        if frames:
+            table.show(frames[-1])
 
 
 def _shape(placement: Placement) -> _Shape:

@@ -21,8 +21,7 @@ WIDTH, HEIGHT = TOP.width * ENLARGE, TOP.height * ENLARGE + 160  # pixels of a p
 PICK: Colour = (214, 96, 0)
 PLACE: Colour = (0, 104, 201)
 COLOURS: dict[str, Colour] = {"pick": PICK, "place": PLACE, "decoder": (104, 64, 160)}
-_LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
-_SAME_PLACE_M = 0.02  # candidates this near to each other are drawn as one
+LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
 _LEAST_FULL_BAR = 0.1  # a distribution without a higher peak does not fill its histogram
 _HOT = 0.02  # probability of a cell of the heat map that is drawn in full colour
 _KINDS = {
@@ -55,7 +54,7 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     if explanation is None:
         draw.text((12, HEIGHT - 96), "before the first decision", font=font(15), fill=MUTED, anchor="lm")
         return np.asarray(canvas)
-    places = _merged(explanation.places)
+    places = explanation.distinct_places()
     for place in reversed(places):
         _draw_place(draw, place)
     _draw_action(draw, explanation)
@@ -78,6 +77,15 @@ def draw_panel(scene: Scene, assets: Assets, explanation: Explanation | None) ->
     return np.asarray(canvas)
 
 
+def attention_rows(explanation: Explanation) -> list[tuple[Colour, np.ndarray]]:
+    """Return attention to the prompt as rows of colour and weights, for `draw_prompt_strip`."""
+    rows = [(COLOURS.get(kind, INK), weights) for kind, weights in explanation.attention.items()]
+    if explanation.bins:
+        return rows
+    # policies that point attend to objects and their names, never to the end
+    return [(colour, weights[:-1]) for colour, weights in rows]
+
+
 def _tint_objects(panel: np.ndarray, segm: np.ndarray, objects: Sequence[ObjectProbability]) -> None:
     """Colour objects by the probability of picking them, and outline them."""
     for each in sorted(objects, key=lambda each: each.probability):
@@ -88,7 +96,7 @@ def _tint_objects(panel: np.ndarray, segm: np.ndarray, objects: Sequence[ObjectP
         for axis in (0, 1):
             inner &= np.roll(mask, 2, axis) & np.roll(mask, -2, axis)
         _blend(panel[: len(mask)], PICK, 0.75 * each.probability * mask)
-        _blend(panel[: len(mask)], PICK, (each.probability >= _LEAST_SHOWN) * (mask & ~inner))
+        _blend(panel[: len(mask)], PICK, (each.probability >= LEAST_SHOWN) * (mask & ~inner))
 
 
 def _box_mask(each: ObjectProbability, shape: tuple[int, ...]) -> np.ndarray:
@@ -119,20 +127,6 @@ def _blend(image: np.ndarray, colour: Colour, alpha: np.ndarray) -> None:
     image[:] = np.rint(image * (1 - weight) + np.array(colour) * weight)
 
 
-def _merged(places: Sequence[PlaceProbability]) -> list[PlaceProbability]:
-    """Join candidates at one place under the most probable one's kind, the most probable first."""
-    joined: list[PlaceProbability] = []
-    for each in sorted(places, key=lambda each: -each.probability):
-        for index, other in enumerate(joined):
-            if math.dist(each.position, other.position) < _SAME_PLACE_M:
-                total = each.probability + other.probability
-                joined[index] = PlaceProbability(other.kind, other.position, total)
-                break
-        else:
-            joined.append(each)
-    return sorted(joined, key=lambda each: -each.probability)
-
-
 def _pixel(position: Sequence[float] | np.ndarray) -> tuple[float, float]:
     column, row = ENLARGE * project(np.array([float(position[0]), float(position[1]), 0.0]), TOP)
     return float(column), float(row)
@@ -141,7 +135,7 @@ def _pixel(position: Sequence[float] | np.ndarray) -> tuple[float, float]:
 def _draw_place(draw: ImageDraw.ImageDraw, place: PlaceProbability) -> None:
     x, y = _pixel(place.position)
     radius = 3 + 8 * math.sqrt(place.probability)
-    shown = place.probability >= _LEAST_SHOWN
+    shown = place.probability >= LEAST_SHOWN
     for grow, colour in ((2, (255, 255, 255)), (0, PLACE if shown else (150, 180, 210))):
         size = radius + grow
         if shown or not grow:
@@ -183,12 +177,12 @@ def _draw_labels(
     draw: ImageDraw.ImageDraw, objects: Sequence[ObjectProbability], places: Sequence[PlaceProbability]
 ) -> None:
     for each in objects:
-        if each.probability >= _LEAST_SHOWN and "top" in each.boxes:
+        if each.probability >= LEAST_SHOWN and "top" in each.boxes:
             x, y, height, _ = (ENLARGE * value for value in each.boxes["top"])
             row = y - height / 2 - 2 if y - height / 2 > 20 else y + height / 2 + 20
             _label(draw, (x, row), each.probability, PICK, "md")
     for place in places:
-        if place.probability >= _LEAST_SHOWN:
+        if place.probability >= LEAST_SHOWN:
             x, y = _pixel(place.position)
             row, anchor = (y + 13, "ma") if y < TOP.height * ENLARGE - 34 else (y - 13, "md")
             _label(draw, (x, row), place.probability, PLACE, anchor)
@@ -258,7 +252,7 @@ def _draw_rotation(draw: ImageDraw.ImageDraw, explanation: Explanation, top: int
     draw.line((left, base, right, base), fill=MUTED)
     for value, probability in zip(yaw, explanation.yaw_probabilities, strict=True):
         x = left + (right - left) * (math.pi - value) / (2 * math.pi)
-        if probability >= _LEAST_SHOWN / 4:
+        if probability >= LEAST_SHOWN / 4:
             draw.rectangle((x - 2, base - 20 * probability, x + 2, base), fill=PLACE)
     for x, label in ((left, "180°"), ((left + right) / 2, "0°"), (right, "−180°")):
         draw.text((x, base + 3), label, font=font(12), fill=MUTED, anchor="ma")

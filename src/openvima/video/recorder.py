@@ -15,8 +15,8 @@ from openvima.scene.explanation import Explanation
 from openvima.sim.arm_view import arm_drawables
 from openvima.sim.ur5 import HOME
 from openvima.video.encoder import VideoWriter
-from openvima.video.explanation import COLOURS, draw_panel
-from openvima.video.prompt_strip import INK, MUTED, PAPER, Colour, draw_prompt_strip, font
+from openvima.video.explanation import attention_rows, draw_panel
+from openvima.video.prompt_strip import MUTED, PAPER, Colour, draw_prompt_strip, font
 
 ENLARGE = 3  # 768 × 384 pixels
 _STILL_START_S, _STILL_END_S = 0.8, 1.4  # time to read the prompt and the outcome
@@ -122,9 +122,7 @@ class EpisodeRecorder:
     ) -> None:
         """Draw the panel beside the scene, and the strip above both, with attention below the prompt."""
         self._panel = draw_panel(self._last.scene, env.assets, explanation if is_decided else None)
-        weights = [(COLOURS.get(kind, INK), row) for kind, row in explanation.attention.items()]
-        if not explanation.bins:  # policies that point attend to objects and their names, never to the end
-            weights = [(colour, row[:-1]) for colour, row in weights]
+        weights = attention_rows(explanation)
         width = self._width + _GAP + self._panel.shape[1]
         self._strip = draw_prompt_strip(env.prompt, width=width, weights=weights)
 

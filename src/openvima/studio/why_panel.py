@@ -1,0 +1,181 @@
+"""*Why*: what the policy considers, on the table and below the prompt; two policies side by side."""
+
+import math
+
+import numpy as np
+import viser
+
+from openvima.evaluation.session import EpisodeSession, first_difference
+from openvima.policies.bundled import SMALL
+from openvima.scene import Action, Placement, Pose
+from openvima.scene.explanation import Explanation, PlaceProbability
+from openvima.studio.browser_session import BrowserSession
+from openvima.studio.table import Table
+from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
+
+_NOBODY = "nobody"
+_MAX_PLACES = 6  # ghosts shown at once
+_ARROW_Z_M = 0.09
+_LABEL_Z_M = 0.08
+
+
+class WhyPanel:
+    """The tab *Why*.
+
+    Args:
+        session: The browser's session.
+    """
+
+    def __init__(self, session: BrowserSession) -> None:
+        self.session = session
+        self._nodes: list[viser.SceneNodeHandle] = []
+        gui = session.gui
+        with session.tabs.add_tab("Why", viser.Icon.QUESTION_MARK):
+            self._shown = gui.add_checkbox("show why", False, hint="what the policy considers next")
+            hint = "0 takes the most probable action; above, actions are sampled"
+            self._temperature = gui.add_slider("temperature", 0.0, 2.0, 0.1, 0.0, hint=hint)
+            names = (_NOBODY, SMALL, "oracle", "random", *session.config.policies)
+            self._other = gui.add_dropdown("compare with", names, hint="on the same episode, in lockstep")
+            self._text = gui.add_markdown("")
+            blank = np.full((1, 1, 3), 255, np.uint8)
+            self._images = [gui.add_image(blank, visible=False) for _ in range(2)]
+        self._shown.on_update(lambda _: session.submit(session.changed))
+        self._temperature.on_update(lambda _: session.interrupt(self._choose_temperature))
+        self._other.on_update(lambda _: session.interrupt(self._choose_other))
+        session.on_change(self._show)
+
+    def _choose_temperature(self) -> None:
+        self.session.choose_policy(self.session.policy_name, temperature=self._temperature.value)
+
+    def _choose_other(self) -> None:
+        name = self._other.value
+        self.session.compare(None if name == _NOBODY else self.session.load_policy(name))
+
+    def _show(self) -> None:
+        """Show what is considered at the step in view."""
+        for node in self._nodes:
+            node.remove()
+        self._nodes.clear()
+        self.session.prompt_weights = []
+        lines, panels = [], []
+        runs = self.session.runs()
+        for (table, run), name in zip(runs, (self.session.policy_name, self._other.value), strict=False):
+            proposal = run.propose() if self._shown.value else None
+            if len(runs) > 1:
+                lines.append(f"**{name}**: {_state(run)}")
+            if proposal is None:
+                continue
+            if proposal.error is not None:
+                lines.append(f"**{name}**: {proposal.error}")
+            if proposal.action is not None:
+                self._add_arrow(table, "action", proposal.action)
+            if proposal.explanation is not None:
+                self._explain(table, run, proposal.explanation)
+                lines.append(_second_choice(proposal.explanation, run))
+                panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
+                self.session.prompt_weights = self.session.prompt_weights or attention_rows(
+                    proposal.explanation
+                )
+            elif proposal.action is not None:
+                lines.append(f"{name} explains nothing; the arrow is its action.")
+        if len(runs) > 1:
+            lines.append(self._compared(runs[0][1], runs[1][1]))
+        self._text.content = "\n\n".join(lines)
+        for number, image in enumerate(self._images):
+            image.visible = number < len(panels)
+            if image.visible:
+                image.image = panels[number]
+
+    def _explain(self, table: Table, run: EpisodeSession, explanation: Explanation) -> None:
+        """Tint objects by the probability of picking them; show the picked one where it may be placed."""
+        placements = {placement.id: placement for placement in run.scene.placements}
+        for each in explanation.objects:
+            placement = placements.get(each.object_id)
+            if placement is not None and each.probability >= LEAST_SHOWN:
+                ghost = table.add_ghost(
+                    f"objects/{placement.id}/why",
+                    placement,
+                    pose=Pose((0.0, 0.0, 0.0)),
+                    colour=PICK,
+                    opacity=0.15 + 0.6 * each.probability,
+                    grow=1.04,
+                )
+                x, y, _ = placement.pose.position
+                self._nodes.append(ghost)
+                self._add_label(table, f"pick{placement.id}", each.probability, (x, y))
+        picked = max(explanation.objects, key=lambda each: each.probability, default=None)
+        placement = placements.get(picked.object_id) if picked else None
+        action = Action.from_arrays(explanation.action)
+        for number, place in enumerate(explanation.distinct_places()[:_MAX_PLACES]):
+            if place.probability < LEAST_SHOWN:
+                break
+            self._add_label(table, f"place{number}", place.probability, place.position)
+            if placement is not None and run.scene.end_effector == "suction":
+                pose = _placed(placement, action, place)
+                opacity = 0.12 + 0.4 * place.probability
+                self._nodes.append(
+                    table.add_ghost(f"why/{number}", placement, pose=pose, colour=PLACE, opacity=opacity)
+                )
+
+    def _add_label(self, table: Table, name: str, probability: float, position: tuple[float, float]) -> None:
+        self._nodes.append(
+            self.session.client.scene.add_label(
+                f"{table.root}/why/label_{name}",
+                percent(probability),
+                position=(*position, _LABEL_Z_M),
+                anchor="bottom-center",
+                font_screen_scale=0.9,
+            )
+        )
+
+    def _add_arrow(
+        self, table: Table, name: str, action: Action, colour: tuple[int, int, int] = (255, 255, 255)
+    ) -> None:
+        points = [[(*point, _ARROW_Z_M) for point in (action.pose0_position, action.pose1_position)]]
+        self._nodes.append(
+            self.session.client.scene.add_arrows(
+                f"{table.root}/why/{name}",
+                np.array(points),
+                colour,
+                shaft_radius=0.004,
+                head_radius=0.012,
+                head_length=0.03,
+            )
+        )
+
+    def _compared(self, one: EpisodeSession, other: EpisodeSession) -> str:
+        """Mark the first step at which two policies differ, by an arrow on each table, and say it."""
+        index = first_difference(one.steps, other.steps)
+        if index is None:
+            return "No difference so far."
+        for table, run in self.session.runs():
+            self._add_arrow(table, "difference", run.steps[index].action, PICK)
+        return f"The **first difference** is step {index + 1}: the orange arrows."
+
+
+def _placed(placement: Placement, action: Action, place: PlaceProbability) -> Pose:
+    """Return the pose of a picked object after it was placed at a candidate."""
+    yaw = action.yaw1_rad - action.yaw0_rad
+    (x, y, z), (x0, y0) = placement.pose.position, action.pose0_position
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    dx, dy = cos * (x - x0) - sin * (y - y0), sin * (x - x0) + cos * (y - y0)
+    turned = placement.pose.rotated(yaw)
+    return Pose((place.position[0] + dx, place.position[1] + dy, z), turned.quaternion)
+
+
+def _state(run: EpisodeSession) -> str:
+    if run.outcome is None:
+        return f"after step {run.num_steps}"
+    return "solved" if run.outcome.success else f"not solved: {run.outcome.reason}"
+
+
+def _second_choice(explanation: Explanation, run: EpisodeSession) -> str:
+    """Say which action was the second most probable."""
+    choice = explanation.second_choice()
+    if choice is None:
+        return ""
+    picked, place, probability = choice
+    names = {p.id: f"{p.texture} {p.object}" for p in run.scene.placements}
+    what = f"pick the {names.get(picked.object_id, 'object')}"
+    where = "" if place is None else f", place at ({place.position[0]:.2f}, {place.position[1]:.2f}) m"
+    return f"Second most probable, {percent(probability)}: {what}{where}."
