@@ -9,6 +9,7 @@ import rich
 import viser
 from viser.infra import ClientId
 
+from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError
 from openvima.serving.config import is_loopback
 from openvima.studio.browser_session import BrowserSession, StudioConfig
@@ -30,6 +31,7 @@ class Studio:
 
     def __init__(self, config: StudioConfig) -> None:
         self.config = config
+        load_assets(config.env_config.assets)  # fails now rather than in a browser
         _check_free(config.host, config.port)
         rich.get_console().quiet = True  # viser prints addresses of its own
         self._server = _Server(config.host, config.port, label="openvima studio", verbose=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from openvima.catalog.geometry import Vector3
 from openvima.catalog.packs import load_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, OpenVimaError
@@ -87,14 +88,14 @@ class BrowserSession:
         self.compared: EpisodeSession | None = None  # the same episode by another policy, in lockstep
         self.policy: RolloutPolicy | None = None  # the chosen one
         self.policy_name, self.temperature, self.speed = YOU, 0.0, 1.0
-        self.stopped = threading.Event()  # ends animations and runs
+        self._running = self._newest = threading.Event()  # set to end the work submitted with it
         self.prompt_weights: list[tuple[Colour, np.ndarray]] = []  # attention to draw below the prompt
         self._other_policy: RolloutPolicy | None = None
         self._other_table: Table | None = None
         self._compat = config.env_config.compat
         self._changed: list[Callable[[], None]] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
-        client.camera.position, client.camera.look_at = CAMERA_M, LOOK_AT_M
+        self._look(CAMERA_M, LOOK_AT_M)
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(_PANEL_WIDTH)
         self.tabs = self.gui.add_tab_group()
@@ -109,17 +110,27 @@ class BrowserSession:
 
     def submit(self, work: Callable[[], object]) -> "Future[None]":
         """Do work in this browser's thread; what it raises is shown, and the page lives on."""
-        return self._worker.submit(self._reported, work)
-
-    def interrupt(self, work: Callable[[], object]) -> "Future[None]":
-        """Submit work, and end the animation or run before it."""
-        self.stopped.set()
+        stop = self._newest = threading.Event()
 
         def begin() -> None:
-            self.stopped.clear()
+            self._running = stop
             work()
 
-        return self.submit(begin)
+        return self._worker.submit(self._reported, begin)
+
+    def interrupt(self, work: Callable[[], object]) -> "Future[None]":
+        """Submit work, and end the animations and runs before it."""
+        self.pause()
+        return self.submit(work)
+
+    def pause(self) -> None:
+        """End the animation or run that is going on."""
+        self._running.set()
+        self._newest.set()
+
+    def is_paused(self) -> bool:
+        """Whether the work that is going on should end."""
+        return self._running.is_set()
 
     def load_policy(self, name: str) -> RolloutPolicy | None:
         """Load a policy for this browser alone; `YOU` gives None.
@@ -169,12 +180,15 @@ class BrowserSession:
         if self._other_table is not None:
             self._other_table.remove()
             self._other_table = None
+            self._look(CAMERA_M, LOOK_AT_M)
         if policy is not None and self.current is not None:
             episode = self.current.episode
             self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
             self._other_table = Table(
                 self.client.scene, self.assets, root="/second", offset_y_m=_SECOND_TABLE_Y_M
             )
+            middle = _SECOND_TABLE_Y_M / 2
+            self._look((1.75, middle, 1.4), (0.4, middle, 0.0))
         self.back(0)
 
     def step(self, action: Action | None = None) -> bool:
@@ -188,9 +202,14 @@ class BrowserSession:
                 frames[table] = step.frames
             elif error := run.propose().error:
                 self.warn(str(error))
-        animate(frames, speed=self.speed, stops=self.stopped.is_set)
+        animate(frames, speed=self.speed, stops=self.is_paused)
         self.changed()
         return bool(frames)
+
+    def run(self) -> None:
+        """Step until the episode is over, no action is there, or the user pauses."""
+        while not self.is_paused() and self.step():
+            pass
 
     def back(self, num_steps: int) -> None:
         """Go back to the state after some steps."""
@@ -218,6 +237,9 @@ class BrowserSession:
         """Show a message over the page."""
         self.client.add_notification(title, message, auto_close_seconds=12.0, color="red")
 
+    def _look(self, position: Vector3, look_at: Vector3) -> None:
+        self.client.camera.position, self.client.camera.look_at = position, look_at
+
     def close_episode(self) -> None:
         """Free the current episode."""
         for _, run in self.runs():
@@ -226,7 +248,7 @@ class BrowserSession:
 
     def close(self) -> None:
         """End the session: the browser has gone."""
-        self.stopped.set()
+        self.pause()
         self._worker.submit(self.close_episode)
         self._worker.shutdown(wait=False)
 

@@ -1,5 +1,8 @@
 """*Play*: choose an episode and a policy, and step through it."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import viser
 
@@ -44,11 +47,18 @@ class PlayPanel:
         self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
         hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
         self._source = gui.add_text("source", "", hint=hint, visible=False)
-        self._task.on_update(lambda _: self.session.interrupt(self._choose_task))
-        for choice in (self._level, self._seed):
-            choice.on_update(lambda _: self.session.interrupt(self._open))
-        self._name.on_update(lambda _: self.session.interrupt(self._choose_policy))
-        self._source.on_update(lambda _: self.session.interrupt(self._choose_policy))
+        for choice, work in (
+            (self._task, self._choose_task),
+            (self._level, self._open),
+            (self._seed, self._open),
+            (self._name, self._choose_policy),
+            (self._source, self._choose_policy),
+        ):
+            choice.on_update(partial(self._chosen, work))
+
+    def _chosen(self, work: Callable[[], None], event: viser.GuiEvent) -> None:
+        if event.client is not None:  # by the user, not by this code
+            self.session.interrupt(work)
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         session = self.session
@@ -58,14 +68,11 @@ class PlayPanel:
 
         @self._buttons.on_click
         def _(_: viser.GuiEvent) -> None:
-            work = {"step": session.step, "play": self._run, "next seed": self._next_seed}
+            work = {"step": session.step, "play": session.run, "next seed": self._next_seed}
             chosen = work.get(self._buttons.value)
-            session.stopped.set() if chosen is None else session.interrupt(chosen)
+            session.pause() if chosen is None else session.interrupt(chosen)
 
-        @self._time.on_update
-        def _(event: viser.GuiEvent) -> None:
-            if event.client is not None:  # not set by `_show`
-                session.interrupt(lambda: session.back(self._time.value))
+        self._time.on_update(partial(self._chosen, lambda: session.back(self._time.value)))
 
         @self._speed.on_update
         def _(_: viser.GuiEvent) -> None:
@@ -100,12 +107,9 @@ class PlayPanel:
         self.session.open(episode, self.session.policy)
         self._choose_policy()
 
-    def _run(self) -> None:
-        while not self.session.stopped.is_set() and self.session.step():
-            pass
-
     def _next_seed(self) -> None:
         self._seed.value = int(self._seed.value) + 1
+        self._open()
 
     def _show(self) -> None:
         """Show the camera views, how far the episode is, and how it ended."""

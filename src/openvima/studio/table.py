@@ -18,7 +18,7 @@ from openvima.sim.arm_view import arm_parts
 from openvima.sim.ur5 import link_frames
 from openvima.video.prompt_strip import Colour
 
-CAMERA_M, LOOK_AT_M = (1.36, 0.0, 1.0), (0.42, 0.0, 0.08)  # near the axis of the front camera
+CAMERA_M, LOOK_AT_M = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # near the axis of the front camera
 _LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
 _AMBIENT, _DIRECTIONAL = 1.2, 2.3  # such that colours are those of the front camera, by eye
 _Shape = tuple[str, str, Vector3, Vector3]

@@ -12,7 +12,9 @@ from openvima.scene.explanation import Explanation, PlaceProbability
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import Table
 from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
+from openvima.video.prompt_strip import Colour
 
+_Point = tuple[float, float]
 _NOBODY = "nobody"
 _MAX_PLACES = 6  # ghosts shown at once
 _ARROW_Z_M = 0.09
@@ -63,15 +65,18 @@ class WhyPanel:
             proposal = run.propose() if self._shown.value else None
             if len(runs) > 1:
                 lines.append(f"**{name}**: {_state(run)}")
+                self._add_label(table, "name", name, (0.82, 0.0))
             if proposal is None:
                 continue
             if proposal.error is not None:
                 lines.append(f"**{name}**: {proposal.error}")
             if proposal.action is not None:
-                self._add_arrow(table, "action", proposal.action)
+                self._add_arrow(
+                    table, "action", proposal.action.pose0_position, proposal.action.pose1_position
+                )
             if proposal.explanation is not None:
                 self._explain(table, run, proposal.explanation)
-                lines.append(_second_choice(proposal.explanation, run))
+                lines.append(self._second_choice(table, run, proposal.explanation))
                 panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
                 self.session.prompt_weights = self.session.prompt_weights or attention_rows(
                     proposal.explanation
@@ -102,14 +107,14 @@ class WhyPanel:
                 )
                 x, y, _ = placement.pose.position
                 self._nodes.append(ghost)
-                self._add_label(table, f"pick{placement.id}", each.probability, (x, y))
+                self._add_label(table, f"pick{placement.id}", percent(each.probability), (x, y))
         picked = max(explanation.objects, key=lambda each: each.probability, default=None)
         placement = placements.get(picked.object_id) if picked else None
         action = Action.from_arrays(explanation.action)
         for number, place in enumerate(explanation.distinct_places()[:_MAX_PLACES]):
             if place.probability < LEAST_SHOWN:
                 break
-            self._add_label(table, f"place{number}", place.probability, place.position)
+            self._add_label(table, f"place{number}", percent(place.probability), place.position)
             if placement is not None and run.scene.end_effector == "suction":
                 pose = _placed(placement, action, place)
                 opacity = 0.12 + 0.4 * place.probability
@@ -117,11 +122,26 @@ class WhyPanel:
                     table.add_ghost(f"why/{number}", placement, pose=pose, colour=PLACE, opacity=opacity)
                 )
 
-    def _add_label(self, table: Table, name: str, probability: float, position: tuple[float, float]) -> None:
+    def _second_choice(self, table: Table, run: EpisodeSession, explanation: Explanation) -> str:
+        """Say which action was the second most probable, and draw a thin arrow if its place is known."""
+        choice = explanation.second_choice()
+        if choice is None or choice[-1] < LEAST_SHOWN:
+            return "No other action has a probability of 1 %."
+        picked, place, probability = choice
+        names = {p.id: f"{p.texture} {p.object}" for p in run.scene.placements}
+        said = (
+            f"Second most probable, {percent(probability)}: pick the {names.get(picked.object_id, 'object')}"
+        )
+        if place is None:
+            return f"{said}."
+        self._add_arrow(table, "second", picked.grasp, place.position, PLACE)
+        return f"{said}, place it at ({place.position[0]:.2f}, {place.position[1]:.2f}) m: the blue arrow."
+
+    def _add_label(self, table: Table, name: str, text: str, position: _Point) -> None:
         self._nodes.append(
             self.session.client.scene.add_label(
                 f"{table.root}/why/label_{name}",
-                percent(probability),
+                text,
                 position=(*position, _LABEL_Z_M),
                 anchor="bottom-center",
                 font_screen_scale=0.9,
@@ -129,9 +149,9 @@ class WhyPanel:
         )
 
     def _add_arrow(
-        self, table: Table, name: str, action: Action, colour: tuple[int, int, int] = (255, 255, 255)
+        self, table: Table, name: str, start: _Point, end: _Point, colour: Colour = (255, 255, 255)
     ) -> None:
-        points = [[(*point, _ARROW_Z_M) for point in (action.pose0_position, action.pose1_position)]]
+        points = [[(*point, _ARROW_Z_M) for point in (start, end)]]
         self._nodes.append(
             self.session.client.scene.add_arrows(
                 f"{table.root}/why/{name}",
@@ -149,7 +169,8 @@ class WhyPanel:
         if index is None:
             return "No difference so far."
         for table, run in self.session.runs():
-            self._add_arrow(table, "difference", run.steps[index].action, PICK)
+            action = run.steps[index].action
+            self._add_arrow(table, "difference", action.pose0_position, action.pose1_position, PICK)
         return f"The **first difference** is step {index + 1}: the orange arrows."
 
 
@@ -167,15 +188,3 @@ def _state(run: EpisodeSession) -> str:
     if run.outcome is None:
         return f"after step {run.num_steps}"
     return "solved" if run.outcome.success else f"not solved: {run.outcome.reason}"
-
-
-def _second_choice(explanation: Explanation, run: EpisodeSession) -> str:
-    """Say which action was the second most probable."""
-    choice = explanation.second_choice()
-    if choice is None:
-        return ""
-    picked, place, probability = choice
-    names = {p.id: f"{p.texture} {p.object}" for p in run.scene.placements}
-    what = f"pick the {names.get(picked.object_id, 'object')}"
-    where = "" if place is None else f", place at ({place.position[0]:.2f}, {place.position[1]:.2f}) m"
-    return f"Second most probable, {percent(probability)}: {what}{where}."
