@@ -26,7 +26,7 @@ def test_an_episode_is_played_to_success_taken_back_and_explained(studio: Any, o
     page = open_page(studio.url)
     page.wait_for("0 steps of at most")
     page.press("play")
-    page.wait_for("Solved")
+    page.wait_for("solved in")
     session = newest(studio)
     session.submit(lambda: session.back(1)).result()
     page.wait_for("1 step of at most")
@@ -52,7 +52,7 @@ def test_what_fails_is_said_and_the_page_lives_on(studio: Any, open_page: Callab
     page.wait_for(f"there is no policy '{NO_POLICY}'")
     page.choose("policy", "oracle")
     page.press("play")
-    page.wait_for("Solved")
+    page.wait_for("solved in")
 
 
 def test_two_browsers_have_sessions_of_their_own(studio: Any, open_page: Callable) -> None:
@@ -64,7 +64,7 @@ def test_two_browsers_have_sessions_of_their_own(studio: Any, open_page: Callabl
     other = newest(studio)
     second.choose("task", "visual_manipulation")
     second.press("step")
-    second.wait_for("Solved")
+    second.wait_for("solved in")
     assert other.current.num_steps == 1 and other.current.episode.task == "visual_manipulation"
     assert one.current.num_steps == 0 and one.current.episode.task == "rearrange"
     first.press("step")

@@ -1,30 +1,26 @@
 """Playing a single episode with any policy."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from openvima.catalog import Assets
 from openvima.env.config import DEFAULT_ENV_CONFIG
-from openvima.env.tabletop import TabletopEnv
-from openvima.evaluation.actions import ActionRecorder, action_arrays
+from openvima.errors import ActionError, OracleError, PolicyError
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
-from openvima.evaluation.recording import record_episode
-from openvima.evaluation.rollout import play as roll_out
-from openvima.evaluation.rollout_policies import (
-    Decision,
-    Observation,
-    PromptedRolloutPolicy,
-    RolloutPolicy,
-    load_rollout_policy,
-)
+from openvima.evaluation.results import EpisodeOutcome
+from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutPolicy, load_rollout_policy
+from openvima.evaluation.session import EpisodeSession
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import Policy
+from openvima.render import channels_last
+from openvima.render.camera import VIEWS
+from openvima.render.rasteriser import Rasteriser
 from openvima.scene import Action, Episode, Outcome, Scene
-
-_HOST_TASK = "visual_manipulation"  # an environment of any task plays all episodes
+from openvima.scene.explanation import Explanation
+from openvima.video.recorder import EpisodeRecorder
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,45 +91,56 @@ def play(
         True
     """
     rollout_policy = _load(policy, episode, device=device, boxes=boxes, trust_code=trust_code)
-    render_mode = "rgb_array" if frames else None
-    env = TabletopEnv(
-        _HOST_TASK, assets=assets, compat=compat, realtime=video is not None, render_mode=render_mode
+    if explain:
+        rollout_policy.explainer()  # raises now
+    session = EpisodeSession(
+        episode, rollout_policy, assets=assets, compat=compat, record=video is not None, explain=explain
     )
-    recorder = _FrameRecorder(rollout_policy, frames)
     if video is None:
-        (ended,) = roll_out([env], [episode], recorder)
+        outcome = _run(session)
     else:
         name = policy if isinstance(policy, str) else type(policy).__name__
         caption = f"{episode.task} · {Path(name).name}" if title is None else title
-        ended = record_episode(env, recorder, episode, Path(video), title=caption, explain=explain)
+        with EpisodeRecorder(
+            session.env,
+            Path(video),
+            title=caption,
+            explain=partial(_explanation, session) if explain else None,
+        ) as recorder:
+            outcome = _run(session, recorder)
+            recorder.record_outcome(outcome.success if episode.problem.goals else None, outcome.steps)
+    scenes = [*(step.before for step in session.steps), session.scene] if frames else []
+    rasteriser = Rasteriser(session.env.assets)
     return PlayResult(
         episode,
-        tuple(Action.from_arrays(action_arrays(step)) for step in recorder.steps[0]),
-        Outcome(ended.success, env.outcome.failure, ended.reason),
-        env.scene,
-        (*recorder.frames, _rendered(env)) if frames else (),
+        tuple(step.action for step in session.steps),
+        Outcome(outcome.success, session.env.outcome.failure, outcome.reason),
+        session.scene,
+        tuple(_both_views(rasteriser, scene) for scene in scenes),
     )
 
 
-class _FrameRecorder(ActionRecorder):
-    """Keeps an image before each action too."""
+def _run(session: EpisodeSession, recorder: EpisodeRecorder | None = None) -> EpisodeOutcome:
+    """Step to the end, and raise what the policy raises."""
+    while session.outcome is None:
+        error = session.propose().error
+        if error is not None and not isinstance(error, ActionError | OracleError):  # these end the episode
+            raise error
+        if session.step() is not None and recorder is not None:
+            recorder.record_step(session.env)
+    return session.outcome
 
-    def __init__(self, policy: RolloutPolicy, with_frames: bool) -> None:
-        super().__init__(policy)
-        self._with_frames = with_frames
-        self._envs: Sequence[TabletopEnv] = ()
-        self.frames: list[np.ndarray] = []
 
-    def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Start the episode."""
-        self._envs = envs
-        super().begin(envs)
+def _explanation(session: EpisodeSession) -> Explanation:
+    explanation = session.steps[-1].proposal.explanation
+    if explanation is None:
+        raise PolicyError("explain() of the policy returned None for an episode that goes on.")
+    return explanation
 
-    def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
-        """Pass on the decision."""
-        if self._with_frames:
-            self.frames.append(_rendered(self._envs[0]))
-        return super().decide(observations)
+
+def _both_views(rasteriser: Rasteriser, scene: Scene) -> np.ndarray:
+    images = rasteriser.scene(scene)
+    return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
 
 
 def _load(
@@ -156,9 +163,3 @@ def _load(
         trust_code=trust_code,
     )
     return load_rollout_policy(batch)
-
-
-def _rendered(env: TabletopEnv) -> np.ndarray:
-    image = env.render()
-    assert image is not None  # the environment was made to render
-    return image

@@ -132,6 +132,15 @@ class EpisodeSession:
         self._policy = _as_rollout_policy(policy)
         self.back(self.num_steps)
 
+    def summary(self) -> str:
+        """Say in a phrase how far the episode is, or how it ended."""
+        taken = "1 step" if self.num_steps == 1 else f"{self.num_steps} steps"
+        if self.outcome is None:
+            return f"{taken} of at most {self.episode.max_steps}"
+        return (
+            f"solved in {taken}" if self.outcome.success else f"not solved ({taken}): {self.outcome.reason}"
+        )
+
     def frame(self) -> VideoFrame:
         """Return the current scene with the arm's joint angles, for drawing."""
         return VideoFrame(self.scene, self.env.joints)

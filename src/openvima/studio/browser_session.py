@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from openvima.catalog.geometry import Vector3
 from openvima.catalog.packs import load_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, OpenVimaError
@@ -95,7 +94,7 @@ class BrowserSession:
         self._compat = config.env_config.compat
         self._changed: list[Callable[[], None]] = []
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
-        self._look(CAMERA_M, LOOK_AT_M)
+        client.camera.position, client.camera.look_at = CAMERA_M, LOOK_AT_M
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(_PANEL_WIDTH)
         self.tabs = self.gui.add_tab_group()
@@ -145,23 +144,16 @@ class BrowserSession:
             name, device=config.device, trust_code=config.trust_code, temperature=self.temperature
         )
 
-    def choose_policy(self, name: str, *, temperature: float | None = None) -> None:
-        """Let a policy decide from here on.
-
-        Args:
-            name: As for `openvima evaluate --policy`, or `YOU`.
-            temperature: 0 for greedy decoding; None: as before.
-        """
-        before = self.policy_name, self.temperature
-        self.policy_name, self.temperature = name, self.temperature if temperature is None else temperature
-        try:
-            self.policy = self.load_policy(name)
-        except OpenVimaError:
-            self.policy_name, self.temperature = before
-            raise
+    def choose_policy(self, name: str) -> None:
+        """Let a policy decide from here on."""
+        self.policy, self.policy_name = self.load_policy(name), name
         if self.current is not None:
             self.current.policy = self.policy
             self.changed()
+
+    def choose_assets(self, name: str) -> None:
+        """Use an asset pack for what is opened from here on."""
+        self.assets = self.table.assets = load_assets(name)
 
     def open(self, episode: Episode, policy: RolloutPolicy | None, *, compat: bool | None = None) -> None:
         """Start an episode, sampled or composed, and show it."""
@@ -173,22 +165,22 @@ class BrowserSession:
 
     def compare(self, policy: RolloutPolicy | None) -> None:
         """Show beside the current episode how another policy does it, from the start; None: nothing."""
+        if (policy is None) != (self._other_policy is None):
+            middle = 0.0 if policy is None else _SECOND_TABLE_Y_M / 2
+            (x, _, z), (at_x, _, at_z) = CAMERA_M, LOOK_AT_M
+            back = 1.0 if policy is None else 1.42  # to have both in view
+            self.client.camera.position = (at_x + back * (x - at_x), middle, back * z)
+            self.client.camera.look_at = (at_x, middle, at_z)
         self._other_policy = policy
-        if self.compared is not None:
-            self.compared.close()
-            self.compared = None
         if self._other_table is not None:
             self._other_table.remove()
-            self._other_table = None
-            self._look(CAMERA_M, LOOK_AT_M)
+        self.compared = self._other_table = None
         if policy is not None and self.current is not None:
             episode = self.current.episode
             self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
             self._other_table = Table(
                 self.client.scene, self.assets, root="/second", offset_y_m=_SECOND_TABLE_Y_M
             )
-            middle = _SECOND_TABLE_Y_M / 2
-            self._look((1.75, middle, 1.4), (0.4, middle, 0.0))
         self.back(0)
 
     def step(self, action: Action | None = None) -> bool:
@@ -233,12 +225,9 @@ class BrowserSession:
                 self.current.prompt, width=2 * _PROMPT_WIDTH, weights=self.prompt_weights, **size
             )
 
-    def warn(self, message: str, *, title: str = "That did not work") -> None:
+    def warn(self, message: str) -> None:
         """Show a message over the page."""
-        self.client.add_notification(title, message, auto_close_seconds=12.0, color="red")
-
-    def _look(self, position: Vector3, look_at: Vector3) -> None:
-        self.client.camera.position, self.client.camera.look_at = position, look_at
+        self.client.add_notification("That did not work", message, auto_close_seconds=12.0, color="red")
 
     def close_episode(self) -> None:
         """Free the current episode."""

@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 import viser
 
+from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
-from openvima.evaluation.session import EpisodeSession
 from openvima.policies.bundled import SMALL
 from openvima.render import channels_last
 from openvima.render.camera import VIEWS
@@ -29,7 +29,6 @@ class PlayPanel:
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
-        self._rasteriser = Rasteriser(session.assets)
         gui = session.gui
         with session.tabs.add_tab("Play", viser.Icon.ROBOT):
             self._add_choices(gui)
@@ -43,6 +42,8 @@ class PlayPanel:
         self._task = gui.add_dropdown("task", list_tasks(), initial_value=_FIRST_TASK)
         self._level = gui.add_dropdown("level", LEVELS, initial_value="train")
         self._seed = gui.add_number("seed", 0, min=0, max=2**53, step=1)
+        packs = dict.fromkeys((self.session.config.env_config.assets, *ASSET_PACKS))
+        self._assets = gui.add_dropdown("assets", [*packs])
         names = (SMALL, "oracle", "random", YOU, *self.session.config.policies, _OTHER)
         self._name = gui.add_dropdown("policy", names, initial_value=SMALL)
         hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
@@ -51,6 +52,7 @@ class PlayPanel:
             (self._task, self._choose_task),
             (self._level, self._open),
             (self._seed, self._open),
+            (self._assets, self._choose_assets),
             (self._name, self._choose_policy),
             (self._source, self._choose_policy),
         ):
@@ -85,6 +87,10 @@ class PlayPanel:
         self._level.value = level if level in levels else levels[0]
         self._open()
 
+    def _choose_assets(self) -> None:
+        self.session.choose_assets(self._assets.value)
+        self._open()
+
     def _choose_policy(self) -> None:
         self._source.visible = self._name.value == _OTHER
         name = self._source.value.strip() if self._source.visible else self._name.value
@@ -116,16 +122,8 @@ class PlayPanel:
         current = self.session.current
         if current is None:
             return
-        images = self._rasteriser.scene(current.scene)
+        images = Rasteriser(self.session.assets).scene(current.scene)
         self._views.image = np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
         self._time.max = max(1, current.num_steps)
         self._time.value = current.num_steps
-        self._outcome.content = _sentence(current)
-
-
-def _sentence(current: EpisodeSession) -> str:
-    outcome, steps = current.outcome, current.num_steps
-    taken = "1 step" if steps == 1 else f"{steps} steps"
-    if outcome is None:
-        return f"{taken} of at most {current.episode.max_steps}"
-    return f"**Solved** in {taken}." if outcome.success else f"**Not solved**: {outcome.reason} ({taken})."
+        self._outcome.content = current.summary()

@@ -1,17 +1,15 @@
 """The table in 3D: meshes and textures of the asset pack, and the arm, as nodes of one browser's scene."""
 
-import io
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
-import trimesh
 import viser
-from PIL import Image
 
 from openvima.catalog.geometry import Assets, TriangleMesh, Vector3
 from openvima.env.tabletop import FRAMES_PER_SECOND, VideoFrame
+from openvima.render.gltf import encode_glb
 from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
 from openvima.scene import EndEffector, Placement, Pose, Scene
 from openvima.sim.arm_view import arm_parts
@@ -37,7 +35,8 @@ class Table:
     def __init__(
         self, scene: viser.SceneApi, assets: Assets, *, root: str = "/first", offset_y_m: float = 0.0
     ) -> None:
-        self.scene_api, self.assets, self.root = scene, assets, root
+        self.scene_api, self.root = scene, root
+        self._assets = assets
         self.objects: dict[int, viser.GlbHandle] = {}
         self.shown: VideoFrame | None = None
         self._shapes: dict[int, _Shape] = {}
@@ -50,6 +49,16 @@ class Table:
         self.sheet = scene.add_box(
             f"{root}/table", SHEET_RGB, (*SHEET_SIZE, 0.002), position=(0.5, 0.0, -0.0011)
         )
+
+    @property
+    def assets(self) -> Assets:
+        """The asset pack; another one that is assigned is for what is shown next."""
+        return self._assets
+
+    @assets.setter
+    def assets(self, assets: Assets) -> None:
+        self._show_objects(Scene(()))
+        self._assets = assets
 
     def show(self, frame: VideoFrame) -> None:
         """Show a scene and the arm; objects that are shown already are moved only."""
@@ -166,25 +175,9 @@ def _move(node: viser.SceneNodeHandle, pose: Pose) -> None:
 
 @lru_cache(maxsize=512)
 def _object_glb(assets: Assets, name: str, texture: str, size: Vector3, scale: Vector3) -> bytes:
-    return _glb(assets.geometry(name, size, scale).visual, assets.texture(texture))
+    return encode_glb(assets.geometry(name, size, scale).visual, assets.texture(texture))
 
 
 @lru_cache(maxsize=64)
 def _part_glb(mesh: TriangleMesh, rgb: Colour) -> bytes:
-    return _glb(mesh, np.array(rgb, np.uint8).reshape(1, 1, 3))
-
-
-def _glb(mesh: TriangleMesh, texture: np.ndarray) -> bytes:
-    """Encode a mesh with its texture as binary glTF."""
-    material = trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0)
-    material.baseColorTexture = Image.fromarray(np.ascontiguousarray(texture))
-    body = trimesh.Trimesh(
-        mesh.vertices.reshape(-1, 3),
-        np.arange(3 * len(mesh.vertices)).reshape(-1, 3),
-        vertex_normals=mesh.normals.reshape(-1, 3),
-        visual=trimesh.visual.TextureVisuals(uv=mesh.uvs.reshape(-1, 2), material=material),
-        process=False,
-    )
-    with io.BytesIO() as stream:
-        body.export(stream, file_type="glb", include_normals=True)
-        return stream.getvalue()
+    return encode_glb(mesh, np.array(rgb, np.uint8).reshape(1, 1, 3))

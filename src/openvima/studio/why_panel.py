@@ -1,14 +1,12 @@
 """*Why*: what the policy considers, on the table and below the prompt; two policies side by side."""
 
-import math
-
 import numpy as np
 import viser
 
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies.bundled import SMALL
-from openvima.scene import Action, Placement, Pose
-from openvima.scene.explanation import Explanation, PlaceProbability
+from openvima.scene import Action, Pose
+from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import Table
 from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
@@ -47,7 +45,8 @@ class WhyPanel:
         session.on_change(self._show)
 
     def _choose_temperature(self) -> None:
-        self.session.choose_policy(self.session.policy_name, temperature=self._temperature.value)
+        self.session.temperature = self._temperature.value
+        self.session.choose_policy(self.session.policy_name)
 
     def _choose_other(self) -> None:
         name = self._other.value
@@ -64,7 +63,7 @@ class WhyPanel:
         for (table, run), name in zip(runs, (self.session.policy_name, self._other.value), strict=False):
             proposal = run.propose() if self._shown.value else None
             if len(runs) > 1:
-                lines.append(f"**{name}**: {_state(run)}")
+                lines.append(f"**{name}**: {run.summary()}")
                 self._add_label(table, "name", name, (0.82, 0.0))
             if proposal is None:
                 continue
@@ -116,7 +115,7 @@ class WhyPanel:
                 break
             self._add_label(table, f"place{number}", percent(place.probability), place.position)
             if placement is not None and run.scene.end_effector == "suction":
-                pose = _placed(placement, action, place)
+                pose = action.placed(placement.pose, place.position)
                 opacity = 0.12 + 0.4 * place.probability
                 self._nodes.append(
                     table.add_ghost(f"why/{number}", placement, pose=pose, colour=PLACE, opacity=opacity)
@@ -172,19 +171,3 @@ class WhyPanel:
             action = run.steps[index].action
             self._add_arrow(table, "difference", action.pose0_position, action.pose1_position, PICK)
         return f"The **first difference** is step {index + 1}: the orange arrows."
-
-
-def _placed(placement: Placement, action: Action, place: PlaceProbability) -> Pose:
-    """Return the pose of a picked object after it was placed at a candidate."""
-    yaw = action.yaw1_rad - action.yaw0_rad
-    (x, y, z), (x0, y0) = placement.pose.position, action.pose0_position
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    dx, dy = cos * (x - x0) - sin * (y - y0), sin * (x - x0) + cos * (y - y0)
-    turned = placement.pose.rotated(yaw)
-    return Pose((place.position[0] + dx, place.position[1] + dy, z), turned.quaternion)
-
-
-def _state(run: EpisodeSession) -> str:
-    if run.outcome is None:
-        return f"after step {run.num_steps}"
-    return "solved" if run.outcome.success else f"not solved: {run.outcome.reason}"
