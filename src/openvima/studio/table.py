@@ -19,7 +19,7 @@ from openvima.video.prompt_strip import Colour
 CAMERA_M, LOOK_AT_M = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # near the axis of the front camera
 _LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
 _AMBIENT, _DIRECTIONAL = 1.2, 2.3  # such that colours are those of the front camera, by eye
-_Shape = tuple[str, str, Vector3, Vector3]
+_Shape = tuple[Assets, str, str, Vector3, Vector3]  # whatever decides how an object is drawn
 
 
 class Table:
@@ -35,8 +35,7 @@ class Table:
     def __init__(
         self, scene: viser.SceneApi, assets: Assets, *, root: str = "/first", offset_y_m: float = 0.0
     ) -> None:
-        self.scene_api, self.root = scene, root
-        self._assets = assets
+        self.scene_api, self.assets, self.root = scene, assets, root
         self.objects: dict[int, viser.GlbHandle] = {}
         self.shown: VideoFrame | None = None
         self._shapes: dict[int, _Shape] = {}
@@ -49,16 +48,6 @@ class Table:
         self.sheet = scene.add_box(
             f"{root}/table", SHEET_RGB, (*SHEET_SIZE, 0.002), position=(0.5, 0.0, -0.0011)
         )
-
-    @property
-    def assets(self) -> Assets:
-        """The asset pack; another one that is assigned is for what is shown next."""
-        return self._assets
-
-    @assets.setter
-    def assets(self, assets: Assets) -> None:
-        self._show_objects(Scene(()))
-        self._assets = assets
 
     def show(self, frame: VideoFrame) -> None:
         """Show a scene and the arm; objects that are shown already are moved only."""
@@ -111,17 +100,20 @@ class Table:
         placements = {placement.id: placement for placement in scene.placements}
         for object_id in [*self.objects]:
             placement = placements.get(object_id)
-            if placement is None or _shape(placement) != self._shapes[object_id]:
+            if placement is None or self._shape(placement) != self._shapes[object_id]:
                 self.objects.pop(object_id).remove()
                 del self._shapes[object_id]
         for object_id, placement in placements.items():
             if object_id not in self.objects:
-                self._shapes[object_id] = _shape(placement)
-                data = _object_glb(self.assets, *_shape(placement))
+                shape = self._shapes[object_id] = self._shape(placement)
+                data = _object_glb(*shape)
                 self.objects[object_id] = self.scene_api.add_glb(
                     f"{self.root}/objects/{object_id}", data, cast_shadow=False, receive_shadow=False
                 )
             _move(self.objects[object_id], placement.pose)
+
+    def _shape(self, placement: Placement) -> _Shape:
+        return self.assets, placement.object, placement.texture, placement.size, placement.scale
 
     def _links(self, end_effector: EndEffector) -> list[viser.FrameHandle]:
         if self._arm is None or self._arm[0] != end_effector:
@@ -161,10 +153,6 @@ def animate(tables: Mapping[Table, Sequence[VideoFrame]], *, speed: float, stops
     for table, frames in tables.items():
         if frames:
             table.show(frames[-1])
-
-
-def _shape(placement: Placement) -> _Shape:
-    return placement.object, placement.texture, placement.size, placement.scale
 
 
 def _move(node: viser.SceneNodeHandle, pose: Pose) -> None:
