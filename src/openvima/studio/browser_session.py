@@ -88,6 +88,7 @@ class BrowserSession:
         self.policy: RolloutPolicy | None = None  # the chosen one
         self.policy_name, self.temperature, self.speed = YOU, 0.0, 1.0
         self._running = self._newest = threading.Event()  # set to end the work submitted with it
+        self.editing = False  # whether clicks select objects to edit, instead of acting
         self.prompt_weights: list[tuple[Colour, np.ndarray]] = []  # attention to draw below the prompt
         self._other_policy: RolloutPolicy | None = None
         self._other_table: Table | None = None

@@ -1,0 +1,164 @@
+"""A scene that is being edited: every change gives a new composition, or an error that says why not."""
+
+import itertools
+from dataclasses import dataclass, field, replace
+from typing import Any  # goals and images, in the forms of `compose`
+
+import yaml
+
+from openvima.brief import brief_repr
+from openvima.catalog.geometry import Assets
+from openvima.env.composed_objects import FIELDS, SceneObject, scene_objects
+from openvima.env.composing import compose
+from openvima.env.episode_code import compose_values
+from openvima.errors import SceneError
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Episode
+
+_STEP_M, _EDGE_M = 0.05, 0.1  # of the positions that are tried for a new object
+_ROUND_M, _ROUND_DEG = 3, 1  # decimals of positions and headings
+
+
+@dataclass(frozen=True, slots=True)
+class Composition:
+    """The arguments of `compose`, to be changed one at a time.
+
+    Args:
+        objects: The objects, each with its handle as `name`.
+        prompt: The text.
+        images: Content of placeholders that are not handles, as for `compose`.
+        goals: Goals by name, as for `compose`.
+        max_steps: Step limit; None for that of `compose`.
+        end_effector: "suction" or "spatula".
+
+    Example:
+        >>> scene = Composition.of(compose([("heart", "red", (0.5, 0.1))], "Turn the {a}."))
+        >>> scene.moved("a", (0.4, 0.0), 30).objects[0].position
+        (0.4, 0.0)
+    """
+
+    objects: tuple[SceneObject, ...]
+    prompt: str
+    images: dict[str, Any] = field(default_factory=dict)
+    goals: tuple[Any, ...] = ()
+    max_steps: int | None = None
+    end_effector: EndEffector = "suction"
+
+    __repr__ = brief_repr
+
+    @staticmethod
+    def of(episode: Episode) -> "Composition":
+        """Return the composition of a composed or sampled episode, as `compose_values` says.
+
+        Raises:
+            SceneError: A goal has no composed form.
+        """
+        values = compose_values(episode)
+        objects = tuple(scene_objects(values.pop("objects")))
+        return Composition(objects, **{**values, "goals": tuple(values["goals"])})
+
+    def episode(self, assets: Assets) -> Episode:
+        """Compose the episode.
+
+        Raises:
+            SceneError, UnknownObjectError, UnknownTextureError: As for `compose`.
+        """
+        return compose(
+            list(self.objects),
+            self.prompt,
+            images=self.images,
+            goals=self.goals,
+            max_steps=self.max_steps,
+            end_effector=self.end_effector,
+            assets=assets,
+        )
+
+    def __getitem__(self, handle: str) -> SceneObject:
+        for each in self.objects:
+            if each.name == handle:
+                return each
+        names = ", ".join(each.name for each in self.objects)
+        raise SceneError(f"there is no object {handle!r:.80}; the scene has {names}.")
+
+    def added(self, object_name: str, texture: str, assets: Assets) -> "Composition":
+        """Add an object at the free position that is nearest to the middle, under the next free letter.
+
+        Raises:
+            SceneError: No position is free.
+            UnknownObjectError, UnknownTextureError: The catalogue has no such object or texture.
+        """
+        taken = {each.name for each in self.objects} | {*self.images}
+        letters = "abcdefghijklmnopqrstuvwxyz"
+        name = next(
+            n for n in itertools.chain(letters, map("object{}".format, itertools.count())) if n not in taken
+        )
+        reason = SceneError("there is no room on the table.")
+        for position in _positions():
+            new = replace(
+                self, objects=(*self.objects, SceneObject(object_name, texture, position, name=name))
+            )
+            try:
+                replace(new, prompt="-", images={}, goals=()).episode(assets)
+            except SceneError as error:
+                reason = error
+                continue
+            return new
+        raise SceneError(f"there is no room for a {texture} {object_name}: {reason}")
+
+    def moved(self, handle: str, position: tuple[float, float], yaw_deg: float) -> "Composition":
+        """Move an object to a position and heading, rounded to millimetres and tenths of a degree."""
+        x, y = (round(float(value), _ROUND_M) for value in position)
+        return self.changed(handle, position=(x, y), yaw_deg=round(float(yaw_deg), _ROUND_DEG))
+
+    def changed(self, handle: str, **fields: Any) -> "Composition":  # Any: fields of `SceneObject`
+        """Change fields of an object.
+
+        Raises:
+            SceneError: There is no such object or field.
+        """
+        if unknown := fields.keys() - {*FIELDS}:
+            raise SceneError(f"objects have no field {', '.join(unknown)}; they have {', '.join(FIELDS)}.")
+        new = replace(self[handle], **fields)
+        return replace(self, objects=tuple(new if each.name == handle else each for each in self.objects))
+
+    def removed(self, handle: str) -> "Composition":
+        """Take an object away."""
+        gone = self[handle]
+        return replace(self, objects=tuple(each for each in self.objects if each is not gone))
+
+    def scene_image(self) -> list[tuple[str, str, tuple[float, float], float]]:
+        """Return the present arrangement in the form of a prompt image of a whole scene."""
+        return [(each.object, each.texture, each.position, each.yaw_deg) for each in self.objects]
+
+    @property
+    def goals_text(self) -> str:
+        """The goals in one line of YAML, such as "[in, a, b], [rotated, a, 60]"."""
+        listed = [[[*part] if isinstance(part, tuple) else part for part in goal] for goal in self.goals]
+        text = yaml.safe_dump(listed, default_flow_style=True, width=10**6, allow_unicode=True)
+        return text.strip()[1:-1]
+
+
+def parse_goals(text: str) -> tuple[Any, ...]:  # Any: plain values; `compose` checks them
+    """Read goals as `Composition.goals_text` writes them.
+
+    Raises:
+        SceneError: It is no list of lists.
+    """
+    try:
+        listed = yaml.safe_load(f"[{text}]")
+    except (yaml.YAMLError, ValueError):
+        listed = None
+    if not isinstance(listed, list) or not all(isinstance(goal, list) for goal in listed):
+        raise SceneError(f"the goals are {text!r:.80}; write them as [in, a, b], [rotated, a, 60].")
+    return tuple(tuple(goal) for goal in listed)
+
+
+def _positions() -> list[tuple[float, float]]:
+    """Positions on the table, nearest to its middle first."""
+    (low_x, low_y), (high_x, high_y) = WORKSPACE_LOW, WORKSPACE_HIGH
+    middle_x, middle_y = (low_x + high_x) / 2, (low_y + high_y) / 2
+    count_x, count_y = (
+        int((high - low - 2 * _EDGE_M) / _STEP_M / 2) for low, high in ((low_x, high_x), (low_y, high_y))
+    )
+    offsets = itertools.product(range(-count_x, count_x + 1), range(-count_y, count_y + 1))
+    ordered = sorted(offsets, key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, offset))
+    return [(round(middle_x + _STEP_M * x, 3), round(middle_y + _STEP_M * y, 3)) for x, y in ordered]
