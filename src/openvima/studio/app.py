@@ -13,12 +13,13 @@ from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError
 from openvima.serving.config import is_loopback
 from openvima.studio.browser_session import BrowserSession, StudioConfig
+from openvima.studio.browse_panel import BrowsePanel
 from openvima.studio.compose_panel import ComposePanel
 from openvima.studio.play_panel import PlayPanel
 from openvima.studio.user_panel import UserPanel
 from openvima.studio.why_panel import WhyPanel
 
-PANELS = (PlayPanel, WhyPanel, ComposePanel, UserPanel)  # in the order of their tabs
+PANELS = (PlayPanel, WhyPanel, ComposePanel, UserPanel, BrowsePanel)  # in the order of their tabs
 
 
 class Studio:

@@ -115,9 +115,8 @@ class ComposePanel:
             if self._scene is not None:
                 self._show(self._selected.value)  # what the fields said before
             raise
-        old, current = self._scene, self.session.current
-        self._scene = new
-        self.session.open(episode, None if current is None else current.policy)
+        old, self._scene = self._scene, new
+        self.session.open(episode, self.session.policy)
         self._episode = self.session.current
         self._follow()
         if old is None or (old.prompt, old.goals) != (new.prompt, new.goals):  # else it may be half typed

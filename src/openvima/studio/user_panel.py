@@ -63,8 +63,8 @@ class UserPanel:
             self._grabbed = Hit(object_id, event.start_position)
         elif event.phase == "end" and self._grabbed is not None:
             first, self._grabbed = self._grabbed, None
-            origin = self.session.client.camera.position
-            direction = np.subtract(event.end_position, origin)
+            origin = self.session.client.camera.position.tolist()
+            direction = np.subtract(event.end_position, origin).tolist()
             self.session.submit(lambda: self._drop(first, origin, direction))
 
     def _drop(self, first: Hit, origin: Sequence[float], direction: Sequence[float]) -> None:
