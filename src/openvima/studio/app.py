@@ -12,8 +12,8 @@ from viser.infra import ClientId
 from openvima.catalog.packs import load_assets
 from openvima.errors import ConfigError
 from openvima.serving.config import is_loopback
-from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.browse_panel import BrowsePanel
+from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.compose_panel import ComposePanel
 from openvima.studio.play_panel import PlayPanel
 from openvima.studio.user_panel import UserPanel
@@ -86,8 +86,10 @@ class Studio:
 
     def _begin(self, client: viser.ClientHandle) -> None:
         session = self.sessions[client.client_id] = BrowserSession(client, self.config)
-        for panel in PANELS:
-            panel(session)
+        first = () if self.config.path is None else (BrowsePanel,)
+        panels = [panel(session) for panel in dict.fromkeys((*first, *PANELS))]
+        if isinstance(panels[0], BrowsePanel):
+            session.submit(panels[0].open)
 
     def _gone(self, client: viser.ClientHandle) -> None:
         session = self.sessions.pop(client.client_id, None)

@@ -1,5 +1,6 @@
 """*Browse*: demonstrations of a data folder, and episodes of an evaluation, which are played again live."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,10 @@ from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
 from openvima.render import channels_last
 from openvima.sim.ur5 import HOME
 from openvima.studio.browser_session import BrowserSession
-from openvima.video.prompt_strip import draw_prompt_strip
 
 _ALL = "any"
 _MOST_STEPS = 20
 _MOST_LISTED = 500  # episodes of a cell in the list
-_PROMPT_WIDTH = 720
 _NOTHING = np.full((1, 1, 3), 255, np.uint8)
 
 
@@ -45,7 +44,7 @@ class BrowsePanel:
             with gui.add_form(None) as form:
                 hint = "results folder or data folder; Enter opens it"
                 self._path = gui.add_text("folder", str(session.config.path or ""), hint=hint)
-            form.on_submit(lambda _: session.interrupt(self._open))
+            form.on_submit(session.callback(self.open))
             self._title = gui.add_markdown("Open the folder of an evaluation or of demonstrations.")
             self._results_folder = gui.add_folder("Evaluation", visible=False)
             self._data_folder = gui.add_folder("Demonstrations", visible=False)
@@ -53,8 +52,6 @@ class BrowsePanel:
             self._add_results_fields(gui)
         with self._data_folder:
             self._add_data_fields(gui)
-        if session.config.path is not None:
-            session.submit(self._open)
 
     def _add_results_fields(self, gui: viser.GuiApi) -> None:
         self._policy = gui.add_dropdown("policy", ["—"])
@@ -66,14 +63,11 @@ class BrowsePanel:
         replay = gui.add_button_group("play again", ("live", "recorded actions"))
         self._reason = gui.add_markdown("")
         for choice in (self._policy, self._ablation):
-            choice.on_update(lambda event: event.client and self.session.submit(self._show_matrix))
-        self._failures.on_update(lambda _: self.session.submit(self._show_cell))
-        self._outcome.on_update(lambda event: event.client and self.session.interrupt(self._replay))
-        replay.on_click(
-            lambda _: self.session.interrupt(
-                self._replay if replay.value == "live" else self._replay_recorded
-            )
-        )
+            choice.on_update(self.session.callback(self._show_matrix))
+        self._failures.on_update(self.session.callback(self._show_cell))
+        self._outcome.on_update(self.session.callback(self._replay))
+        works = {"live": self._replay, "recorded actions": self._replay_recorded}
+        replay.on_click(self.session.callback(lambda: works[replay.value]()))
 
     def _add_data_fields(self, gui: viser.GuiApi) -> None:
         self._task = gui.add_dropdown("task", [_ALL])
@@ -85,14 +79,13 @@ class BrowsePanel:
         self._number = gui.add_slider("demonstration", 0, 1, 1, 0)
         self._step = gui.add_slider("after step", 0, 1, 1, 0)
         self._caption = gui.add_markdown("")
-        self._prompt = gui.add_image(_NOTHING)
         self._views = gui.add_image(_NOTHING, label="front, top")
         for choice in (self._task, self._level, self._object, self._texture, self._steps):
-            choice.on_update(lambda event: event.client and self.session.submit(self._find))
-        self._number.on_update(lambda event: event.client and self.session.submit(self._load))
-        self._step.on_update(lambda event: event.client and self.session.submit(self._scrub))
+            choice.on_update(self.session.callback(self._find))
+        self._number.on_update(self.session.callback(self._load))
+        self._step.on_update(self.session.callback(self._scrub))
 
-    def _open(self) -> None:
+    def open(self) -> None:
         """Open what the path names.
 
         Raises:
@@ -104,7 +97,9 @@ class BrowsePanel:
         elif (folder / MANIFEST_NAME).is_file():
             self._results, self._dataset = None, Dataset(folder)
         else:
-            raise DatasetError(f"{folder} holds neither {FILE_NAME} nor {MANIFEST_NAME}; give another folder.")
+            raise DatasetError(
+                f"{folder} holds neither {FILE_NAME} nor {MANIFEST_NAME}; give another folder."
+            )
         self._results_folder.visible = self._results is not None
         self._data_folder.visible = self._dataset is not None
         if self._results is not None:
@@ -132,16 +127,20 @@ class BrowsePanel:
         rates, self._rows = self._rows_of_choice(), []
         with self._matrix:
             for task in dict.fromkeys(task for task, _ in rates):
-                levels = {f"{level} {100 * rate:.0f}": level for (t, level), rate in rates.items() if t == task}
+                levels = {
+                    f"{level} {100 * rate:.0f}": level for (t, level), rate in rates.items() if t == task
+                }
                 group = self.session.gui.add_button_group(task.replace("_", " "), list(levels))
-                group.on_click(lambda _, t=task, g=group, ls=levels: self._choose_cell(t, ls[g.value]))
+                chosen = partial(self._choose_cell, task, levels, group)
+                group.on_click(self.session.callback(chosen))
                 self._rows.append(group)
         if rates:
-            self._choose_cell(*next(iter(rates)))
+            self._cell = next(iter(rates))
+            self._show_cell()
 
-    def _choose_cell(self, task: str, level: str) -> None:
-        self._cell = task, level
-        self.session.submit(self._show_cell)
+    def _choose_cell(self, task: str, levels: dict[str, str], group: viser.GuiButtonGroupHandle) -> None:
+        self._cell = task, levels[group.value]
+        self._show_cell()
 
     def _show_cell(self) -> None:
         """List the episodes of a cell."""
@@ -195,8 +194,7 @@ class BrowsePanel:
             self._replay_recorded()
             return
         self.session.open(found.sample(), policy, compat=found.batch.env_config.compat)
-        while not self.session.is_paused() and self.session.step():
-            pass
+        self.session.run()
 
     def _replay_recorded(self) -> None:
         found = self._evaluated()
@@ -220,7 +218,9 @@ class BrowsePanel:
         chosen = {"task": self._task, "level": self._level, "object": self._object, "texture": self._texture}
         fields = {name: field.value for name, field in chosen.items() if field.value != _ALL}
         fewest, most = (int(value) for value in self._steps.value)
-        query = DemonstrationQuery(**fields, min_steps=fewest, max_steps=None if most == _MOST_STEPS else most)
+        query = DemonstrationQuery(
+            **fields, min_steps=fewest, max_steps=None if most == _MOST_STEPS else most
+        )
         self._found = find_demonstrations(self._dataset, query)
         self._count.content = f"{len(self._found):,} of {len(self._dataset):,} found"
         self._number.max = max(1, len(self._found) - 1)
@@ -232,10 +232,9 @@ class BrowsePanel:
         number = int(self._number.value)
         if self._dataset is None or number >= len(self._found):
             self._demo, self._caption.content = None, ""
-            self._views.image = self._prompt.image = _NOTHING
+            self._views.image = _NOTHING
             return
         demo = self._demo = self._dataset[int(self._found[number])]
-        self._prompt.image = draw_prompt_strip(demo.prompt, width=_PROMPT_WIDTH)
         self._step.max = max(1, demo.num_steps)
         self._step.value = 0
         self._scrub()
@@ -252,7 +251,10 @@ class BrowsePanel:
             f"**{demo.task}**, {demo.level}, {demo.domain} seed {demo.seed}: "
             f"step {step} of {demo.num_steps}, {ended}"
         )
-        if demo.scenes:
+        if self.session.current is not None:
             self.session.close_episode()
+            self.session.changed()
+        self.session.show_prompt(demo.prompt)
+        if demo.scenes:
             joints = demo.joint_paths[step - 1][-1] if step and demo.joint_paths else HOME
             self.session.table.show(VideoFrame(demo.scenes[step], joints))

@@ -16,7 +16,7 @@ from openvima.errors import ConfigError, OpenVimaError
 from openvima.evaluation.config import DEFAULT_DEVICE
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout_policy
 from openvima.evaluation.session import EpisodeSession
-from openvima.scene import Action, Episode
+from openvima.scene import Action, Episode, RenderedPrompt
 from openvima.serving.config import is_loopback
 from openvima.serving.protocol import check_token
 from openvima.studio.table import CAMERA_M, LOOK_AT_M, Table, animate
@@ -123,6 +123,15 @@ class BrowserSession:
         self.pause()
         return self.submit(work)
 
+    def callback(self, work: Callable[[], object]) -> Callable[[viser.GuiEvent], None]:
+        """Return a callback for a field of viser: it interrupts, unless code has changed the field."""
+
+        def called(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.interrupt(work)
+
+        return called
+
     def pause(self) -> None:
         """End the animation or run that is going on."""
         self._running.set()
@@ -221,10 +230,13 @@ class BrowserSession:
         for function in self._changed:
             self._reported(function)
         if self.current is not None:
-            size = {"image_height": 2 * 64, "font_size": 2 * 19}  # twice as large as shown, to be sharp
-            self._prompt.image = draw_prompt_strip(
-                self.current.prompt, width=2 * _PROMPT_WIDTH, weights=self.prompt_weights, **size
-            )
+            self.show_prompt(self.current.prompt)
+
+    def show_prompt(self, prompt: RenderedPrompt) -> None:
+        """Show a prompt in its window."""
+        size = {"image_height": 2 * 64, "font_size": 2 * 19}  # twice as large as shown, to be sharp
+        weights = self.prompt_weights if self.current is not None else ()
+        self._prompt.image = draw_prompt_strip(prompt, width=2 * _PROMPT_WIDTH, weights=weights, **size)
 
     def warn(self, message: str) -> None:
         """Show a message over the page."""

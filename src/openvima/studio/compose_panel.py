@@ -48,12 +48,12 @@ class ComposePanel:
         with session.tabs.add_tab("Compose", viser.Icon.CUBE_PLUS):
             start = gui.add_button_group("", ("edit this episode", "new scene", "play"))
             self._edits = gui.add_checkbox("clicks select objects", True, hint="else they act, as in You")
-            self._edits.on_update(lambda _: session.submit(self._follow))
+            self._edits.on_update(session.callback(self._follow))
             with gui.add_folder("Object"):
                 self._add_object_fields(gui)
             with gui.add_form("Sentence") as sentence:
                 self._add_sentence_fields(gui)
-            sentence.on_submit(lambda _: session.interrupt(self._rewrite))
+            sentence.on_submit(session.callback(self._rewrite))
             with gui.add_folder("Picture for a {placeholder}", expand_by_default=False):
                 self._add_picture_fields(gui)
             with gui.add_folder("File", expand_by_default=False):
@@ -64,7 +64,7 @@ class ComposePanel:
         actions |= {"save": self._save, "load": self._load}
         actions |= {"Python": lambda: self._copy(python_code), "command": lambda: self._copy(shell_command)}
         for group in (start, file, copy):
-            group.on_click(lambda event: session.interrupt(actions[event.target.value]))
+            group.on_click(session.callback(lambda g=group: actions[g.value]()))
         session.client.scene.on_click()(self._clicked)
         session.on_change(self._follow)
 
@@ -77,12 +77,12 @@ class ComposePanel:
         self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
         self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
         for choice in (self._object, self._texture):
-            choice.on_update(lambda _: self.session.submit(self._draw_thumbnail))
+            choice.on_update(self._shape_changed)
         changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
-        change.on_click(lambda event: self.session.interrupt(changes[event.target.value]))
-        self._by_user(self._selected, self._show_selected)
-        self._by_user(self._pose, lambda: self._move(self._pose.value))
-        self._by_user(self._scale, lambda: self._change_selected(scale=self._scale.value))
+        change.on_click(self.session.callback(lambda: changes[change.value]()))
+        self._selected.on_update(self.session.callback(self._show_selected))
+        self._pose.on_update(self.session.callback(lambda: self._move(self._pose.value)))
+        self._scale.on_update(self.session.callback(lambda: self._change_selected(scale=self._scale.value)))
         self.session.submit(self._draw_thumbnail)
 
     def _add_sentence_fields(self, gui: viser.GuiApi) -> None:
@@ -90,18 +90,14 @@ class ComposePanel:
         self._goals = gui.add_text("goals", "", hint="[in, a, b], [at, a, [0.5, 0.1]], [rotated, a, 60]")
         self._tool = gui.add_dropdown("tool", END_EFFECTORS)
         self._steps = gui.add_number("steps", 10, min=1, max=1000, step=1)
-        gui.add_button("apply").on_click(lambda _: self.session.interrupt(self._rewrite))
+        gui.add_button("apply").on_click(self.session.callback(self._rewrite))
 
     def _add_picture_fields(self, gui: viser.GuiApi) -> None:
         self._slot = gui.add_text("placeholder", "c", hint="a name for the picture, without braces")
         kinds = gui.add_button_group("shows", ("shape above", "scene as it is"))
         upload = gui.add_upload_button("PNG file …", mime_type="image/png")
-        kinds.on_click(lambda _: self.session.interrupt(lambda: self._picture(kinds.value)))
-        upload.on_upload(lambda _: self.session.interrupt(lambda: self._upload(upload.value.content)))
-
-    def _by_user(self, field: Any, work: Callable[[], None]) -> None:  # Any: any field of viser
-        """Do work when a user changes a field, and not when the panel does."""
-        field.on_update(lambda event: event.client is not None and self.session.interrupt(work))
+        kinds.on_click(self.session.callback(lambda: self._picture(kinds.value)))
+        upload.on_upload(self.session.callback(lambda: self._upload(upload.value.content)))
 
     def _use(self, new: Composition, selected: str | None = None) -> None:
         """Put a composition in place of the present one; if it is impossible, nothing changes but a message.
@@ -205,8 +201,7 @@ class ComposePanel:
     def _play(self) -> None:
         self._present()
         self.session.back(0)
-        while not self.session.is_paused() and self.session.step():
-            pass
+        self.session.run()
 
     def _save(self) -> None:
         path = save_episode(self._present().episode(self.session.assets), self._path.value)
@@ -296,6 +291,9 @@ class ComposePanel:
         node = self.session.table.objects[placement.id]
         node.position = (x, y, placement.pose.z)
         node.wxyz = (math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))
+
+    def _shape_changed(self, _: viser.GuiEvent) -> None:
+        self.session.submit(self._draw_thumbnail)
 
     def _draw_thumbnail(self) -> None:
         self._thumbnail.image = draw_thumbnail(

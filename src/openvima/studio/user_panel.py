@@ -46,8 +46,8 @@ class UserPanel:
             self._turn = gui.add_slider("turn (degrees)", -180, 180, 5, 0)
             self._buttons = gui.add_button_group("", ("turn in place", "cancel", "undo"))
             self._record = gui.add_markdown("")
-        self._turn.on_update(lambda _: session.submit(self._preview))
-        self._buttons.on_click(lambda _: session.interrupt(self._press))
+        self._turn.on_update(session.callback(self._preview))
+        self._buttons.on_click(session.callback(self._press))
         session.client.scene.on_click()(self._clicked)
         session.on_change(self._show)
 
@@ -116,6 +116,8 @@ class UserPanel:
         for node in self._nodes:
             node.remove()
         self._nodes = []
+        if current is not None:
+            self._help.content = _HELP[current.scene.end_effector]
         if first is None or current is None:
             return
         scene = self.session.client.scene
@@ -124,6 +126,7 @@ class UserPanel:
             placement = current.scene[first.object_id]
             action = clicked_action(current.scene, first, first, turn_rad=math.radians(self._turn.value))
             pose = pose_after(placement.pose, action)
+            self._help.content = f"Picked {current.scene.describe(placement.id)}. Now click its **place**."
             self._nodes.append(self.session.table.add_ghost(_GHOST, placement, pose=pose, grow=1.05))
 
     def _forget(self) -> None:
@@ -141,7 +144,6 @@ class UserPanel:
             if self._draggable.get(object_id) is not node:
                 self._draggable[object_id] = node
                 node.on_drag()(partial(self._dragged, object_id))
-        self._help.content = _HELP[current.scene.end_effector]
         self._record.content = self._recording(current)
 
     def _recording(self, current: EpisodeSession) -> str:

@@ -1,0 +1,163 @@
+"""You, Compose and Browse in a real browser: clicks, scenes of one's own, failures played again."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openvima.data import Dataset
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.scene import Pose
+from openvima.tasks import sample_episode
+
+pytestmark = pytest.mark.slow
+
+TASKS = ("rotate", "visual_manipulation")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results")
+    evaluate(EvaluationConfig(("random",), TASKS, ("L1", "L2"), episodes=2, out=out))
+    return out
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("demonstrations") / "mine"
+
+
+@pytest.fixture(scope="module")
+def studio(browser: Any, open_studio: Callable, results: Path, recorded: Path) -> Any:
+    return open_studio(path=results, record=recorded)
+
+
+@pytest.fixture
+def page(studio: Any, open_page: Callable) -> Any:  # Any: of an optional package
+    opened = open_page(studio.url)
+    opened.raw.set_viewport_size({"width": 1200, "height": 800})  # so that the prompt covers no object
+    opened.wait_for("Success in % by task and level")  # which is opened last
+    return opened
+
+
+def newest(studio: Any) -> Any:
+    """Return the session of the browser that came last."""
+    return studio.sessions[max(studio.sessions)]
+
+
+def settle(session: Any) -> None:
+    session.submit(lambda: None).result()
+
+
+def click(page: Any, session: Any, position: tuple[float, float, float]) -> None:
+    """Click where a point of the world is in view."""
+    camera = session.client.camera
+    w, x, y, z = camera.wxyz.tolist()
+    seen = (Pose(tuple(camera.position.tolist()), (x, y, z, w)).inverse() @ Pose(position)).position
+    box = page.raw.locator("canvas").first.bounding_box()
+    scale = box["height"] / 2 / math.tan(camera.fov / 2) / seen[2]
+    left = box["x"] + box["width"] / 2 + scale * seen[0]
+    top = box["y"] + box["height"] / 2 + scale * seen[1]
+    page.raw.mouse.click(left, top)
+
+
+def wait_until(page: Any, condition: Callable[[], bool]) -> None:
+    for _ in range(300):
+        if condition():
+            return
+        page.raw.wait_for_timeout(100)
+    raise TimeoutError("the page did not come to what was asked of it")
+
+
+def test_clicks_solve_an_episode_and_the_success_is_recorded(page: Any, studio: Any, recorded: Path) -> None:
+    session = newest(studio)
+    session.submit(lambda: session.open(sample_episode("visual_manipulation", seed=3), None)).result()
+    (goal,) = session.current.episode.problem.goals
+    page.tab("You")
+    page.wait_for("What you solve without a policy is recorded")
+    click(page, session, session.current.scene[goal.object_id].pose.position)
+    page.wait_for("Now click its")
+    click(page, session, session.current.scene[goal.relative_to].pose.position)
+    page.wait_for("1 demonstration in")
+    assert session.current.outcome.success
+    assert Dataset(recorded)[0].seed == 3
+
+
+def test_nothing_of_an_evaluation_level_is_recorded(page: Any, studio: Any, recorded: Path) -> None:
+    session = newest(studio)
+    episode = sample_episode("visual_manipulation", level="L2", seed=3)
+    session.submit(lambda: session.open(episode, None)).result()
+    page.tab("You")
+    page.wait_for("is of level L2, which stays unseen")
+
+
+def test_a_scene_of_two_objects_is_composed_and_solved(page: Any, studio: Any, tmp_path: Path) -> None:
+    session = newest(studio)
+    page.tab("Compose")
+    page.press("new scene")
+    wait_until(page, lambda: session.editing)
+    settle(session)
+    prompt = session.current.episode.problem.prompt
+    assert prompt.text == "Put the {a} into the {b}."
+    block = session.current.scene.placements[0]
+    click(page, session, block.pose.position)
+    wait_until(page, lambda: page.raw.get_by_label("selected", exact=True).first.input_value() == "a")
+    page.raw.get_by_text("File", exact=True).click()
+    page.fill("file", str(tmp_path / "scene.yaml"))
+    page.press("save")
+    page.wait_for("Saved")
+    page.press("Python")
+    page.wait_for("openvima.compose(")
+    page.press("close")
+    page.raw.get_by_role("button", name="play", exact=True).last.click()
+    wait_until(page, lambda: session.current.outcome is not None)
+    assert session.current.outcome.success and not session.editing
+    actions = [step.action for step in session.current.steps]
+    from openvima import load_episode, play
+
+    again = play(load_episode(tmp_path / "scene.yaml"), "openvima-small")
+    assert again.outcome.success and list(again.actions) == actions
+
+
+def test_an_impossible_move_is_refused_and_shown(page: Any, studio: Any) -> None:
+    session = newest(studio)
+    page.tab("Compose")
+    page.press("new scene")
+    wait_until(page, lambda: session.editing)
+    settle(session)
+    block, bowl = session.current.scene.placements
+    click(page, session, block.pose.position)
+    wait_until(page, lambda: page.raw.get_by_label("selected", exact=True).first.input_value() == "a")
+    inputs = page.raw.get_by_text("x, y (m)").locator("xpath=../../..").locator("input")
+    inputs.nth(1).fill(f"{bowl.pose.y:.2f}")
+    inputs.nth(1).press("Enter")
+    page.wait_for("overlaps object")
+    assert session.current.scene.placements[0].pose == block.pose
+
+
+def test_a_failure_of_a_results_folder_is_played_again(page: Any, studio: Any) -> None:
+    session = newest(studio)
+    page.press("L2 0")
+    page.wait_for("rotate, L2")
+    page.press("live")
+    wait_until(page, lambda: session.current.episode.domain == "eval" and session.current.outcome is not None)
+    episode = session.current.episode
+    assert (episode.task, episode.level, episode.seed) == ("rotate", "L2", 0)
+    assert not session.current.outcome.success
+
+
+def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded: Path) -> None:
+    session = newest(studio)
+    page.tab("Browse")
+    page.fill("folder", str(recorded))
+    page.wait_for("1 of 1 found")
+    page.wait_for("step 0 of 1")
+    slider = page.raw.get_by_text("after step", exact=True).last.locator("xpath=../../..").locator("input")
+    slider.fill("1")
+    slider.press("Enter")
+    page.wait_for("step 1 of 1")
+    demo = Dataset(recorded)[0]
+    assert np.array_equal(session.table.shown.joints, demo.joint_paths[0][-1])
