@@ -65,7 +65,7 @@ def click(page: Any, session: Any, position: tuple[float, float, float]) -> None
 
 
 def wait_until(page: Any, condition: Callable[[], bool]) -> None:
-    for _ in range(300):
+    for _ in range(1200):
         if condition():
             return
         page.raw.wait_for_timeout(100)
