@@ -114,6 +114,7 @@ def test_a_scene_of_two_objects_is_composed_and_solved(page: Any, studio: Any, t
     page.press("close")
     page.raw.get_by_role("button", name="play", exact=True).last.click()
     wait_until(page, lambda: session.current.outcome is not None)
+    settle(session)
     assert session.current.outcome.success and not session.editing
     actions = [step.action for step in session.current.steps]
     from openvima import load_episode, play

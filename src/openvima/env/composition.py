@@ -4,17 +4,20 @@ import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any  # goals and images, in the forms of `compose`
 
+import numpy as np
 import yaml
 
 from openvima.brief import brief_repr
+from openvima.catalog import OBJECTS
 from openvima.catalog.geometry import Assets
 from openvima.env.composed_objects import FIELDS, SceneObject, scene_objects
 from openvima.env.composing import compose
 from openvima.env.episode_code import compose_values
 from openvima.errors import SceneError
-from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Episode
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, EndEffector, Episode, Placement, Pose
 
 _STEP_M, _EDGE_M = 0.05, 0.1  # of the positions that are tried for a new object
+_SHELF_X_M, _SHELF_STEP_M, _SHELF_OBJECT_M, _SHELF_COLUMNS = 0.82, 0.066, 0.055, 16
 _ROUND_M, _ROUND_DEG = 3, 1  # decimals of positions and headings
 
 
@@ -79,11 +82,24 @@ class Composition:
         names = ", ".join(each.name for each in self.objects)
         raise SceneError(f"there is no object {handle!r:.80}; the scene has {names}.")
 
-    def added(self, object_name: str, texture: str, assets: Assets) -> "Composition":
-        """Add an object at the free position that is nearest to the middle, under the next free letter.
+    def added(
+        self,
+        object_name: str,
+        texture: str,
+        assets: Assets,
+        *,
+        position: tuple[float, float] | None = None,
+    ) -> "Composition":
+        """Add an object under the next free letter.
+
+        Args:
+            object_name: Display name.
+            texture: Display name.
+            assets: Asset pack.
+            position: x, y in metres, rounded to millimetres; None: the free one nearest to the middle.
 
         Raises:
-            SceneError: No position is free.
+            SceneError: The position is not free, or none is.
             UnknownObjectError, UnknownTextureError: The catalogue has no such object or texture.
         """
         taken = {each.name for each in self.objects} | {*self.images}
@@ -92,10 +108,8 @@ class Composition:
             n for n in itertools.chain(letters, map("object{}".format, itertools.count())) if n not in taken
         )
         reason = SceneError("there is no room on the table.")
-        for position in _positions():
-            new = replace(
-                self, objects=(*self.objects, SceneObject(object_name, texture, position, name=name))
-            )
+        for place in _positions() if position is None else [_rounded(position)]:
+            new = replace(self, objects=(*self.objects, SceneObject(object_name, texture, place, name=name)))
             try:
                 replace(new, prompt="-", images={}, goals=()).episode(assets)
             except SceneError as error:
@@ -106,8 +120,7 @@ class Composition:
 
     def moved(self, handle: str, position: tuple[float, float], yaw_deg: float) -> "Composition":
         """Move an object to a position and heading, rounded to millimetres and tenths of a degree."""
-        x, y = (round(float(value), _ROUND_M) for value in position)
-        return self.changed(handle, position=(x, y), yaw_deg=round(float(yaw_deg), _ROUND_DEG))
+        return self.changed(handle, position=_rounded(position), yaw_deg=round(float(yaw_deg), _ROUND_DEG))
 
     def changed(self, handle: str, **fields: Any) -> "Composition":  # Any: fields of `SceneObject`
         """Change fields of an object.
@@ -150,6 +163,31 @@ def parse_goals(text: str) -> tuple[Any, ...]:  # Any: plain values; `compose` c
     if not isinstance(listed, list) or not all(isinstance(goal, list) for goal in listed):
         raise SceneError(f"the goals are {text!r:.80}; write them as [in, a, b], [rotated, a, 60].")
     return tuple(tuple(goal) for goal in listed)
+
+
+def shelf(texture: str, assets: Assets) -> list[Placement]:
+    """Return all objects of the catalogue in one texture, equally large, in rows before the table.
+
+    Args:
+        texture: Display name.
+        assets: Asset pack.
+    """
+    placements = []
+    for number, (name, spec) in enumerate(OBJECTS.items()):
+        row, column = divmod(number, _SHELF_COLUMNS)
+        y = _SHELF_STEP_M * (column - (_SHELF_COLUMNS - 1) / 2)
+        corners = assets.geometry(name, spec.size_max, (1.0, 1.0, 1.0)).visual.vertices.reshape(-1, 3)
+        factor = _SHELF_OBJECT_M / float(np.ptp(corners[:, :2], axis=0).max())
+        scale = (factor, factor, factor)
+        height_m = assets.geometry(name, spec.size_max, scale).rest_z_m
+        pose = Pose.planar(_SHELF_X_M + _SHELF_STEP_M * row, y, z=height_m)
+        placements.append(Placement(number, name, texture, spec.size_max, pose, scale=scale))
+    return placements
+
+
+def _rounded(position: tuple[float, float]) -> tuple[float, float]:
+    x, y = (round(float(value), _ROUND_M) for value in position)
+    return x, y
 
 
 def _positions() -> list[tuple[float, float]]:

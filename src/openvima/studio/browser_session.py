@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,8 @@ class BrowserSession:
         self._other_table: Table | None = None
         self._compat = config.env_config.compat
         self._changed: list[Callable[[], None]] = []
+        self._drags: list[Callable[[int, viser.SceneNodeDragEvent], None]] = []
+        self._bound: dict[int, viser.GlbHandle] = {}  # objects that can be dragged
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
         client.camera.position, client.camera.look_at = CAMERA_M, LOOK_AT_M
         self.gui.main_panel.dock_right()
@@ -107,6 +110,10 @@ class BrowserSession:
     def on_change(self, function: Callable[[], None]) -> None:
         """Call a function whenever the current episode or its state has changed."""
         self._changed.append(function)
+
+    def on_drag(self, function: Callable[[int, viser.SceneNodeDragEvent], None]) -> None:
+        """Call a function with id and event whenever an object on the table is dragged."""
+        self._drags.append(function)
 
     def submit(self, work: Callable[[], object]) -> "Future[None]":
         """Do work in this browser's thread; what it raises is shown, and the page lives on."""
@@ -227,10 +234,18 @@ class BrowserSession:
 
     def changed(self) -> None:
         """Tell the panels that the current episode has changed, and show the prompt."""
+        for object_id, node in self.table.objects.items():
+            if self._bound.get(object_id) is not node:
+                self._bound[object_id] = node
+                node.on_drag()(partial(self._dragged, object_id))
         for function in self._changed:
             self._reported(function)
         if self.current is not None:
             self.show_prompt(self.current.prompt)
+
+    def _dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
+        for function in self._drags:
+            function(object_id, event)
 
     def show_prompt(self, prompt: RenderedPrompt) -> None:
         """Show a prompt in its window."""

@@ -4,24 +4,22 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import viser
 
 from openvima.catalog import OBJECTS, TEXTURES
-from openvima.env.composition import Composition, parse_goals
+from openvima.env.composition import Composition, parse_goals, shelf
 from openvima.env.episode_code import python_code, shell_command
 from openvima.env.episode_file import load_episode, save_episode
 from openvima.env.photos import read_photo
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
-from openvima.render.rasteriser import Rasteriser
-from openvima.render.raycast import first_hit
-from openvima.render.thumbnails import draw_thumbnail
-from openvima.scene import END_EFFECTORS
+from openvima.scene import END_EFFECTORS, Placement, Pose
 from openvima.studio.browser_session import BrowserSession
+from openvima.studio.table import hit_of, move
 
 _GIZMO, _REFUSED = "/compose/gizmo", "/compose/refused"
 _GIZMO_M = 0.12
@@ -43,7 +41,7 @@ class ComposePanel:
         self._scene: Composition | None = None
         self._episode: EpisodeSession | None = None  # of the composition
         self._gizmo: viser.TransformControlsHandle | None = None
-        self._rasteriser = Rasteriser(session.assets)
+        self._shelf: list[viser.GlbHandle] = []
         gui = session.gui
         with session.tabs.add_tab("Compose", viser.Icon.CUBE_PLUS):
             start = gui.add_button_group("", ("edit this episode", "new scene", "play"))
@@ -66,24 +64,22 @@ class ComposePanel:
         for group in (start, file, copy):
             group.on_click(session.callback(lambda g=group: actions[g.value]()))
         session.client.scene.on_click()(self._clicked)
+        session.on_drag(self._object_dragged)
         session.on_change(self._follow)
 
     def _add_object_fields(self, gui: viser.GuiApi) -> None:
         self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
         self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
-        self._thumbnail = gui.add_image(np.full((1, 1, 4), 255, np.uint8))
         change = gui.add_button_group("", ("add", "replace", "remove"))
         self._selected = gui.add_dropdown("selected", [_NONE])
         self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
         self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
-        for choice in (self._object, self._texture):
-            choice.on_update(self._shape_changed)
+        self._texture.on_update(self.session.callback(self._show_shelf))
         changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
         change.on_click(self.session.callback(lambda: changes[change.value]()))
         self._selected.on_update(self.session.callback(self._show_selected))
         self._pose.on_update(self.session.callback(lambda: self._move(self._pose.value)))
         self._scale.on_update(self.session.callback(lambda: self._change_selected(scale=self._scale.value)))
-        self.session.submit(self._draw_thumbnail)
 
     def _add_sentence_fields(self, gui: viser.GuiApi) -> None:
         self._prompt = gui.add_text("prompt", "", hint="{a} shows object a; Enter applies")
@@ -138,8 +134,9 @@ class ComposePanel:
         assert self._scene is not None  # as begun
         return self._scene
 
-    def _add(self) -> None:
-        new = self._present().added(self._object.value, self._texture.value, self.session.assets)
+    def _add(self, name: str = "", position: tuple[float, float] | None = None) -> None:
+        name, texture = name or self._object.value, self._texture.value
+        new = self._present().added(name, texture, self.session.assets, position=position)
         self._use(new, new.objects[-1].name)
 
     def _replace(self) -> None:
@@ -200,6 +197,7 @@ class ComposePanel:
 
     def _play(self) -> None:
         self._present()
+        self._show(_NONE)
         self.session.back(0)
         self.session.run()
 
@@ -222,13 +220,13 @@ class ComposePanel:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self.session.editing:
-            self.session.submit(lambda: self._select(event.ray_origin, event.ray_direction))
+            self.session.submit(lambda: self._select(event))
 
-    def _select(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+    def _select(self, event: viser.SceneClickEvent) -> None:
         current, scene = self.session.current, self._scene
         if current is None or scene is None:
             return
-        hit = first_hit(current.scene, origin, direction, self.session.assets)
+        hit = hit_of(event, current.scene.placements, self.session.assets)
         ids = [placement.id for placement in current.scene.placements]
         self._show(scene.objects[ids.index(hit.object_id)].name if hit and hit.object_id in ids else _NONE)
 
@@ -237,8 +235,44 @@ class ComposePanel:
         current = self.session.current
         is_at_start = current is not None and current is self._episode and current.num_steps == 0
         self.session.editing = is_at_start and self._edits.value
-        if self._gizmo is not None:
-            self._gizmo.visible = self.session.editing
+        if self.session.editing and not self._shelf:
+            self._show_shelf()
+        for node in (*self._shelf, *([self._gizmo] if self._gizmo else ())):
+            node.visible = self.session.editing
+
+    def _show_shelf(self) -> None:
+        """Show the catalogue before the table, in the chosen texture, to be dragged from."""
+        for node in self._shelf:
+            node.remove()
+        self._shelf = []
+        for placement in shelf(self._texture.value, self.session.assets):
+            node = self.session.table.add_object(f"shelf/{placement.id}", placement)
+            node.on_drag()(partial(self._taken, placement))
+            self._shelf.append(node)
+
+    def _taken(self, placement: Placement, event: viser.SceneNodeDragEvent) -> None:
+        """Move an object out of the shelf, and add it where it is let go."""
+        hit = hit_of(event, (), self.session.assets)
+        if hit is None or event.phase == "start":
+            return
+        x, y, _ = hit.point
+        is_dropped = event.phase == "end"
+        move(event.target, placement.pose if is_dropped else Pose.planar(x, y, z=placement.pose.z))
+        if is_dropped:
+            self.session.interrupt(lambda: self._add(placement.object, (x, y)))
+
+    def _object_dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
+        """Move an object of the scene by dragging it."""
+        hit, scene, current = hit_of(event, (), self.session.assets), self._scene, self.session.current
+        if not self.session.editing or hit is None or scene is None or current is None:
+            return
+        ids = [placement.id for placement in current.scene.placements]
+        chosen = scene.objects[ids.index(object_id)]
+        pose = (hit.point[0], hit.point[1], chosen.yaw_deg)
+        if event.phase == "start":
+            self.session.submit(lambda: self._show(chosen.name))
+        else:
+            self._drag_to(pose, is_end=event.phase == "end")
 
     def _show(self, selected: str) -> None:
         """Select an object."""
@@ -275,7 +309,10 @@ class ComposePanel:
         yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         position = event.target.position
         pose = float(position[0]), float(position[1]), math.degrees(yaw_rad)
-        if event.phase == "end":
+        self._drag_to(pose, is_end=event.phase == "end")
+
+    def _drag_to(self, pose: tuple[float, float, float], *, is_end: bool) -> None:
+        if is_end:
             self.session.interrupt(lambda: self._move(pose))
         else:
             self.session.submit(lambda: self._preview(pose))
@@ -287,15 +324,5 @@ class ComposePanel:
         index = [each.name for each in scene.objects].index(self._selected.value)
         placement = current.scene.placements[index]
         x, y, yaw_deg = pose
-        half_rad = math.radians(yaw_deg) / 2
-        node = self.session.table.objects[placement.id]
-        node.position = (x, y, placement.pose.z)
-        node.wxyz = (math.cos(half_rad), 0.0, 0.0, math.sin(half_rad))
-
-    def _shape_changed(self, _: viser.GuiEvent) -> None:
-        self.session.submit(self._draw_thumbnail)
-
-    def _draw_thumbnail(self) -> None:
-        self._thumbnail.image = draw_thumbnail(
-            self._rasteriser, self._object.value, self._texture.value, "front"
-        )
+        moved = Pose.planar(x, y, math.radians(yaw_deg), z=placement.pose.z)
+        move(self.session.table.objects[placement.id], moved)

@@ -1,7 +1,7 @@
 """The table in 3D: meshes and textures of the asset pack, and the arm, as nodes of one browser's scene."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +11,7 @@ from openvima.catalog.geometry import Assets, TriangleMesh, Vector3
 from openvima.env.tabletop import FRAMES_PER_SECOND, VideoFrame
 from openvima.render.gltf import encode_glb
 from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
+from openvima.render.raycast import Hit, first_hit
 from openvima.scene import EndEffector, Placement, Pose, Scene
 from openvima.sim.arm_view import arm_parts
 from openvima.sim.ur5 import link_frames
@@ -53,7 +54,7 @@ class Table:
         """Show a scene and the arm; objects that are shown already are moved only."""
         self._show_objects(frame.scene)
         for node, pose in zip(self._links(frame.scene.end_effector), link_frames(frame.joints), strict=True):
-            _move(node, pose)
+            move(node, pose)
         self.shown = frame
 
     def remove(self) -> None:
@@ -93,7 +94,7 @@ class Table:
             cast_shadow=False,
             receive_shadow=False,
         )
-        _move(node, placement.pose if pose is None else pose)
+        move(node, placement.pose if pose is None else pose)
         return node
 
     def _show_objects(self, scene: Scene) -> None:
@@ -105,12 +106,16 @@ class Table:
                 del self._shapes[object_id]
         for object_id, placement in placements.items():
             if object_id not in self.objects:
-                shape = self._shapes[object_id] = self._shape(placement)
-                data = _object_glb(*shape)
-                self.objects[object_id] = self.scene_api.add_glb(
-                    f"{self.root}/objects/{object_id}", data, cast_shadow=False, receive_shadow=False
-                )
-            _move(self.objects[object_id], placement.pose)
+                self._shapes[object_id] = self._shape(placement)
+                self.objects[object_id] = self.add_object(f"objects/{object_id}", placement)
+            move(self.objects[object_id], placement.pose)
+
+    def add_object(self, name: str, placement: Placement) -> viser.GlbHandle:
+        """Add a node with an object, which need not be one of the scene."""
+        data = _object_glb(*self._shape(placement))
+        node = self.scene_api.add_glb(f"{self.root}/{name}", data, cast_shadow=False, receive_shadow=False)
+        move(node, placement.pose)
+        return node
 
     def _shape(self, placement: Placement) -> _Shape:
         return self.assets, placement.object, placement.texture, placement.size, placement.scale
@@ -155,7 +160,17 @@ def animate(tables: Mapping[Table, Sequence[VideoFrame]], *, speed: float, stops
             table.show(frames[-1])
 
 
-def _move(node: viser.SceneNodeHandle, pose: Pose) -> None:
+def hit_of(
+    event: viser.SceneClickEvent | viser.SceneNodeDragEvent, placements: Iterable[Placement], assets: Assets
+) -> Hit | None:
+    """Return what a click, or the end of a drag so far, points at; None: nothing."""
+    if isinstance(event, viser.SceneClickEvent):
+        return first_hit(placements, event.ray_origin, event.ray_direction, assets)
+    origin = event.client.camera.position
+    return first_hit(placements, origin.tolist(), np.subtract(event.end_position, origin).tolist(), assets)
+
+
+def move(node: viser.SceneNodeHandle, pose: Pose) -> None:
     """Pose a node; viser sends nothing where nothing changed."""
     x, y, z, w = pose.quaternion
     node.position, node.wxyz = pose.position, (w, x, y, z)

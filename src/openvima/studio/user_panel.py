@@ -1,18 +1,16 @@
 """*You*: act by clicks, and record own successes as demonstrations."""
 
 import math
-from collections.abc import Sequence
-from functools import partial
 
-import numpy as np
 import viser
 
 from openvima.data.user_demonstrations import check_recordable, record_demonstration
 from openvima.errors import DatasetError
 from openvima.evaluation.session import EpisodeSession
-from openvima.render.raycast import TABLE, Hit, first_hit
+from openvima.render.raycast import TABLE, Hit
 from openvima.scene import Action
 from openvima.studio.browser_session import BrowserSession
+from openvima.studio.table import hit_of
 from openvima.tasks.clicks import clicked_action, pose_after
 
 _GHOST, _START = "/you/ghost", "/you/start"
@@ -34,7 +32,6 @@ class UserPanel:
         self.session = session
         self._first: Hit | None = None
         self._grabbed: Hit | None = None
-        self._draggable: dict[int, viser.GlbHandle] = {}
         self._own: list[Action] = []  # actions of the user in the current episode
         self._episode: EpisodeSession | None = None
         self._recorded = ""  # what was said of it
@@ -49,11 +46,12 @@ class UserPanel:
         self._turn.on_update(session.callback(self._preview))
         self._buttons.on_click(session.callback(self._press))
         session.client.scene.on_click()(self._clicked)
+        session.on_drag(self._dragged)
         session.on_change(self._show)
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self._acts.value and not self.session.editing:
-            self.session.submit(lambda: self._click(event.ray_origin, event.ray_direction))
+            self.session.submit(lambda: self._click(event))
 
     def _dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Act from where an object was grabbed to where it is let go."""
@@ -61,26 +59,24 @@ class UserPanel:
             return
         if event.phase == "start":
             self._grabbed = Hit(object_id, event.start_position)
-        elif event.phase == "end" and self._grabbed is not None:
-            first, self._grabbed = self._grabbed, None
-            origin = self.session.client.camera.position.tolist()
-            direction = np.subtract(event.end_position, origin).tolist()
-            self.session.submit(lambda: self._drop(first, origin, direction))
+        elif event.phase == "end" and (first := self._grabbed) is not None:
+            self._grabbed = None
+            self.session.submit(lambda: self._drop(first, event))
 
-    def _drop(self, first: Hit, origin: Sequence[float], direction: Sequence[float]) -> None:
+    def _drop(self, first: Hit, event: viser.SceneNodeDragEvent) -> None:
         current = self.session.current
         if current is None or current.outcome is not None:
             return
         others = [p for p in current.scene.placements if p.id != first.object_id]
-        if (hit := first_hit(others, origin, direction, self.session.assets)) is not None:
+        if (hit := hit_of(event, others, self.session.assets)) is not None:
             self._act(first, hit)
 
-    def _click(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+    def _click(self, event: viser.SceneClickEvent) -> None:
         """Take the first click, or act with the second."""
         current = self.session.current
         if current is None or current.outcome is not None:
             return
-        hit = first_hit(current.scene, origin, direction, self.session.assets)
+        hit = hit_of(event, current.scene.placements, self.session.assets)
         if hit is None:
             return
         if self._first is not None:
@@ -140,10 +136,6 @@ class UserPanel:
         self._forget()
         if current is None:
             return
-        for object_id, node in self.session.table.objects.items():
-            if self._draggable.get(object_id) is not node:
-                self._draggable[object_id] = node
-                node.on_drag()(partial(self._dragged, object_id))
         self._record.content = self._recording(current)
 
     def _recording(self, current: EpisodeSession) -> str:
