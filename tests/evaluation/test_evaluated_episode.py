@@ -9,7 +9,7 @@ import pytest
 from openvima.env import EnvConfig
 from openvima.errors import DatasetError, PolicyError
 from openvima.evaluation import EvaluationConfig, Results, evaluate
-from openvima.evaluation.evaluated_episode import evaluated_episode, find_source
+from openvima.evaluation.evaluated_episode import evaluated_episode, find_source, success_rates
 from openvima.evaluation.rollout import play
 from openvima.policies.file_names import CHECKPOINTS_FOLDER
 
@@ -32,9 +32,12 @@ def test_an_episode_ends_again_as_it_did(evaluation: Path, policy: str) -> None:
     assert (episode.domain, episode.seed, episode.problem.prompt.images) == ("eval", 61, ())
     env = found.batch.env_config.make("rotate", "L1", domain="eval")
     assert found.actions is not None and len(found.actions) == found.outcome.steps
-    if policy == "oracle":
-        (again,) = play([env], [episode], found.load_policy())
-        assert replace(again, near_ties=found.outcome.near_ties) == found.outcome
+    policies = [found.recorded_policy(), *([found.load_policy()] if policy == "oracle" else [])]
+    for rollout_policy in policies * 2:  # it begins anew
+        (again,) = play([env], [episode], rollout_policy)
+        assert again == found.outcome
+    assert str(found).startswith("rotate, L1, seed 61: ")
+    assert success_rates(Results.read(evaluation), policy)["rotate"]["L1"] in (0.0, 0.5, 1.0)
 
 
 def test_unknown_episodes_are_named(evaluation: Path) -> None:
@@ -66,6 +69,7 @@ def test_without_the_policy_the_recorded_actions_remain(evaluation: Path, tmp_pa
     found = evaluated_episode(copy, "random", "rotate", "L1", 60, source="")
     with pytest.raises(PolicyError, match="name its run folder"):
         found.load_policy()
-    assert found.actions
+    assert found.actions is not None
     (copy / "actions.arrow").unlink()
-    assert evaluated_episode(copy, "random", "rotate", "L1", 60).actions is None
+    with pytest.raises(PolicyError, match="kept no actions"):
+        evaluated_episode(copy, "random", "rotate", "L1", 60).recorded_policy()

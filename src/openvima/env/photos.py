@@ -1,5 +1,6 @@
 """Photos of objects as prompt images: bounded reading of PNG files."""
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,14 @@ def read_photo(file: Path) -> PhotoImage:
         raise InputFileError(f"photo {str(file)!r} is all white; it must show an object on white.")
     rows, columns = np.flatnonzero(is_object.any(axis=-1)), np.flatnonzero(is_object.any(axis=0))
     return _fitted(Image.fromarray(pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]))
+
+
+def photo_from_bytes(content: bytes) -> PhotoImage:
+    """Read the content of a PNG file; see `read_photo`."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "photo.png")
+        file.write_bytes(content)
+        return read_photo(file)
 
 
 def _fitted(picture: Image.Image) -> PhotoImage:

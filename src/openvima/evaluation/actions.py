@@ -61,10 +61,11 @@ class ActionReplay:
     """A rollout policy that replays recorded actions; where none is left it gives an `OracleError`."""
 
     def __init__(self, actions: Sequence[np.ndarray]) -> None:
-        self._left = [iter(steps) for steps in actions]
+        self._actions, self._left = actions, [iter(steps) for steps in actions]
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
-        """Start: nothing is read from the environments."""
+        """Start with the first actions; nothing is read from the environments."""
+        self._left = [iter(steps) for steps in self._actions]
 
     def decide(self, observations: Sequence[Observation | None]) -> Sequence[Decision]:
         """Give the next recorded action of each episode that is not over."""

@@ -4,17 +4,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from openvima.brief import brief_repr
 from openvima.errors import DatasetError, OpenVimaError, PolicyError, unknown_name
 from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
-from openvima.evaluation.actions import ACTIONS_NAME, action_arrays, read_actions
+from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
 from openvima.evaluation.results import EpisodeOutcome, Results
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_rollout_policy
 from openvima.evaluation.sources import PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
 from openvima.policies.file_names import CHECKPOINTS_FOLDER
-from openvima.scene import Action, Episode
+from openvima.scene import Episode
 
 _SEED_DOMAIN = "eval"
 
@@ -26,14 +28,19 @@ class EvaluatedEpisode:
     Args:
         batch: Policy, task, level, seed and all settings that decide the episode.
         outcome: How it ended.
-        actions: The recorded actions; None if the evaluation kept none.
+        actions: The recorded actions, shape (steps, 12), float32; None if the evaluation kept none.
     """
 
     batch: Batch
     outcome: EpisodeOutcome
-    actions: tuple[Action, ...] | None = field(repr=False)
+    actions: np.ndarray | None = field(repr=False)
 
     __repr__ = brief_repr
+
+    def __str__(self) -> str:
+        ended = "solved" if self.outcome.success else f"not solved: {self.outcome.reason}"
+        steps = f"{self.outcome.steps} step{'s' * (self.outcome.steps != 1)}"
+        return f"{self.batch.task}, {self.batch.level}, seed {self.outcome.seed}: {ended} ({steps})"
 
     def sample(self) -> Episode:
         """Sample the episode."""
@@ -54,6 +61,25 @@ class EvaluatedEpisode:
             )
         PolicySource(self.batch.policy, self.batch.source, self.batch.trust_code).check()
         return load_rollout_policy(self.batch)
+
+    def recorded_policy(self) -> RolloutPolicy:
+        """Return what repeats the recorded actions, without the policy.
+
+        Raises:
+            PolicyError: The evaluation kept none.
+        """
+        if self.actions is None:
+            raise PolicyError("the evaluation kept no actions; name the policy's weights to play it again.")
+        return ActionReplay([self.actions])
+
+
+def success_rates(results: Results, policy: str, ablation: str = "") -> dict[str, dict[str, float]]:
+    """Return the success rate of a policy by task and level, from 0 to 1."""
+    rates: dict[str, dict[str, float]] = {}
+    for row in results.rows:
+        if (row.policy, row.ablation) == (policy, ablation):
+            rates.setdefault(row.task, {})[row.level] = row.rate
+    return rates
 
 
 def evaluated_episode(
@@ -151,9 +177,8 @@ def _runs_near(folder: Path) -> Iterator[Path]:
         yield from sorted(path.parent for path in place.glob(f"*/{CHECKPOINTS_FOLDER}"))
 
 
-def _actions(folder: Path, results: Results, row: int, place: int) -> tuple[Action, ...] | None:
+def _actions(folder: Path, results: Results, row: int, place: int) -> np.ndarray | None:
     folder = folder if folder.is_dir() else folder.parent
     if not (folder / ACTIONS_NAME).is_file():
         return None
-    steps = read_actions(folder, results.rows)[0][row][place]
-    return tuple(Action.from_arrays(action_arrays(step)) for step in steps)
+    return read_actions(folder, results.rows)[0][row][place]

@@ -12,13 +12,14 @@ from openvima.data.manifest import MANIFEST_NAME
 from openvima.data.query import DemonstrationQuery, find_demonstrations
 from openvima.env.tabletop import VideoFrame
 from openvima.errors import DatasetError, PolicyError
-from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode
-from openvima.evaluation.results import FILE_NAME, EpisodeOutcome, Results
+from openvima.evaluation.evaluated_episode import EvaluatedEpisode, evaluated_episode, success_rates
+from openvima.evaluation.results import FILE_NAME, Results
+from openvima.evaluation.rollout_policies import RolloutPolicy
 from openvima.render import channels_last
 from openvima.sim.ur5 import HOME
 from openvima.studio.browser_session import BrowserSession
 
-_ALL = "any"
+_ALL, _NONE = "any", "—"
 _MOST_STEPS = 20
 _MOST_LISTED = 500  # episodes of a cell in the list
 _NOTHING = np.full((1, 1, 3), 255, np.uint8)
@@ -54,11 +55,11 @@ class BrowsePanel:
             self._add_data_fields(gui)
 
     def _add_results_fields(self, gui: viser.GuiApi) -> None:
-        self._policy = gui.add_dropdown("policy", ["—"])
-        self._ablation = gui.add_dropdown("ablation", ["—"])
+        self._policy = gui.add_dropdown("policy", [_NONE])
+        self._ablation = gui.add_dropdown("ablation", [_NONE])
         self._matrix = gui.add_folder("Success in % by task and level")
         self._failures = gui.add_checkbox("failures only", True)
-        self._outcome = gui.add_dropdown("episode", ["—"])
+        self._outcome = gui.add_dropdown("episode", [_NONE])
         self._source = gui.add_text("weights", "", hint="run folder; empty: found by the hash of its weights")
         replay = gui.add_button_group("play again", ("live", "recorded actions"))
         self._reason = gui.add_markdown("")
@@ -106,63 +107,48 @@ class BrowsePanel:
             results = self._results[1]
             self._title.content = f"`{folder}`: {sum(row.episodes for row in results.rows):,} episodes"
             self._policy.options = results.policy_names()
-            self._ablation.options = list(dict.fromkeys(row.ablation or "—" for row in results.rows))
+            self._ablation.options = list(dict.fromkeys(row.ablation or _NONE for row in results.rows))
             self._show_matrix()
         if self._dataset is not None:
             self._title.content = f"`{folder}`: {len(self._dataset):,} demonstrations"
             self._task.options = [_ALL, *self._dataset.manifest["tasks"]]
             self._find()
 
-    def _rows_of_choice(self) -> dict[tuple[str, str], float]:
-        """Success rate by task and level, of the chosen policy and ablation."""
-        assert self._results is not None  # as opened
-        chosen = self._policy.value, self._ablation.value
-        rows = self._results[1].rows
-        return {(r.task, r.level): r.rate for r in rows if (r.policy, r.ablation or "—") == chosen}
-
     def _show_matrix(self) -> None:
         """Show a row of buttons for each task, one for each level."""
         for group in self._rows:
             group.remove()
-        rates, self._rows = self._rows_of_choice(), []
+        assert self._results is not None  # as opened
+        rates = success_rates(self._results[1], self._policy.value, self._chosen_ablation)
+        self._rows = []
         with self._matrix:
-            for task in dict.fromkeys(task for task, _ in rates):
-                levels = {
-                    f"{level} {100 * rate:.0f}": level for (t, level), rate in rates.items() if t == task
-                }
-                group = self.session.gui.add_button_group(task.replace("_", " "), list(levels))
-                chosen = partial(self._choose_cell, task, levels, group)
-                group.on_click(self.session.callback(chosen))
+            for task, by_level in rates.items():
+                levels = {f"{level} {100 * rate:.0f}": level for level, rate in by_level.items()}
+                group = self.session.gui.add_button_group(task.replace("_", " "), [*levels])
+                group.on_click(self.session.callback(partial(self._choose_cell, task, levels, group)))
                 self._rows.append(group)
         if rates:
-            self._cell = next(iter(rates))
-            self._show_cell()
+            task = next(iter(rates))
+            self._show_cell(task, next(iter(rates[task])))
 
     def _choose_cell(self, task: str, levels: dict[str, str], group: viser.GuiButtonGroupHandle) -> None:
-        self._cell = task, levels[group.value]
-        self._show_cell()
+        self._show_cell(task, levels[group.value])
 
-    def _show_cell(self) -> None:
-        """List the episodes of a cell."""
-        listed = [
-            f"{outcome.seed}: {'solved' if outcome.success else outcome.reason}"
-            for outcome in self._outcomes()
-            if not (outcome.success and self._failures.value)
-        ]
-        self._outcome.options = listed[:_MOST_LISTED] or ["—"]
-        task, level = self._cell
-        self._reason.content = f"**{task}, {level}**: {len(listed)} episodes" + (
-            " failed." if self._failures.value else "."
-        )
-
-    def _outcomes(self) -> tuple[EpisodeOutcome, ...]:
+    def _show_cell(self, task: str = "", level: str = "") -> None:
+        """List the episodes of a cell; by default of that in view."""
         assert self._results is not None  # as opened
-        row = self._results[1].row(self._policy.value, *self._cell, self._chosen_ablation)
-        return () if row is None else row.outcomes
+        task, level = self._cell = (task, level) if task else self._cell
+        row = self._results[1].row(self._policy.value, task, level, self._chosen_ablation)
+        outcomes = () if row is None else row.outcomes
+        kept = [o for o in outcomes if not (o.success and self._failures.value)]
+        listed = [f"{o.seed}: {'solved' if o.success else o.reason}" for o in kept[:_MOST_LISTED]]
+        self._outcome.options = listed or [_NONE]
+        failed = sum(not outcome.success for outcome in outcomes)
+        self._reason.content = f"**{task}, {level}**: {failed} of {len(outcomes)} episodes failed."
 
     @property
     def _chosen_ablation(self) -> str:
-        return "" if self._ablation.value == "—" else self._ablation.value
+        return "" if self._ablation.value == _NONE else self._ablation.value
 
     def _evaluated(self) -> EvaluatedEpisode:
         """Return the chosen episode.
@@ -184,33 +170,23 @@ class BrowsePanel:
         )
 
     def _replay(self) -> None:
-        """Play an episode again with its policy, or with its recorded actions where nobody has the policy."""
+        """Play an episode again, with its policy or with its actions where the policy is not found."""
         found = self._evaluated()
-        self._show_outcome(found)
         try:
             policy = found.load_policy()
         except PolicyError as error:
             self.session.warn(str(error))
-            self._replay_recorded()
-            return
-        self.session.open(found.sample(), policy, compat=found.batch.env_config.compat)
-        self.session.run()
+            policy = found.recorded_policy()
+        self._play(found, policy)
 
     def _replay_recorded(self) -> None:
         found = self._evaluated()
-        self._show_outcome(found)
-        if found.actions is None:
-            raise DatasetError("the evaluation kept no actions; name the policy's weights to play it again.")
-        self.session.open(found.sample(), None, compat=found.batch.env_config.compat)
-        for action in found.actions:
-            if self.session.is_paused() or not self.session.step(action):
-                return
+        self._play(found, found.recorded_policy())
 
-    def _show_outcome(self, found: EvaluatedEpisode) -> None:
-        outcome, batch = found.outcome, found.batch
-        ended = "solved" if outcome.success else f"not solved: {outcome.reason}"
-        steps = f"{outcome.steps} step{'s' * (outcome.steps != 1)}"
-        self._reason.content = f"**{batch.task}, {batch.level}, seed {batch.first_seed}**: {ended} ({steps})."
+    def _play(self, found: EvaluatedEpisode, policy: RolloutPolicy) -> None:
+        self._reason.content = f"**Recorded**: {found}."
+        self.session.open(found.sample(), policy, compat=found.batch.env_config.compat)
+        self.session.run()
 
     def _find(self) -> None:
         """Find the demonstrations that the fields ask for."""

@@ -1,20 +1,19 @@
 """*Compose*: a scene and a sentence of one's own, changed one thing at a time."""
 
+import contextlib
 import math
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import viser
 
 from openvima.catalog import OBJECTS, TEXTURES
-from openvima.env.composition import Composition, parse_goals, shelf
+from openvima.env.composition import Composition, shelf
 from openvima.env.episode_code import python_code, shell_command
 from openvima.env.episode_file import load_episode, save_episode
-from openvima.env.photos import read_photo
+from openvima.env.photos import photo_from_bytes
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
@@ -44,7 +43,8 @@ class ComposePanel:
         self._shelf: list[viser.GlbHandle] = []
         gui = session.gui
         with session.tabs.add_tab("Compose", viser.Icon.CUBE_PLUS):
-            start = gui.add_button_group("", ("edit this episode", "new scene", "play"))
+            actions = {"edit this episode": self._take_over, "new scene": self._begin, "play": self._play}
+            self._add_buttons("", actions)
             self._edits = gui.add_checkbox("clicks select objects", True, hint="else they act, as in You")
             self._edits.on_update(session.callback(self._follow))
             with gui.add_folder("Object"):
@@ -56,27 +56,28 @@ class ComposePanel:
                 self._add_picture_fields(gui)
             with gui.add_folder("File", expand_by_default=False):
                 self._path = gui.add_text("file", "scene.yaml")
-                file = gui.add_button_group("", ("save", "load"))
-                copy = gui.add_button_group("copy as", ("Python", "command"))
-        actions = {"edit this episode": self._take_over, "new scene": self._begin, "play": self._play}
-        actions |= {"save": self._save, "load": self._load}
-        actions |= {"Python": lambda: self._copy(python_code), "command": lambda: self._copy(shell_command)}
-        for group in (start, file, copy):
-            group.on_click(session.callback(lambda g=group: actions[g.value]()))
+                self._add_buttons("", {"save": self._save, "load": self._load})
+                written = {"Python": python_code, "command": shell_command}
+                self._add_buttons(
+                    "copy as", {kind: partial(self._copy, code) for kind, code in written.items()}
+                )
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._object_dragged)
         session.on_change(self._follow)
 
+    def _add_buttons(self, label: str, actions: Mapping[str, Callable[[], object]]) -> None:
+        group = self.session.gui.add_button_group(label, [*actions])
+        group.on_click(self.session.callback(lambda: actions[group.value]()))
+
     def _add_object_fields(self, gui: viser.GuiApi) -> None:
         self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
         self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
-        change = gui.add_button_group("", ("add", "replace", "remove"))
+        changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
+        self._add_buttons("", changes)
         self._selected = gui.add_dropdown("selected", [_NONE])
         self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
         self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
         self._texture.on_update(self.session.callback(self._show_shelf))
-        changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
-        change.on_click(self.session.callback(lambda: changes[change.value]()))
         self._selected.on_update(self.session.callback(self._show_selected))
         self._pose.on_update(self.session.callback(lambda: self._move(self._pose.value)))
         self._scale.on_update(self.session.callback(lambda: self._change_selected(scale=self._scale.value)))
@@ -90,10 +91,11 @@ class ComposePanel:
 
     def _add_picture_fields(self, gui: viser.GuiApi) -> None:
         self._slot = gui.add_text("placeholder", "c", hint="a name for the picture, without braces")
-        kinds = gui.add_button_group("shows", ("shape above", "scene as it is"))
+        shape = lambda: self._insert((self._object.value, self._texture.value))  # noqa: E731
+        scene = lambda: self._insert(self._present().scene_image())  # noqa: E731
+        self._add_buttons("shows", {"shape above": shape, "scene as it is": scene})
         upload = gui.add_upload_button("PNG file …", mime_type="image/png")
-        kinds.on_click(self.session.callback(lambda: self._picture(kinds.value)))
-        upload.on_upload(self.session.callback(lambda: self._upload(upload.value.content)))
+        upload.on_upload(self.session.callback(lambda: self._insert(photo_from_bytes(upload.value.content))))
 
     def _use(self, new: Composition, selected: str | None = None) -> None:
         """Put a composition in place of the present one; if it is impossible, nothing changes but a message.
@@ -104,8 +106,9 @@ class ComposePanel:
         try:
             episode = new.episode(self.session.assets)
         except OpenVimaError:
-            if self._scene is not None:
-                self._show(self._selected.value)  # what the fields said before
+            if self._scene is not None and self.session.current is not None:
+                self.session.table.show(self.session.current.frame())  # as before
+                self._show(self._selected.value)
             raise
         old, self._scene = self._scene, new
         self.session.open(episode, self.session.policy)
@@ -134,8 +137,10 @@ class ComposePanel:
         assert self._scene is not None  # as begun
         return self._scene
 
-    def _add(self, name: str = "", position: tuple[float, float] | None = None) -> None:
-        name, texture = name or self._object.value, self._texture.value
+    def _add(self) -> None:
+        self._drop(self._object.value, self._texture.value)
+
+    def _drop(self, name: str, texture: str, position: tuple[float, float] | None = None) -> None:
         new = self._present().added(name, texture, self.session.assets, position=position)
         self._use(new, new.objects[-1].name)
 
@@ -151,49 +156,27 @@ class ComposePanel:
     def _move(self, pose: Sequence[float]) -> None:
         """Move the selected object, or show in red where it cannot be."""
         x, y, yaw_deg = pose
-        name, scene = self._selected.value, self._present()
-        new = scene.moved(name, (x, y), yaw_deg)
+        name = self._selected.value
+        new = self._present().moved(name, (x, y), yaw_deg)
         try:
             self._use(new)
         except SceneError:
-            refused = replace(new, objects=(new[name],), prompt="-", images={}, goals=())
-            self._show_refused(refused)
+            with contextlib.suppress(SceneError):  # it is outside, which one sees
+                refused = new.alone(name, self.session.assets)
+                self.session.table.add_ghost(_REFUSED, refused, colour=_REFUSED_RGB, opacity=0.6, grow=1.02)
             raise
 
-    def _show_refused(self, scene: Composition) -> None:
-        try:
-            (placement,) = scene.episode(self.session.assets).problem.scene.placements
-        except SceneError:  # it is outside, which one sees
-            return
-        self.session.table.add_ghost(_REFUSED, placement, colour=_REFUSED_RGB, opacity=0.6, grow=1.02)
-
     def _rewrite(self) -> None:
-        new = replace(
-            self._present(),
-            prompt=self._prompt.value,
-            goals=parse_goals(self._goals.value),
-            max_steps=int(self._steps.value),
-            end_effector=self._tool.value,
-        )
-        used = {name: image for name, image in new.images.items() if f"{{{name}}}" in new.prompt}
-        self._use(replace(new, images=used))
-
-    def _picture(self, kind: str) -> None:
-        scene = self._present()
-        shape = (self._object.value, self._texture.value)
-        self._insert(shape if kind == "shape above" else scene.scene_image())
-
-    def _upload(self, content: bytes) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder, "photo.png")
-            file.write_bytes(content)
-            self._insert(read_photo(file))
+        prompt, goals = self._prompt.value, self._goals.value
+        limits: Any = {
+            "max_steps": int(self._steps.value),
+            "end_effector": self._tool.value,
+        }  # Any: of two kinds
+        self._use(self._present().rewritten(prompt, goals, **limits))
 
     def _insert(self, image: object) -> None:
-        """Show a picture at a placeholder, which is added to the prompt if it is not there."""
-        scene, slot = self._present(), self._slot.value.strip()
-        prompt = self._prompt.value if f"{{{slot}}}" in self._prompt.value else f"{scene.prompt} {{{slot}}}"
-        self._use(replace(scene, prompt=prompt, images={**scene.images, slot: image}))
+        scene = replace(self._present(), prompt=self._prompt.value)
+        self._use(scene.with_image(self._slot.value.strip(), image))
 
     def _play(self) -> None:
         self._present()
@@ -223,12 +206,16 @@ class ComposePanel:
             self.session.submit(lambda: self._select(event))
 
     def _select(self, event: viser.SceneClickEvent) -> None:
-        current, scene = self.session.current, self._scene
-        if current is None or scene is None:
-            return
-        hit = hit_of(event, current.scene.placements, self.session.assets)
-        ids = [placement.id for placement in current.scene.placements]
-        self._show(scene.objects[ids.index(hit.object_id)].name if hit and hit.object_id in ids else _NONE)
+        names = self._names()
+        if self.session.current is not None:
+            hit = hit_of(event, self.session.current.scene.placements, self.session.assets)
+            self._show(names.get(hit.object_id, _NONE) if hit else _NONE)
+
+    def _names(self) -> dict[int, str]:
+        """Handles of the objects by id: both are in one order."""
+        current = self._episode
+        placements = () if current is None else current.scene.placements
+        return {p.id: each.name for p, each in zip(placements, self._present().objects, strict=True)}
 
     def _follow(self) -> None:
         """Stop editing while the composition is played, or when another episode is in view."""
@@ -259,19 +246,18 @@ class ComposePanel:
         is_dropped = event.phase == "end"
         move(event.target, placement.pose if is_dropped else Pose.planar(x, y, z=placement.pose.z))
         if is_dropped:
-            self.session.interrupt(lambda: self._add(placement.object, (x, y)))
+            self.session.interrupt(lambda: self._drop(placement.object, placement.texture, (x, y)))
 
     def _object_dragged(self, object_id: int, event: viser.SceneNodeDragEvent) -> None:
         """Move an object of the scene by dragging it."""
-        hit, scene, current = hit_of(event, (), self.session.assets), self._scene, self.session.current
-        if not self.session.editing or hit is None or scene is None or current is None:
+        hit = hit_of(event, (), self.session.assets)
+        if not self.session.editing or hit is None:
             return
-        ids = [placement.id for placement in current.scene.placements]
-        chosen = scene.objects[ids.index(object_id)]
-        pose = (hit.point[0], hit.point[1], chosen.yaw_deg)
+        name = self._names()[object_id]
         if event.phase == "start":
-            self.session.submit(lambda: self._show(chosen.name))
+            self.session.submit(lambda: self._show(name))
         else:
+            pose = (*hit.point[:2], self._present()[name].yaw_deg)
             self._drag_to(pose, is_end=event.phase == "end")
 
     def _show(self, selected: str) -> None:
@@ -291,7 +277,6 @@ class ComposePanel:
             return
         chosen = self._scene[self._selected.value]
         (x, y), half_rad = chosen.position, math.radians(chosen.yaw_deg) / 2
-        self._object.value, self._texture.value = chosen.object, chosen.texture
         self._pose.value, self._scale.value = (x, y, chosen.yaw_deg), chosen.scale
         self._gizmo = self.session.client.scene.add_transform_controls(
             _GIZMO,
@@ -318,11 +303,8 @@ class ComposePanel:
             self.session.submit(lambda: self._preview(pose))
 
     def _preview(self, pose: tuple[float, float, float]) -> None:
-        scene, current = self._scene, self.session.current
-        if scene is None or current is None or current is not self._episode:
-            return
-        index = [each.name for each in scene.objects].index(self._selected.value)
-        placement = current.scene.placements[index]
-        x, y, yaw_deg = pose
-        moved = Pose.planar(x, y, math.radians(yaw_deg), z=placement.pose.z)
-        move(self.session.table.objects[placement.id], moved)
+        current, x, y, yaw_deg = self.session.current, *pose
+        for object_id, name in self._names().items():
+            if name == self._selected.value and current is not None and current is self._episode:
+                z = current.scene[object_id].pose.z
+                move(self.session.table.objects[object_id], Pose.planar(x, y, math.radians(yaw_deg), z=z))
