@@ -4,8 +4,9 @@ import pytest
 
 from openvima import compose
 from openvima.catalog import load_assets
+from openvima.data.user_demonstrations import check_recordable
 from openvima.env.composition import Composition, parse_goals
-from openvima.errors import SceneError, UnknownObjectError
+from openvima.errors import DatasetError, SceneError, UnknownObjectError
 from openvima.tasks import sample_episode
 
 ASSETS = load_assets("procedural")
@@ -57,6 +58,16 @@ def test_sampled_episodes_are_edited_too() -> None:
     scene = Composition.of(sample_episode("visual_manipulation", seed=4))
     (goal,) = scene.goals
     assert goal[0] == "in" and scene.removed(scene.objects[-1].name)
+
+
+def test_an_episode_that_is_held_out_stays_so_when_it_is_edited() -> None:
+    held_out = sample_episode("visual_manipulation", level="L3", seed=4, domain="eval")
+    scene = Composition.of(held_out).added("heart", "red", ASSETS)
+    edited = scene.episode(ASSETS)
+    assert (edited.task, edited.level, edited.domain) == ("composed", "L3", "eval")
+    assert Composition.of(edited).episode(ASSETS) == edited
+    with pytest.raises(DatasetError, match="of level L3, which stays unseen"):
+        check_recordable(edited)
 
 
 @pytest.mark.parametrize("text", ["in, a, b", "[in, a", "{a: b}", "!!python/name:os.system"])

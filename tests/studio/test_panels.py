@@ -141,7 +141,7 @@ def test_an_impossible_move_is_refused_and_shown(page: Any, studio: Any) -> None
 
 def test_a_failure_of_a_results_folder_is_played_again(page: Any, studio: Any) -> None:
     session = newest(studio)
-    page.press("L2 0")
+    page.raw.get_by_role("button", name="L2 0", exact=True).first.click()
     page.wait_for("rotate, L2")
     page.press("live")
     wait_until(page, lambda: session.current.episode.domain == "eval" and session.current.outcome is not None)

@@ -32,6 +32,8 @@ class Composition:
         goals: Goals by name, as for `compose`.
         max_steps: Step limit; None for that of `compose`.
         end_effector: "suction" or "spatula".
+        level: Level of the episode that it came from: what is held out stays so, however it is edited.
+        domain: Domain of the seed of that episode.
 
     Example:
         >>> scene = Composition.of(compose([("heart", "red", (0.5, 0.1))], "Turn the {a}."))
@@ -45,6 +47,8 @@ class Composition:
     goals: tuple[Any, ...] = ()
     max_steps: int | None = None
     end_effector: EndEffector = "suction"
+    level: str = "train"
+    domain: str = "user"
 
     __repr__ = brief_repr
 
@@ -57,7 +61,8 @@ class Composition:
         """
         values = compose_values(episode)
         objects = tuple(scene_objects(values.pop("objects")))
-        return Composition(objects, **{**values, "goals": tuple(values["goals"])})
+        values |= {"goals": tuple(values["goals"]), "level": episode.level, "domain": episode.domain}
+        return Composition(objects, **values)
 
     def episode(self, assets: Assets) -> Episode:
         """Compose the episode.
@@ -65,7 +70,7 @@ class Composition:
         Raises:
             SceneError, UnknownObjectError, UnknownTextureError: As for `compose`.
         """
-        return compose(
+        composed = compose(
             list(self.objects),
             self.prompt,
             images=self.images,
@@ -74,6 +79,7 @@ class Composition:
             end_effector=self.end_effector,
             assets=assets,
         )
+        return replace(composed, level=self.level, domain=self.domain)
 
     def __getitem__(self, handle: str) -> SceneObject:
         for each in self.objects:
