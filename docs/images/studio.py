@@ -7,6 +7,7 @@ import io
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from PIL import Image
@@ -69,7 +70,7 @@ def take(shot: Callable[[Page], None], url: str, browser) -> bytes:
 
 
 if __name__ == "__main__":
-    with Studio(StudioConfig()) as studio, launched_browser() as chromium:
+    with closing(Studio(StudioConfig())) as studio, launched_browser() as chromium:
         for name in sys.argv[1:] or SHOTS:
             target = Path(__file__).with_name(f"studio_{name}.png")
             target.write_bytes(take(SHOTS[name], studio.url, chromium))

@@ -3,7 +3,9 @@
 import logging
 import os
 import sys
+import threading
 import webbrowser
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -74,9 +76,9 @@ def main(
         token or os.environ.get(TOKEN_VARIABLE) or None,
     )
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    with Studio(config) as studio:
+    with closing(Studio(config)) as studio:
         print(studio.url, flush=True)
         if open:
             webbrowser.open(studio.url)
-        studio.wait()
+        threading.Event().wait()
     return 0

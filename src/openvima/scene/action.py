@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.errors import ActionError, echo
-from openvima.scene.pose import IDENTITY, Pose, Quaternion, normalised, yaw_quaternion
+from openvima.scene.pose import IDENTITY, Quaternion, normalised, yaw_quaternion
 from openvima.scene.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 
 ACTION_SHAPES = {
@@ -96,19 +96,6 @@ class Action:
     def yaw1_rad(self) -> float:
         """Tool heading at pose1, in radians; a zero quaternion counts as no rotation."""
         return _tool_yaw(self.pose1_rotation)
-
-    def placed(self, pose: Pose, place: tuple[float, float] | None = None) -> Pose:
-        """Return the pose of an object at `pose` after it was picked and placed, before it settles.
-
-        Args:
-            pose: Pose of the object before.
-            place: Where it is placed instead of at `pose1_position`.
-        """
-        yaw_rad = self.yaw1_rad - self.yaw0_rad
-        (x, y, z), (x0, y0), (x1, y1) = pose.position, self.pose0_position, place or self.pose1_position
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        dx, dy = cos * (x - x0) - sin * (y - y0), sin * (x - x0) + cos * (y - y0)
-        return Pose((x1 + dx, y1 + dy, z), pose.rotated(yaw_rad).quaternion)
 
 
 def _tool_yaw(quaternion: Quaternion) -> float:

@@ -2,7 +2,6 @@
 
 import hmac
 import socket
-import threading
 from urllib.parse import urlsplit
 
 import rich
@@ -23,7 +22,7 @@ PANELS = (PlayPanel, WhyPanel, ComposePanel, UserPanel, BrowsePanel)  # in the o
 
 
 class Studio:
-    """The server; a context manager.
+    """The server; `close` ends it.
 
     Args:
         config: Settings.
@@ -49,22 +48,12 @@ class Studio:
         host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
         return f"http://{host}:{self._server.get_port()}"
 
-    def wait(self) -> None:
-        """Serve until interrupted."""
-        threading.Event().wait()
-
     def close(self) -> None:
         """End all sessions and the server."""
         for session in [*self.sessions.values()]:
             session.close()
         self.sessions.clear()
         self._server.stop()
-
-    def __enter__(self) -> "Studio":
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self.close()
 
     def _connected(self, client: viser.ClientHandle) -> None:
         if not self._server.is_own_page(client.client_id, any_host=self.config.token is not None):

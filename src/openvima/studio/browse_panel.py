@@ -26,11 +26,7 @@ _NOTHING = np.full((1, 1, 3), 255, np.uint8)
 
 
 class BrowsePanel:
-    """The tab *Browse*.
-
-    Args:
-        session: The browser's session.
-    """
+    """The tab *Browse*."""
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
@@ -172,6 +168,7 @@ class BrowsePanel:
     def _replay(self) -> None:
         """Play an episode again, with its policy or with its actions where the policy is not found."""
         found = self._evaluated()
+        self.session.choose_assets(found.batch.env_config.assets)
         try:
             policy = found.load_policy()
         except PolicyError as error:

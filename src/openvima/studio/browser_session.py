@@ -13,13 +13,12 @@ import viser
 
 from openvima.catalog.packs import load_assets
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
-from openvima.errors import ConfigError, OpenVimaError
+from openvima.errors import OpenVimaError
 from openvima.evaluation.config import DEFAULT_DEVICE
 from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout_policy
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import Action, Episode, RenderedPrompt
-from openvima.serving.config import is_loopback
-from openvima.serving.protocol import check_token
+from openvima.serving.config import ServerConfig
 from openvima.studio.table import CAMERA_M, LOOK_AT_M, Table, animate
 from openvima.video.prompt_strip import Colour, draw_prompt_strip
 
@@ -59,14 +58,7 @@ class StudioConfig:
     token: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"port is {self.port}; give one from 0 to 65535, 0 for a free one.")
-        if self.token is None and not is_loopback(self.host):
-            raise ConfigError(
-                f"host is {self.host!r}, which other machines may reach; give a token with --token, or keep "
-                "127.0.0.1 and reach it through a tunnel: ssh -L PORT:127.0.0.1:PORT MACHINE."
-            )
-        check_token(self.token)
+        ServerConfig(self.host, self.port, self.token)  # checks them
 
 
 class BrowserSession:
@@ -149,11 +141,7 @@ class BrowserSession:
         return self._running.is_set()
 
     def load_policy(self, name: str) -> RolloutPolicy | None:
-        """Load a policy for this browser alone; `YOU` gives None.
-
-        Raises:
-            OpenVimaError: There is no such policy.
-        """
+        """Load a policy for this browser alone; `YOU` gives None."""
         if name == YOU:
             return None
         config = self.config

@@ -29,11 +29,7 @@ _NONE = "none"
 
 
 class ComposePanel:
-    """The tab *Compose*; the episode in view is the composition until another one is opened.
-
-    Args:
-        session: The browser's session.
-    """
+    """The tab *Compose*; the episode in view is the composition until another one is opened."""
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session

@@ -1,8 +1,5 @@
 """*Play*: choose an episode and a policy, and step through it."""
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 import viser
 
@@ -21,11 +18,7 @@ _OTHER = "other …"
 
 
 class PlayPanel:
-    """The tab *Play*.
-
-    Args:
-        session: The browser's session.
-    """
+    """The tab *Play*."""
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
@@ -52,15 +45,11 @@ class PlayPanel:
             (self._task, self._choose_task),
             (self._level, self._open),
             (self._seed, self._open),
-            (self._assets, self._choose_assets),
+            (self._assets, self._open),
             (self._name, self._choose_policy),
             (self._source, self._choose_policy),
         ):
-            choice.on_update(partial(self._chosen, work))
-
-    def _chosen(self, work: Callable[[], None], event: viser.GuiEvent) -> None:
-        if event.client is not None:  # by the user, not by this code
-            self.session.interrupt(work)
+            choice.on_update(self.session.callback(work))
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         session = self.session
@@ -68,27 +57,17 @@ class PlayPanel:
         self._time = gui.add_slider("after step", 0, 1, 1, 0)
         self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
 
-        @self._buttons.on_click
-        def _(_: viser.GuiEvent) -> None:
-            work = {"step": session.step, "play": session.run, "next seed": self._next_seed}
-            chosen = work.get(self._buttons.value)
-            session.pause() if chosen is None else session.interrupt(chosen)
-
-        self._time.on_update(partial(self._chosen, lambda: session.back(self._time.value)))
-
-        @self._speed.on_update
-        def _(_: viser.GuiEvent) -> None:
-            session.speed = self._speed.value
+        works = {"step": session.step, "play": session.run, "pause": session.pause}
+        works["next seed"] = self._next_seed
+        self._buttons.on_click(session.callback(lambda: works[self._buttons.value]()))
+        self._time.on_update(session.callback(lambda: session.back(self._time.value)))
+        self._speed.on_update(lambda _: setattr(session, "speed", self._speed.value))
 
     def _choose_task(self) -> None:
         levels = task_spec(self._task.value).levels
         level = self._level.value
         self._level.options = levels
         self._level.value = level if level in levels else levels[0]
-        self._open()
-
-    def _choose_assets(self) -> None:
-        self.session.choose_assets(self._assets.value)
         self._open()
 
     def _choose_policy(self) -> None:
@@ -99,6 +78,7 @@ class PlayPanel:
 
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
+        self.session.choose_assets(self._assets.value)
         config = self.session.config.env_config
         episode = sample_episode(
             self._task.value,

@@ -15,6 +15,7 @@ from openvima.render.raycast import Hit, first_hit
 from openvima.scene import EndEffector, Placement, Pose, Scene
 from openvima.sim.arm_view import arm_parts
 from openvima.sim.ur5 import link_frames
+from openvima.video.explanation import PLACE
 from openvima.video.prompt_strip import Colour
 
 CAMERA_M, LOOK_AT_M = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # near the axis of the front camera
@@ -67,20 +68,11 @@ class Table:
         placement: Placement,
         *,
         pose: Pose | None = None,
-        colour: Colour = (0, 104, 201),
+        colour: Colour = PLACE,
         opacity: float = 0.3,
         grow: float = 1.0,
     ) -> viser.MeshHandle:
-        """Add a translucent copy of an object.
-
-        Args:
-            name: Name of the node, below the table's root.
-            placement: The object.
-            pose: Where; by default where the object is.
-            colour: Its colour.
-            opacity: From 0 to 1.
-            grow: Factor on its size, such that it can cover the object.
-        """
+        """Add a translucent copy of an object, where it is or at a pose, below the table's root."""
         mesh = self.assets.geometry(placement.object, placement.size, placement.scale).visual
         centre = mesh.vertices.reshape(-1, 3).mean(axis=0)
         vertices = (mesh.vertices.reshape(-1, 3) - centre) * grow + centre
@@ -137,13 +129,7 @@ class Table:
 
 
 def animate(tables: Mapping[Table, Sequence[VideoFrame]], *, speed: float, stops: Callable[[], bool]) -> None:
-    """Show the frames of steps, 30 a second.
-
-    Args:
-        tables: Frames by table; all start at once.
-        speed: Factor on the speed of the arm.
-        stops: Asked before each frame; once it says so, the last frames are shown.
-    """
+    """Show the frames of steps by table, 30 a second times `speed`; the last at once if `stops` says so."""
     start = time.perf_counter()
     for number in range(max(map(len, tables.values()), default=0)):
         wait = start + number / (FRAMES_PER_SECOND * speed) - time.perf_counter()

@@ -22,11 +22,7 @@ _HELP = {
 
 
 class UserPanel:
-    """The tab *You*, and the clicks into the scene.
-
-    Args:
-        session: The browser's session.
-    """
+    """The tab *You*, and the clicks into the scene."""
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session

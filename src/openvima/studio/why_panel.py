@@ -1,5 +1,7 @@
 """*Why*: what the policy considers, on the table and below the prompt; two policies side by side."""
 
+from dataclasses import replace
+
 import numpy as np
 import viser
 
@@ -9,10 +11,10 @@ from openvima.scene import Action, Pose
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import Table
+from openvima.tasks.clicks import pose_after
 from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
 from openvima.video.prompt_strip import Colour
 
-_Point = tuple[float, float]
 _NOBODY = "nobody"
 _MAX_PLACES = 6  # ghosts shown at once
 _ARROW_Z_M = 0.09
@@ -20,11 +22,7 @@ _LABEL_Z_M = 0.08
 
 
 class WhyPanel:
-    """The tab *Why*.
-
-    Args:
-        session: The browser's session.
-    """
+    """The tab *Why*."""
 
     def __init__(self, session: BrowserSession) -> None:
         self.session = session
@@ -39,9 +37,9 @@ class WhyPanel:
             self._text = gui.add_markdown("")
             blank = np.full((1, 1, 3), 255, np.uint8)
             self._images = [gui.add_image(blank, visible=False) for _ in range(2)]
-        self._shown.on_update(lambda _: session.submit(session.changed))
-        self._temperature.on_update(lambda _: session.interrupt(self._choose_temperature))
-        self._other.on_update(lambda _: session.interrupt(self._choose_other))
+        self._shown.on_update(session.callback(session.changed))
+        self._temperature.on_update(session.callback(self._choose_temperature))
+        self._other.on_update(session.callback(self._choose_other))
         session.on_change(self._show)
 
     def _choose_temperature(self) -> None:
@@ -55,7 +53,7 @@ class WhyPanel:
     def _show(self) -> None:
         """Show what is considered at the step in view."""
         for node in self._nodes:
-            node.remove()
+            self.session.client.scene.remove_by_name(node.name)  # if it did not go with its object
         self._nodes.clear()
         self.session.prompt_weights = []
         lines, panels = [], []
@@ -70,16 +68,13 @@ class WhyPanel:
             if proposal.error is not None:
                 lines.append(f"**{name}**: {proposal.error}")
             if proposal.action is not None:
-                self._add_arrow(
-                    table, "action", proposal.action.pose0_position, proposal.action.pose1_position
-                )
+                self._add_arrow(table, "action", proposal.action)
             if proposal.explanation is not None:
                 self._explain(table, run, proposal.explanation)
                 lines.append(self._second_choice(table, run, proposal.explanation))
                 panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
-                self.session.prompt_weights = self.session.prompt_weights or attention_rows(
-                    proposal.explanation
-                )
+                rows = attention_rows(proposal.explanation)
+                self.session.prompt_weights = self.session.prompt_weights or rows
             elif proposal.action is not None:
                 lines.append(f"{name} explains nothing; the arrow is its action.")
         if len(runs) > 1:
@@ -96,17 +91,11 @@ class WhyPanel:
         for each in explanation.objects:
             placement = placements.get(each.object_id)
             if placement is not None and each.probability >= LEAST_SHOWN:
-                ghost = table.add_ghost(
-                    f"objects/{placement.id}/why",
-                    placement,
-                    pose=Pose((0.0, 0.0, 0.0)),
-                    colour=PICK,
-                    opacity=0.15 + 0.6 * each.probability,
-                    grow=1.04,
-                )
-                x, y, _ = placement.pose.position
-                self._nodes.append(ghost)
-                self._add_label(table, f"pick{placement.id}", percent(each.probability), (x, y))
+                style = {"colour": PICK, "opacity": 0.15 + 0.6 * each.probability, "grow": 1.04}
+                name = f"objects/{placement.id}/why"  # moves with the object
+                self._nodes.append(table.add_ghost(name, placement, pose=Pose((0.0, 0.0, 0.0)), **style))
+                xy = placement.pose.x, placement.pose.y
+                self._add_label(table, f"pick{placement.id}", percent(each.probability), xy)
         picked = max(explanation.objects, key=lambda each: each.probability, default=None)
         placement = placements.get(picked.object_id) if picked else None
         action = Action.from_arrays(explanation.action)
@@ -115,11 +104,10 @@ class WhyPanel:
                 break
             self._add_label(table, f"place{number}", percent(place.probability), place.position)
             if placement is not None and run.scene.end_effector == "suction":
-                pose = action.placed(placement.pose, place.position)
-                opacity = 0.12 + 0.4 * place.probability
-                self._nodes.append(
-                    table.add_ghost(f"why/{number}", placement, pose=pose, colour=PLACE, opacity=opacity)
-                )
+                moved = replace(action, pose1_position=place.position)
+                pose, opacity = pose_after(placement.pose, moved), 0.12 + 0.4 * place.probability
+                ghost = table.add_ghost(f"why/{number}", placement, pose=pose, opacity=opacity)
+                self._nodes.append(ghost)
 
     def _second_choice(self, table: Table, run: EpisodeSession, explanation: Explanation) -> str:
         """Say which action was the second most probable, and draw a thin arrow if its place is known."""
@@ -127,40 +115,24 @@ class WhyPanel:
         if choice is None or choice[-1] < LEAST_SHOWN:
             return "No other action has a probability of 1 %."
         picked, place, probability = choice
-        names = {p.id: f"{p.texture} {p.object}" for p in run.scene.placements}
-        said = (
-            f"Second most probable, {percent(probability)}: pick the {names.get(picked.object_id, 'object')}"
-        )
+        names = {p.id: f"the {p.texture} {p.object}" for p in run.scene.placements}
+        what = names.get(picked.object_id, "an object")
+        said = f"Second most probable, {percent(probability)}: pick {what}"
         if place is None:
             return f"{said}."
-        self._add_arrow(table, "second", picked.grasp, place.position, PLACE)
+        self._add_arrow(table, "second", Action.planar(picked.grasp, place.position), PLACE)
         return f"{said}, place it at ({place.position[0]:.2f}, {place.position[1]:.2f}) m: the blue arrow."
 
-    def _add_label(self, table: Table, name: str, text: str, position: _Point) -> None:
-        self._nodes.append(
-            self.session.client.scene.add_label(
-                f"{table.root}/why/label_{name}",
-                text,
-                position=(*position, _LABEL_Z_M),
-                anchor="bottom-center",
-                font_screen_scale=0.9,
-            )
-        )
+    def _add_label(self, table: Table, name: str, text: str, position: tuple[float, float]) -> None:
+        at, name = (*position, _LABEL_Z_M), f"{table.root}/why/label_{name}"
+        label = self.session.client.scene.add_label(name, text, position=at, anchor="bottom-center")
+        self._nodes.append(label)
 
-    def _add_arrow(
-        self, table: Table, name: str, start: _Point, end: _Point, colour: Colour = (255, 255, 255)
-    ) -> None:
-        points = [[(*point, _ARROW_Z_M) for point in (start, end)]]
-        self._nodes.append(
-            self.session.client.scene.add_arrows(
-                f"{table.root}/why/{name}",
-                np.array(points),
-                colour,
-                shaft_radius=0.004,
-                head_radius=0.012,
-                head_length=0.03,
-            )
-        )
+    def _add_arrow(self, table: Table, name: str, action: Action, colour: Colour = (255, 255, 255)) -> None:
+        points = [[(*point, _ARROW_Z_M) for point in (action.pose0_position, action.pose1_position)]]
+        size = {"shaft_radius": 0.004, "head_radius": 0.012, "head_length": 0.03}
+        scene = self.session.client.scene
+        self._nodes.append(scene.add_arrows(f"{table.root}/why/{name}", np.array(points), colour, **size))
 
     def _compared(self, one: EpisodeSession, other: EpisodeSession) -> str:
         """Mark the first step at which two policies differ, by an arrow on each table, and say it."""
@@ -168,6 +140,5 @@ class WhyPanel:
         if index is None:
             return "No difference so far."
         for table, run in self.session.runs():
-            action = run.steps[index].action
-            self._add_arrow(table, "difference", action.pose0_position, action.pose1_position, PICK)
+            self._add_arrow(table, "difference", run.steps[index].action, PICK)
         return f"The **first difference** is step {index + 1}: the orange arrows."
