@@ -1,8 +1,11 @@
 """Settings of a policy server."""
 
 import ipaddress
+import socket
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
+from urllib.parse import urlsplit
 
 from openvima.errors import ConfigError, unknown_name
 from openvima.serving.packing import MAX_LENGTH
@@ -85,3 +88,32 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def is_own_page(headers: Mapping[str, str], *, any_host: bool) -> bool:
+    """Whether a browser opens a WebSocket from a page of the same server.
+
+    Pages of other sites could open one to the loopback interface, or give a name of theirs its address.
+
+    Args:
+        headers: Of the request.
+        any_host: Whether the server may have names that do not mean this machine alone.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != host:
+        return False
+    return any_host or is_loopback(urlsplit(f"//{host}").hostname or "")
+
+
+def check_can_listen(host: str, port: int) -> None:
+    """Check that an address can be listened on, for servers that would try other ports or wait for ever.
+
+    Raises:
+        ConfigError: It is taken, or not one of this machine.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family):
+            pass
+    except OSError as error:
+        raise ConfigError(f"cannot listen on {host}, port {port}: {error}; choose another one.") from error

@@ -1,16 +1,13 @@
 """The studio's server: every browser gets a session of its own, with its own episodes and scene."""
 
 import hmac
-import socket
-from urllib.parse import urlsplit
 
 import rich
 import viser
 from viser.infra import ClientId
 
 from openvima.catalog.packs import load_assets
-from openvima.errors import ConfigError
-from openvima.serving.config import is_loopback
+from openvima.serving.config import check_can_listen, is_own_page
 from openvima.studio.browse_panel import BrowsePanel
 from openvima.studio.browser_session import BrowserSession, StudioConfig
 from openvima.studio.compose_panel import ComposePanel
@@ -34,7 +31,7 @@ class Studio:
     def __init__(self, config: StudioConfig) -> None:
         self.config = config
         load_assets(config.env_config.assets)  # fails now rather than in a browser
-        _check_free(config.host, config.port)
+        check_can_listen(config.host, config.port)
         rich.get_console().quiet = True  # viser prints addresses of its own
         self._server = _Server(config.host, config.port, label="openvima studio", verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -56,7 +53,7 @@ class Studio:
         self._server.stop()
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        if not self._server.is_own_page(client.client_id, any_host=self.config.token is not None):
+        if not self._server.serves(client.client_id, any_host=self.config.token is not None):
             client.add_notification("No entry", "Open the address that openvima studio printed.", color="red")
         elif self.config.token is None:
             self._begin(client)
@@ -92,29 +89,8 @@ class _Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> None:
         """Refuse: the studio stays on this machine."""
 
-    def is_own_page(self, client_id: int, *, any_host: bool) -> bool:
-        """Whether a connection comes from a page of this server.
-
-        Pages of other sites could open a WebSocket to the loopback interface, or give a name of theirs its
-        address; what they are shown are empty pages, since scene and panels are those of sessions.
-        """
+    def serves(self, client_id: int, *, any_host: bool) -> bool:
+        """Whether a browser has opened a page of this server; others see no scene and no panels."""
         connection = self._websock_server._live_connections.get(ClientId(client_id))
         request = None if connection is None else connection.request
-        if request is None:
-            return False
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            return False
-        return any_host or is_loopback(urlsplit(f"//{host}").hostname or "")
-
-
-def _check_free(host: str, port: int) -> None:
-    """Check that an address can be listened on: viser would try other ports, or wait for ever."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.create_server((host, port), family=family):
-            pass
-    except OSError as error:
-        raise ConfigError(
-            f"cannot listen on {host}:{port} ({error.strerror}); give another --host or --port."
-        ) from None
+        return request is not None and is_own_page(request.headers, any_host=any_host)

@@ -19,13 +19,12 @@ from openvima.evaluation.rollout_policies import RolloutPolicy, load_own_rollout
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import Action, Episode, RenderedPrompt
 from openvima.serving.config import ServerConfig
-from openvima.studio.table import CAMERA_M, LOOK_AT_M, Table, animate
+from openvima.studio.table import SECOND_TABLE_Y_M, VIEW, VIEW_OF_BOTH, Table, animate
 from openvima.video.prompt_strip import Colour, draw_prompt_strip
 
 _LOG = logging.getLogger(__name__)
 YOU = "you"  # the policy that is none: a user acts
 _PANEL_WIDTH, _PROMPT_WIDTH = 400, 560  # pixels
-_SECOND_TABLE_Y_M = 1.15  # beside the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +65,6 @@ class BrowserSession:
 
     Panels read `current`, the episode in view, and change it by `open`, `step` and `back`, inside of
     `submit`. Functions given to `on_change` are called, in that thread, whenever it has changed.
-
-    Args:
-        client: The browser.
-        config: Settings of the studio.
     """
 
     def __init__(self, client: viser.ClientHandle, config: StudioConfig) -> None:
@@ -90,7 +85,7 @@ class BrowserSession:
         self._drags: list[Callable[[int, viser.SceneNodeDragEvent], None]] = []
         self._bound: dict[int, viser.GlbHandle] = {}  # objects that can be dragged
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=f"browser-{client.client_id}")
-        client.camera.position, client.camera.look_at = CAMERA_M, LOOK_AT_M
+        client.camera.position, client.camera.look_at = VIEW
         self.gui.main_panel.dock_right()
         self.gui.main_panel.set_width(_PANEL_WIDTH)
         self.tabs = self.gui.add_tab_group()
@@ -144,10 +139,8 @@ class BrowserSession:
         """Load a policy for this browser alone; `YOU` gives None."""
         if name == YOU:
             return None
-        config = self.config
-        return load_own_rollout_policy(
-            name, device=config.device, trust_code=config.trust_code, temperature=self.temperature
-        )
+        options = {"device": self.config.device, "trust_code": self.config.trust_code}
+        return load_own_rollout_policy(name, temperature=self.temperature, **options)
 
     def choose_policy(self, name: str) -> None:
         """Let a policy decide from here on."""
@@ -171,21 +164,16 @@ class BrowserSession:
     def compare(self, policy: RolloutPolicy | None) -> None:
         """Show beside the current episode how another policy does it, from the start; None: nothing."""
         if (policy is None) != (self._other_policy is None):
-            middle = 0.0 if policy is None else _SECOND_TABLE_Y_M / 2
-            (x, _, z), (at_x, _, at_z) = CAMERA_M, LOOK_AT_M
-            back = 1.0 if policy is None else 1.42  # to have both in view
-            self.client.camera.position = (at_x + back * (x - at_x), middle, back * z)
-            self.client.camera.look_at = (at_x, middle, at_z)
+            camera = self.client.camera
+            camera.position, camera.look_at = VIEW if policy is None else VIEW_OF_BOTH
         self._other_policy = policy
         if self._other_table is not None:
             self._other_table.remove()
         self.compared = self._other_table = None
         if policy is not None and self.current is not None:
-            episode = self.current.episode
+            episode, scene = self.current.episode, self.client.scene
             self.compared = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
-            self._other_table = Table(
-                self.client.scene, self.assets, root="/second", offset_y_m=_SECOND_TABLE_Y_M
-            )
+            self._other_table = Table(scene, self.assets, root="/second", offset_y_m=SECOND_TABLE_Y_M)
         self.back(0)
 
     def step(self, action: Action | None = None) -> bool:

@@ -17,6 +17,7 @@ from openvima.env.photos import photo_from_bytes
 from openvima.errors import OpenVimaError, SceneError
 from openvima.evaluation.session import EpisodeSession
 from openvima.scene import END_EFFECTORS, Placement, Pose
+from openvima.scene.pose import quaternion_yaw
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of, move
 
@@ -286,10 +287,9 @@ class ComposePanel:
 
     def _dragged(self, event: viser.TransformControlsEvent) -> None:
         """Move the object with the gizmo, and compose the scene when it is let go."""
-        w, x, y, z = event.target.wxyz
-        yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        position = event.target.position
-        pose = float(position[0]), float(position[1]), math.degrees(yaw_rad)
+        w, *xyz = event.target.wxyz.tolist()
+        x, y, _ = event.target.position.tolist()
+        pose = x, y, math.degrees(quaternion_yaw((*xyz, w)))
         self._drag_to(pose, is_end=event.phase == "end")
 
     def _drag_to(self, pose: tuple[float, float, float], *, is_end: bool) -> None:

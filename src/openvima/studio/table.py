@@ -2,14 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import lru_cache
 
 import numpy as np
 import viser
 
-from openvima.catalog.geometry import Assets, TriangleMesh, Vector3
+from openvima.catalog.geometry import Assets
 from openvima.env.tabletop import FRAMES_PER_SECOND, VideoFrame
-from openvima.render.gltf import encode_glb
+from openvima.render.gltf import Shape, coloured_glb, object_glb
 from openvima.render.rasteriser import SHEET_RGB, SHEET_SIZE
 from openvima.render.raycast import Hit, first_hit
 from openvima.scene import EndEffector, Placement, Pose, Scene
@@ -18,10 +17,11 @@ from openvima.sim.ur5 import link_frames
 from openvima.video.explanation import PLACE
 from openvima.video.prompt_strip import Colour
 
-CAMERA_M, LOOK_AT_M = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # near the axis of the front camera
+SECOND_TABLE_Y_M = 1.15  # beside the first
+VIEW = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # camera and where it looks at; near that of the front camera
+VIEW_OF_BOTH = (1.59, SECOND_TABLE_Y_M / 2, 1.39), (0.4, SECOND_TABLE_Y_M / 2, 0.06)
 _LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
 _AMBIENT, _DIRECTIONAL = 1.2, 2.3  # such that colours are those of the front camera, by eye
-_Shape = tuple[Assets, str, str, Vector3, Vector3]  # whatever decides how an object is drawn
 
 
 class Table:
@@ -40,16 +40,15 @@ class Table:
         self.scene_api, self.assets, self.root = scene, assets, root
         self.objects: dict[int, viser.GlbHandle] = {}
         self.shown: VideoFrame | None = None
-        self._shapes: dict[int, _Shape] = {}
+        self._shapes: dict[int, Shape] = {}
         self._arm: tuple[EndEffector, list[viser.FrameHandle]] | None = None
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
         scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT)
         scene.add_light_directional("/lights/sun", intensity=_DIRECTIONAL, position=_LIGHT_M)
         self._node = scene.add_frame(root, show_axes=False, position=(0.0, offset_y_m, 0.0))
-        self.sheet = scene.add_box(
-            f"{root}/table", SHEET_RGB, (*SHEET_SIZE, 0.002), position=(0.5, 0.0, -0.0011)
-        )
+        size, position = (*SHEET_SIZE, 0.002), (0.5, 0.0, -0.0011)
+        scene.add_box(f"{root}/table", SHEET_RGB, size, position=position)
 
     def show(self, frame: VideoFrame) -> None:
         """Show a scene and the arm; objects that are shown already are moved only."""
@@ -104,12 +103,12 @@ class Table:
 
     def add_object(self, name: str, placement: Placement) -> viser.GlbHandle:
         """Add a node with an object, which need not be one of the scene."""
-        data = _object_glb(*self._shape(placement))
+        data = object_glb(*self._shape(placement))
         node = self.scene_api.add_glb(f"{self.root}/{name}", data, cast_shadow=False, receive_shadow=False)
         move(node, placement.pose)
         return node
 
-    def _shape(self, placement: Placement) -> _Shape:
+    def _shape(self, placement: Placement) -> Shape:
         return self.assets, placement.object, placement.texture, placement.size, placement.scale
 
     def _links(self, end_effector: EndEffector) -> list[viser.FrameHandle]:
@@ -120,10 +119,8 @@ class Table:
                 self.scene_api.add_frame(f"{self.root}/arm/{link}", show_axes=False) for link in range(8)
             ]
             for number, (link, rgb, mesh) in enumerate(arm_parts(end_effector)):
-                data = _part_glb(mesh, rgb)
-                self.scene_api.add_glb(
-                    f"{self.root}/arm/{link}/{number}", data, cast_shadow=False, receive_shadow=False
-                )
+                name = f"{self.root}/arm/{link}/{number}"
+                self.scene_api.add_glb(name, coloured_glb(mesh, rgb), cast_shadow=False, receive_shadow=False)
             self._arm = (end_effector, nodes)
         return self._arm[1]
 
@@ -160,13 +157,3 @@ def move(node: viser.SceneNodeHandle, pose: Pose) -> None:
     """Pose a node; viser sends nothing where nothing changed."""
     x, y, z, w = pose.quaternion
     node.position, node.wxyz = pose.position, (w, x, y, z)
-
-
-@lru_cache(maxsize=512)
-def _object_glb(assets: Assets, name: str, texture: str, size: Vector3, scale: Vector3) -> bytes:
-    return encode_glb(assets.geometry(name, size, scale).visual, assets.texture(texture))
-
-
-@lru_cache(maxsize=64)
-def _part_glb(mesh: TriangleMesh, rgb: Colour) -> bytes:
-    return encode_glb(mesh, np.array(rgb, np.uint8).reshape(1, 1, 3))
