@@ -4,7 +4,7 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -68,8 +68,8 @@ class BrowserSession:
     """
 
     def __init__(self, client: viser.ClientHandle, config: StudioConfig) -> None:
-        self.client, self.gui, self.config = client, client.gui, config
-        self.assets = load_assets(config.env_config.assets)
+        self.client, self.gui, self.config, self.env_config = client, client.gui, config, config.env_config
+        self.assets = load_assets(self.env_config.assets)
         self.table = Table(client.scene, self.assets)
         self.current: EpisodeSession | None = None
         self.compared: EpisodeSession | None = None  # the same episode by another policy, in lockstep
@@ -152,10 +152,11 @@ class BrowserSession:
     def choose_assets(self, name: str) -> None:
         """Use an asset pack for what is opened from here on."""
         self.assets = self.table.assets = load_assets(name)
+        self.env_config = replace(self.env_config, assets=name)
 
     def open(self, episode: Episode, policy: RolloutPolicy | None, *, compat: bool | None = None) -> None:
         """Start an episode, sampled or composed, and show it."""
-        self._compat = self.config.env_config.compat if compat is None else compat
+        self._compat = self.env_config.compat if compat is None else compat
         opened = EpisodeSession(episode, policy, assets=self.assets, compat=self._compat)
         self.close_episode()
         self.current = opened

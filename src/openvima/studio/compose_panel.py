@@ -193,7 +193,7 @@ class ComposePanel:
         current = self.session.current
         if current is None:
             return
-        text = written(current.episode, env_config=self.session.config.env_config)
+        text = written(current.episode, env_config=self.session.env_config)
         with self.session.gui.add_modal("Copy") as modal:
             self.session.gui.add_markdown(f"```\n{text}```")
             self.session.gui.add_button("close").on_click(lambda _: modal.close())

@@ -79,7 +79,7 @@ class PlayPanel:
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
         self.session.choose_assets(self._assets.value)
-        config = self.session.config.env_config
+        config = self.session.env_config
         episode = sample_episode(
             self._task.value,
             level=self._level.value,

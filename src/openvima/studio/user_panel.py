@@ -136,7 +136,7 @@ class UserPanel:
 
     def _recording(self, current: EpisodeSession) -> str:
         """Record a success that is all the user's own, and say what is recorded."""
-        folder, config = self.session.config.record, self.session.config.env_config
+        folder, config = self.session.config.record, self.session.env_config
         if folder is None:
             return "Start the studio with `--record-demonstrations DIR` to keep what you solve."
         try:
