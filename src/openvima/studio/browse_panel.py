@@ -168,7 +168,6 @@ class BrowsePanel:
     def _replay(self) -> None:
         """Play an episode again, with its policy or with its actions where the policy is not found."""
         found = self._evaluated()
-        self.session.choose_assets(found.batch.env_config.assets)
         try:
             policy = found.load_policy()
         except PolicyError as error:
@@ -182,6 +181,7 @@ class BrowsePanel:
 
     def _play(self, found: EvaluatedEpisode, policy: RolloutPolicy) -> None:
         self._reason.content = f"**Recorded**: {found}."
+        self.session.choose_assets(found.batch.env_config.assets)
         self.session.open(found.sample(), policy, compat=found.batch.env_config.compat)
         self.session.run()
 

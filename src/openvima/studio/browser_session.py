@@ -226,9 +226,10 @@ class BrowserSession:
 
     def show_prompt(self, prompt: RenderedPrompt) -> None:
         """Show a prompt in its window."""
-        size = {"image_height": 2 * 64, "font_size": 2 * 19}  # twice as large as shown, to be sharp
         weights = self.prompt_weights if self.current is not None else ()
-        self._prompt.image = draw_prompt_strip(prompt, width=2 * _PROMPT_WIDTH, weights=weights, **size)
+        self._prompt.image = draw_prompt_strip(  # twice as large as shown, to be sharp
+            prompt, width=2 * _PROMPT_WIDTH, image_height=128, font_size=38, weights=weights
+        )
 
     def warn(self, message: str) -> None:
         """Show a message over the page."""

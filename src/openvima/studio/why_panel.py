@@ -130,9 +130,15 @@ class WhyPanel:
 
     def _add_arrow(self, table: Table, name: str, action: Action, colour: Colour = (255, 255, 255)) -> None:
         points = [[(*point, _ARROW_Z_M) for point in (action.pose0_position, action.pose1_position)]]
-        size = {"shaft_radius": 0.004, "head_radius": 0.012, "head_length": 0.03}
-        scene = self.session.client.scene
-        self._nodes.append(scene.add_arrows(f"{table.root}/why/{name}", np.array(points), colour, **size))
+        arrow = self.session.client.scene.add_arrows(
+            f"{table.root}/why/{name}",
+            np.array(points),
+            colour,
+            shaft_radius=0.004,
+            head_radius=0.012,
+            head_length=0.03,
+        )
+        self._nodes.append(arrow)
 
     def _compared(self, one: EpisodeSession, other: EpisodeSession) -> str:
         """Mark the first step at which two policies differ, by an arrow on each table, and say it."""
