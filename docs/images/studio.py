@@ -49,12 +49,20 @@ def compare(page: Page) -> None:
     page.wait_for("first difference")
 
 
-SHOTS: dict[str, Callable[[Page], None]] = {"play": play, "why": why, "compare": compare}
+def compose(page: Page) -> None:
+    """A scene of one's own with the catalogue before the table."""
+    page.tab("Compose")
+    page.press("new scene")
+    page.raw.get_by_role("button", name="new scene").wait_for()
+
+
+SHOTS: dict[str, Callable[[Page], None]] = {"play": play, "why": why, "compare": compare, "compose": compose}
 
 
 def take(shot: Callable[[Page], None], url: str, browser) -> bytes:
     """Return a picture of a page after what `shot` does, with few colours."""
     page = Page(browser, url, width=1300, height=800)
+    page.raw.set_default_timeout(0)
     page.wait_for("0 steps of at most")
     page.raw.locator(".mantine-Notification-closeButton").first.click()  # of software rendering
     shot(page)
