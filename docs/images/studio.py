@@ -5,19 +5,27 @@ It drives the studio in the system's browser, as the tests do; playwright and Ch
 
 import io
 import sys
+import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import chdir, closing
 from pathlib import Path
 
 from PIL import Image
 
+from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.policies.bundled import SMALL
 from openvima.studio.app import Studio
 from openvima.studio.browser_session import StudioConfig
 from studio_page import Page, launched_browser
 
 SETTLED_S = 6.0  # until the camera and what was sent last are drawn, with software rendering
 NUM_COLOURS = 256
+HEART_PX = (542, 412)  # where the heart of `visual_manipulation`, seed 3, is in view
+RESULTS = "results"  # in a temporary folder
+EVALUATION = EvaluationConfig(
+    (SMALL,), ("follow_motion", "rotate", "twist"), ("L1", "L3", "L4"), 4, out=Path(RESULTS)
+)
 
 
 def play(page: Page) -> None:
@@ -56,7 +64,32 @@ def compose(page: Page) -> None:
     page.raw.get_by_role("button", name="new scene").wait_for()
 
 
-SHOTS: dict[str, Callable[[Page], None]] = {"play": play, "why": why, "compare": compare, "compose": compose}
+def you(page: Page) -> None:
+    """An object that was clicked, before its place is."""
+    page.choose("task", "visual_manipulation")
+    page.fill("seed", "3")
+    page.tab("You")
+    page.wait_for("Click an")
+    page.raw.wait_for_timeout(SETTLED_S * 1000)
+    page.raw.mouse.click(*HEART_PX)
+    page.wait_for("Now click its")
+
+
+def browse(page: Page) -> None:
+    """The evaluation of a policy, and its failures in one cell."""
+    page.tab("Browse")
+    page.fill("folder", RESULTS)
+    page.wait_for("episodes failed")
+
+
+SHOTS: dict[str, Callable[[Page], None]] = {
+    "play": play,
+    "why": why,
+    "compare": compare,
+    "compose": compose,
+    "you": you,
+    "browse": browse,
+}
 
 
 def take(shot: Callable[[Page], None], url: str, browser) -> bytes:
@@ -78,7 +111,15 @@ def take(shot: Callable[[Page], None], url: str, browser) -> bytes:
 
 
 if __name__ == "__main__":
-    with closing(Studio(StudioConfig())) as studio, launched_browser() as chromium:
+    here = Path(__file__).resolve()
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        chdir(scratch),
+        closing(Studio(StudioConfig())) as studio,
+        launched_browser() as chromium,
+    ):
         for name in sys.argv[1:] or SHOTS:
-            target = Path(__file__).with_name(f"studio_{name}.png")
-            target.write_bytes(take(SHOTS[name], studio.url, chromium))
+            if name == "browse":
+                evaluate(EVALUATION)
+            picture = take(SHOTS[name], studio.url, chromium)
+            here.with_name(f"studio_{name}.png").write_bytes(picture)
