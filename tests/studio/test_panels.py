@@ -156,7 +156,11 @@ def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded:
     page.fill("folder", str(recorded))
     page.wait_for("1 of 1 found")
     page.wait_for("step 0 of 1")
-    slider = page.raw.get_by_text("after step", exact=True).last.locator("xpath=../../..").locator("input")
+    slider = (
+        page.raw.get_by_text("after step", exact=True)
+        .last.locator("xpath=../../..")
+        .locator("input[type=text]")
+    )
     slider.fill("1")
     slider.press("Enter")
     page.wait_for("step 1 of 1")
