@@ -1,4 +1,4 @@
-"""Speed of contrastive pretraining by the recipe `small-2`, on one CPU core: rendering, and steps.
+"""Speed of contrastive pretraining by the recipe `small`, on one CPU core: rendering, and steps.
 
     python benchmarks/pretraining.py [--scenes N] [--batch K] [--rounds R] [--json FILE]
 
@@ -47,7 +47,7 @@ def augmented(pairs: Pairs, config: TrainingConfig) -> Pairs:
 
 def measure(num_scenes: int, batch: int, num_rounds: int) -> dict[str, float]:
     """Measure everything, in milliseconds."""
-    settings = {**recipe_settings("small-2"), "pretraining.batch_size": batch}
+    settings = {**recipe_settings("small"), "pretraining.batch_size": batch}
     config = TrainingConfig.of({**settings, "data": Path(), "out": Path()})
     augmentation = SceneAugmentation.of(config.pretraining, second_view=True)
 
@@ -69,7 +69,7 @@ def measure(num_scenes: int, batch: int, num_rounds: int) -> dict[str, float]:
     times: dict[str, list[float]] = {}
     stages = {}
     for width, kernel in ENCODERS:
-        sizes = with_variant(small(), {"attributes": True, "crop_width": width, "crop_kernel": kernel})
+        sizes = with_variant(small(), {"crop_width": width, "crop_kernel": kernel})
         stages[f"{width}_channels_kernel_{kernel}"] = ContrastivePretraining(
             build_network(sizes, seed=0), config.pretraining, 0, pairs, ONE_PROCESS, tokenizer.encode
         )

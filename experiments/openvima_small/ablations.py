@@ -87,7 +87,7 @@ def _within_prompts_only(config: PointerConfig) -> PointerConfig:
 
 
 def _probs_of_cloning() -> dict[str, Variant]:
-    """Leave out what `small-2` draws in behaviour cloning, one at a time, or add what it does not."""
+    """Leave out what the recipe draws in behaviour cloning, one at a time, or add what it does not."""
     return {
         "inverse-dynamics": Variant(
             "with inverse dynamics",
@@ -133,7 +133,14 @@ def _pretraining() -> dict[str, Variant]:
             ("grating_prob", "eared_prob", "ring_and_block_prob"),
         ),
     )
-    found = {"short-pretraining": Variant("own pretraining of 1,000 steps", settings=_SHORT_PRETRAINING)}
+    found = {
+        "short-pretraining": Variant("own pretraining of 1,000 steps", settings=_SHORT_PRETRAINING),
+        "wide-crops": Variant(
+            "the same with a wider crop encoder: 48 channels, kernel 3",
+            settings={**_SHORT_PRETRAINING, "model.crop_width": 48, "model.crop_kernel": 3},
+            baseline="short-pretraining",
+        ),
+    }
     for name, what, settings in parts:
         off = {f"pretraining.{setting}": 0.0 for setting in settings}
         found[f"no-{name}"] = Variant(
@@ -177,7 +184,7 @@ def main() -> int:
     parser.add_argument("--crops", required=True, help="run of the recipe after pretraining, or a checkpoint")
     parser.add_argument("--out", type=Path, required=True, help="folder of runs and results")
     parser.add_argument("--only", default=",".join(VARIANTS), help="variants, separated by commas")
-    parser.add_argument("--recipe", default="small-2", help="recipe that the variants differ from")
+    parser.add_argument("--recipe", default="small", help="recipe that the variants differ from")
     parser.add_argument("--seeds", default="0,1,2", help="seeds of weights, order and augmentation")
     parser.add_argument("--steps", type=int, default=1500, help="steps of behaviour cloning")
     parser.add_argument("--batch", type=int, default=64, help="demonstrations a step")

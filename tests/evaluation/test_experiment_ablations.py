@@ -20,9 +20,8 @@ EPISODES = 10
 
 def test_every_variant_differs_from_its_baseline_and_all_fit() -> None:
     def resolved(name: str) -> tuple:
-        config = TrainingConfig.of({**settings_of(name, "small-2"), "data": Path(), "out": Path()})
-        sizes = with_variant(small(), {"attributes": True})
-        return with_variant(VARIANTS[name].change(sizes), asdict(config.model)), config.identity()
+        config = TrainingConfig.of({**settings_of(name, "small"), "data": Path(), "out": Path()})
+        return with_variant(VARIANTS[name].change(small()), asdict(config.model)), config.identity()
 
     for name, variant in VARIANTS.items():
         assert policy_size(resolved(name)[0]).parameters.total < 10_000_000

@@ -208,11 +208,14 @@ def test_only_prompts_that_compare_by_attributes_name_them():
 
 def test_the_weight_needs_attributes_and_these_the_preset_small(tmp_path):
     settings = {"data": tmp_path, "out": tmp_path / "run", "preset": "small"}
-    with pytest.raises(ConfigError, match=r"set model\.attributes"):
-        resolved(TrainingConfig.of({**settings, "pretraining.attribute_loss_weight": 1}))
+    with pytest.raises(ConfigError, match=r"set model\.attributes, or"):
+        wanted = {"model.attributes": False, "pretraining.attribute_loss_weight": 1}
+        resolved(TrainingConfig.of({**settings, **wanted}))
+    with pytest.raises(ConfigError, match=r"set model\.attributes to False"):
+        resolved(TrainingConfig.of({**settings, "pretraining.attribute_loss_weight": 0}))
     with pytest.raises(ConfigError, match="preset small"):
         resolved(TrainingConfig.of({**settings, "preset": "nano", "model.attributes": True}))
-    resolved(TrainingConfig.of({**recipe_settings("small-2"), "data": tmp_path, "out": tmp_path / "run"}))
+    resolved(TrainingConfig.of({**recipe_settings("small"), "data": tmp_path, "out": tmp_path / "run"}))
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def test_the_small_policy_is_trained_by_one_command(trained) -> None:
     assert (first.pretraining.grayscale_prob, first.pretraining.occlusion_prob) == (0.3, 0.35)
     assert first.loader.batch_size == 128
     augmentation = first.augmentation
-    assert (augmentation.inverse_dynamics_prob, augmentation.rename_objects_prob) == (0.2, 0.3)
+    assert (augmentation.inverse_dynamics_prob, augmentation.rename_objects_prob) == (0.0, 0.3)
     assert (augmentation.shuffle_sentences_prob, augmentation.distractor_prob) == (0.3, 0.6)
 
 

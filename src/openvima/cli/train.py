@@ -25,10 +25,10 @@ The same command resumes an interrupted run from its last checkpoint.
 Example: openvima train --data demos --preset nano --out run
 
 --recipe selects default settings: "paper" (as in the VIMA paper), "workstation" (one GPU, less data), "nano"
-(minutes on a few cores), "small" (for a policy like the bundled openvima-small), "small-2" (its next
-version), "midas-pretrain", "midas-finetune" or "midas-in-context". The default is "small" for the preset of
-that name, "nano" for nano presets and your own learners, else "paper". --init-from disables the pretraining
-of recipe and file; set --pretraining.steps to pretrain anyway.
+(minutes on a few cores), "small" (the bundled openvima-small), "midas-pretrain", "midas-finetune" or
+"midas-in-context". The default is "small" for the preset of that name, "nano" for nano presets and your own
+learners, else "paper". --init-from disables the pretraining of recipe and file; set --pretraining.steps to
+pretrain anyway.
 --config takes a YAML file of settings, such as the config.yaml of another run. Options take precedence over
 the file, and the file over the recipe. The defaults below are those of the selected recipe and file.
 --trust-code lets the file name code that is run, such as a learner or detector of your own.

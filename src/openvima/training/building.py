@@ -87,14 +87,20 @@ def resolved(config: TrainingConfig) -> TrainingConfig:
             f"tokens {image_tokens(sizes)!r} has no appearance embedding to pretrain; leave it out, or set "
             "it to 0."
         )
-    if config.pretraining.attribute_loss_weight and not config.model.attributes:
-        raise ConfigError(
-            f"pretraining.attribute_loss_weight is {config.pretraining.attribute_loss_weight:g}, but the "
-            "network compares no attributes; set model.attributes, or leave the weight out."
-        )
     if config.pretraining.steps is None:
         steps = PRETRAINING_STEPS if has_appearance and not config.init_from else 0
-        return replace(config, pretraining=replace(config.pretraining, steps=steps))
+        config = replace(config, pretraining=replace(config.pretraining, steps=steps))
+    attributes, weight = getattr(sizes, "attributes", None), config.pretraining.attribute_loss_weight
+    if weight and not attributes:
+        raise ConfigError(
+            f"pretraining.attribute_loss_weight is {weight:g}, but the network compares no attributes; set "
+            "model.attributes, or leave the weight out."
+        )
+    if attributes and config.pretraining.steps and not weight:
+        raise ConfigError(
+            "pretraining.attribute_loss_weight is 0, so the network's attributes would stay random; give a "
+            "weight such as 0.5, or set model.attributes to False."
+        )
     return config
 
 

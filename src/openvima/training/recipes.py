@@ -29,7 +29,7 @@ _PAPER: Mapping[str, Any] = {
 }
 # MIDAS, Li et al. 2023: learning rates and batch sizes are not published, so they are VIMA's.
 _MIDAS: Mapping[str, Any] = {**_PAPER, "preset": "midas-92m"}
-# For a policy like the bundled openvima-small; its history is in docs/training.md.
+# The bundled openvima-small; docs/training.md has its history.
 _SMALL: Mapping[str, Any] = {
     "preset": "small",
     "pretraining.steps": 4000,
@@ -39,14 +39,22 @@ _SMALL: Mapping[str, Any] = {
     "pretraining.box_jitter_px": 1.0,
     "pretraining.grayscale_prob": 0.3,
     "pretraining.occlusion_prob": 0.35,
+    "pretraining.attribute_loss_weight": 0.5,
+    "pretraining.grating_prob": 0.4,
+    "pretraining.eared_prob": 0.3,
+    "pretraining.ring_and_block_prob": 0.3,
     "schedule.steps": 3100,
     "loader.batch_size": 128,
+    "loader.rerendered_prob": 0.4,
     "optimizer.learning_rate": 4e-4,
     "schedule.warmup_steps": 100,
-    "augmentation.inverse_dynamics_prob": 0.2,
-    "augmentation.drop_unused_objects_prob": 0.35,
+    "augmentation.text_description_prob": 0.4,
+    "augmentation.synonym_prob": 0.3,
+    "augmentation.paraphrase_prob": 0.4,
+    "augmentation.unknown_word_prob": 0.05,
     "augmentation.rename_objects_prob": 0.3,
     "augmentation.shuffle_sentences_prob": 0.3,
+    "augmentation.shuffle_prompt_objects_prob": 1.0,
     "augmentation.distractor_prob": 0.6,
     "loader.validation_fraction": 0.02,
     "loader.validation_episodes": 500,
@@ -91,26 +99,6 @@ RECIPES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         # A few cores and a few thousand demonstrations: minutes.
         "nano": {},
         "small": _SMALL,
-        # Its next version; not trained at full length yet.
-        "small-2": {
-            **_SMALL,
-            "model.attributes": True,
-            "model.crop_kernel": 1,
-            "model.crop_width": 32,
-            "model.num_layers": 3,
-            "pretraining.attribute_loss_weight": 0.5,
-            "pretraining.grating_prob": 0.4,
-            "pretraining.eared_prob": 0.3,
-            "pretraining.ring_and_block_prob": 0.3,
-            "loader.rerendered_prob": 0.4,
-            "augmentation.inverse_dynamics_prob": 0.0,
-            "augmentation.drop_unused_objects_prob": 0.0,
-            "augmentation.text_description_prob": 0.4,
-            "augmentation.synonym_prob": 0.3,
-            "augmentation.paraphrase_prob": 0.4,
-            "augmentation.unknown_word_prob": 0.05,
-            "augmentation.shuffle_prompt_objects_prob": 1.0,
-        },
     }
 )
 

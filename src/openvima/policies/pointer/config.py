@@ -165,10 +165,10 @@ def nano() -> PointerConfig:
 
 
 def small() -> PointerConfig:
-    """8.6 M parameters: place candidates, correspondence between images, coreference in the prompt."""
+    """7.3 M parameters: place candidates, correspondence, coreference in the prompt, attributes."""
     text = TextEncoderConfig(width=192, num_layers=3, num_heads=6, head_width=32, hidden_width=384)
     images = ObjectEncoderConfig(
-        ConvConfig(width=48, output_width=192, place_channels=32),
+        ConvConfig(width=32, output_width=192, place_channels=32, last_kernel=1),
         box_width=64,
         width=192,
         fuse_views=True,
@@ -179,8 +179,9 @@ def small() -> PointerConfig:
     return PointerConfig(
         images,
         PromptEncoderConfig(text, image_width=192, vocabulary_size=VOCABULARY_SIZE),
-        DecoderConfig(width=192, num_layers=4, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
+        DecoderConfig(width=192, num_layers=3, num_self_heads=6, num_cross_heads=6, initial_std=0.05),
         CandidateHeadConfig(),
         correspondence=CorrespondenceConfig(),
         coreference=True,
+        attributes=AttributeConfig(),
     )
