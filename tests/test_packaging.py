@@ -15,6 +15,10 @@ POLICY_FILES = {
     "tokenizer/vocabulary.json",
     "MODEL_CARD.md",
     "training_data.json",
+    *(
+        f"training/{name}"
+        for name in ("config.yaml", "metrics.jsonl", "sessions_log.jsonl", "timings_log.jsonl")
+    ),
 }
 TRAINED = {
     *(f"openvima/detector/trained/{name}" for name in ("model.safetensors", "config.yaml")),
