@@ -5,13 +5,13 @@ import math
 import viser
 
 from openvima.data.user_demonstrations import check_recordable, record_demonstration
+from openvima.env.clicks import clicked_action, pose_after
 from openvima.errors import DatasetError
 from openvima.evaluation.session import EpisodeSession
 from openvima.render.raycast import TABLE, Hit
 from openvima.scene import Action
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of
-from openvima.tasks.clicks import clicked_action, pose_after
 
 _GHOST, _START = "/you/ghost", "/you/start"
 _START_RGB, _START_M = (220, 120, 0), 0.008

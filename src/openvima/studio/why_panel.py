@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import viser
 
+from openvima.env.clicks import pose_after
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies.bundled import SMALL
 from openvima.scene import Action, Pose
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import Table
-from openvima.tasks.clicks import pose_after
 from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
 from openvima.video.prompt_strip import Colour
 

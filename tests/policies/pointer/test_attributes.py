@@ -128,9 +128,10 @@ def test_hidden_views_do_not_matter():
     torch.testing.assert_close(attributes(features, boxes, masks).norm(dim=-1), torch.ones(3, 6).double())
 
 
-def test_the_preset_has_none_and_with_them_stays_small():
-    assert preset("small").attributes is None
-    assert policy_size(with_attributes(preset("small"))).parameters.trainable < 10e6
+def test_the_preset_has_them_and_is_small():
+    assert preset("small").attributes == AttributeConfig()
+    assert policy_size(preset("small")).parameters.trainable < 10e6
+    assert with_attributes(preset("small"), False).attributes is None
     with pytest.raises(ConfigError, match="preset small"):
         with_attributes(preset("nano"))
     with pytest.raises(ConfigError, match="place candidates"):
