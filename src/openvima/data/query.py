@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from openvima.catalog import LEVELS, OBJECTS, TEXTURES
 from openvima.data.reader import Dataset
@@ -67,7 +66,7 @@ def find_demonstrations(dataset: Dataset, query: DemonstrationQuery) -> np.ndarr
         chosen &= steps <= query.max_steps
     for field in ("task", "level"):
         if value := getattr(query, field):
-            chosen &= pc.equal(index.column(field), value).to_numpy()
+            chosen &= index.column(field).to_numpy() == value
     found = np.flatnonzero(chosen)
     return _showing(dataset, found, query) if query.object or query.texture else found
 
@@ -84,7 +83,7 @@ def _showing(dataset: Dataset, candidates: np.ndarray, query: DemonstrationQuery
         fits = np.ones(len(objects), bool)
         for field in ("object", "texture"):
             if value := getattr(query, field):
-                fits &= pc.equal(objects.field(field), value).to_numpy(zero_copy_only=False)
+                fits &= objects.field(field).to_numpy(zero_copy_only=False) == value
         owners = np.repeat(np.arange(len(lists)), lists.value_lengths().to_numpy())
         showing = set(owners[fits].tolist())
         kept += [index for index, row in members if row in showing]

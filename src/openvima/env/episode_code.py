@@ -193,7 +193,7 @@ def _goal(goal: object, episode: Episode, handles: Mapping[int, str], number: in
     """A goal by name."""
     scene = episode.problem.scene
     object_id, relative_to = getattr(goal, "object_id", None), getattr(goal, "relative_to", None)
-    if object_id not in handles or not hasattr(goal, "relative_to"):
+    if object_id is None or object_id not in handles or not hasattr(goal, "relative_to"):
         raise SceneError(f"goal {number} is a {type(goal).__name__}, which has no composed form.")
     if not isinstance(goal, AtPose):
         if relative_to is None:

@@ -14,7 +14,7 @@ from openvima.serving.packing import unpack
 from openvima.serving.protocol import PROTOCOL, TOKEN_VARIABLE, check_address, check_protocol, type_of
 
 if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
+    from websockets.sync.connection import Connection as Socket
 
 CONNECT_S = 10.0
 CLOSE_S = 2.0
@@ -143,7 +143,7 @@ class Connection:
 
 
 @contextmanager
-def _opened(url: str, token: str | None, timeout_s: float) -> "Iterator[ClientConnection]":
+def _opened(url: str, token: str | None, timeout_s: float) -> "Iterator[Socket]":
     from websockets.exceptions import InvalidStatus, WebSocketException
     from websockets.sync.client import connect
 
