@@ -13,6 +13,7 @@ import os
 import re
 import shlex
 import socket
+import stat
 import sys
 import threading
 import time
@@ -164,8 +165,10 @@ def _release(path: Path, own: Owner, descriptor: int) -> None:
 def _locked_file(path: Path, part: Part) -> tuple[int, bool | None]:
     """Open a lock file and lock a part of it, as `_lock` does."""
     while True:
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise StorageError(f"{path} is no regular file, so the folder cannot be locked; delete it.")
+        with contextlib.suppress(FileNotFoundError):
+            # One look: between two, another process may delete the file that it created.
+            if not stat.S_ISREG(os.lstat(path).st_mode):
+                raise StorageError(f"{path} is no regular file, so the folder cannot be locked; delete it.")
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)

@@ -21,7 +21,7 @@ from openvima.env.tabletop import TabletopEnv
 from openvima.errors import DatasetError, EpisodeError
 from openvima.folder_lock import folder_lock
 from openvima.render.raycast import object_below
-from openvima.scene import COMPOSED, Action, Episode, Scene
+from openvima.scene import COMPOSED, HOST_TASK, Action, Episode, Scene
 from openvima.scene.goal import object_of
 from openvima.tasks import list_tasks
 from openvima.tasks.oracle import TIED_TO_TABLE
@@ -29,7 +29,6 @@ from openvima.tasks.oracle import TIED_TO_TABLE
 COMMAND = "openvima studio"  # what manifests name as their maker
 DOMAIN, LEVEL = "user", "train"
 SHARD_SIZE = 50  # episodes; the last shard is written anew for each demonstration, 2 MB at most
-_HOST_TASK = "visual_manipulation"  # whose environment plays composed episodes
 _MOVED_M = 0.002
 _LOCK_S = 10.0  # to wait for another session that records
 
@@ -84,7 +83,7 @@ def demonstrate(
     """
     is_composed = episode.task == COMPOSED
     if is_composed:
-        env = TabletopEnv(_HOST_TASK, assets=env_config.assets, compat=env_config.compat)
+        env = TabletopEnv(HOST_TASK, assets=env_config.assets, compat=env_config.compat)
     else:
         env = env_config.make(episode.task, episode.level, domain=episode.domain)
     observation, _ = env.reset(options={"episode": episode})

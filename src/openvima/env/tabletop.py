@@ -17,9 +17,8 @@ from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.html import notebook_html
-from openvima.render import channels_last
 from openvima.render.camera import VIEWS, View
-from openvima.render.rasteriser import Image, Rasteriser
+from openvima.render.rasteriser import Image, Rasteriser, front_above_top
 from openvima.scene import (
     ACTION_SHAPES,
     END_EFFECTORS,
@@ -280,8 +279,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         """
         if self.render_mode is None:
             return None
-        images = self._images()
-        return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
+        return front_above_top(self._images())
 
     def close(self) -> None:
         """Free the simulation; `reset` starts it again."""

@@ -15,9 +15,7 @@ from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, RolloutP
 from openvima.evaluation.session import EpisodeSession
 from openvima.evaluation.sources import PolicySource
 from openvima.policies.base import Policy
-from openvima.render import channels_last
-from openvima.render.camera import VIEWS
-from openvima.render.rasteriser import Rasteriser
+from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.scene import Action, Episode, Outcome, Scene
 from openvima.scene.explanation import Explanation
 from openvima.video.recorder import EpisodeRecorder
@@ -116,7 +114,7 @@ def play(
         tuple(step.action for step in session.steps),
         Outcome(outcome.success, session.env.outcome.failure, outcome.reason),
         session.scene,
-        tuple(_both_views(rasteriser, scene) for scene in scenes),
+        tuple(front_above_top(rasteriser.scene(scene)) for scene in scenes),
     )
 
 
@@ -136,11 +134,6 @@ def _explanation(session: EpisodeSession) -> Explanation:
     if explanation is None:
         raise PolicyError("explain() of the policy returned None for an episode that goes on.")
     return explanation
-
-
-def _both_views(rasteriser: Rasteriser, scene: Scene) -> np.ndarray:
-    images = rasteriser.scene(scene)
-    return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
 
 
 def _load(

@@ -13,11 +13,10 @@ from openvima.evaluation.results import EpisodeOutcome
 from openvima.evaluation.rollout import EpisodeSlot
 from openvima.evaluation.rollout_policies import Decision, PromptedRolloutPolicy, RolloutPolicy
 from openvima.policies.base import Policy
-from openvima.scene import Action, Episode, RenderedPrompt, Scene
+from openvima.scene import HOST_TASK, Action, Episode, RenderedPrompt, Scene
 from openvima.scene.explanation import Explanation
 from openvima.user_code import described
 
-_HOST_TASK = "visual_manipulation"  # an environment of any task plays all episodes
 SAME_POSITION_M, SAME_YAW_RAD = 0.02, math.radians(10)  # actions that differ by less count as equal
 
 
@@ -96,7 +95,7 @@ class EpisodeSession:
         explain: bool = True,
     ) -> None:
         self.episode = episode
-        self.env = TabletopEnv(_HOST_TASK, assets=assets, compat=compat, realtime=record)
+        self.env = TabletopEnv(HOST_TASK, assets=assets, compat=compat, realtime=record)
         self._policy = _as_rollout_policy(policy)
         self._record, self._explains = record, explain
         self.steps: list[SessionStep] = []

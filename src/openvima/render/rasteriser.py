@@ -1,7 +1,7 @@
 """Rasteriser of scenes and prompts: colours, object ids and heights, bit-identical on every machine."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -10,6 +10,7 @@ import numpy as np
 from openvima.catalog.geometry import Assets, TriangleMesh
 from openvima.errors import ShapeError
 from openvima.render.camera import CAMERAS, VIEWS, Camera, View
+from openvima.render.image_layout import channels_last
 from openvima.render.indexed import IndexedMesh, KernelBuffers, indexed, magnified, matrix_3x4
 from openvima.render.kernels import MICROMETRES, draw_triangles
 from openvima.scene import (
@@ -299,6 +300,11 @@ def _checked_id(object_id: int) -> int:
     if not 0 <= object_id <= LARGEST_ID:
         raise ShapeError(f"object id {object_id} does not fit a segmentation image; use 0 to {LARGEST_ID}.")
     return object_id
+
+
+def front_above_top(images: Mapping[View, Image]) -> np.ndarray:
+    """Return the colours of both views in one image, the front view above, shape (2 · H, W, 3), uint8."""
+    return np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
 
 
 def _rgb_of(images: dict[View, Image]) -> dict[str, np.ndarray]:

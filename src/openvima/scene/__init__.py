@@ -11,7 +11,7 @@ from openvima.scene.constraint import (
     StepContext,
     ZoneKeptClear,
 )
-from openvima.scene.episode import COMPOSED, Episode, Outcome, Problem
+from openvima.scene.episode import COMPOSED, HOST_TASK, Episode, Outcome, Problem
 from openvima.scene.goal import AtPose, Condition, Goal, InZone, Tolerance, Zone, block_points
 from openvima.scene.pose import Pose, angle_difference
 from openvima.scene.prompt import (
@@ -45,6 +45,7 @@ __all__ = [
     "END_EFFECTORS",
     "FIRST_OBJECT_ID",
     "FLOOR_ID",
+    "HOST_TASK",
     "SHEET_ID",
     "WORKSPACE_HIGH",
     "WORKSPACE_LOW",

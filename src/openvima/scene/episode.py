@@ -11,6 +11,7 @@ from openvima.scene.prompt import Prompt
 from openvima.scene.scene import Scene
 
 COMPOSED = "composed"  # task of composed episodes
+HOST_TASK = "visual_manipulation"  # whose environments play them; those of any task would
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,11 +165,8 @@ class ComposePanel:
 
     def _rewrite(self) -> None:
         prompt, goals = self._prompt.value, self._goals.value
-        limits: Any = {
-            "max_steps": int(self._steps.value),
-            "end_effector": self._tool.value,
-        }  # Any: of two kinds
-        self._use(self._present().rewritten(prompt, goals, **limits))
+        max_steps, tool = int(self._steps.value), self._tool.value
+        self._use(self._present().rewritten(prompt, goals, max_steps=max_steps, end_effector=tool))
 
     def _insert(self, image: object) -> None:
         scene = replace(self._present(), prompt=self._prompt.value)

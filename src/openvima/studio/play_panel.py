@@ -6,9 +6,7 @@ import viser
 from openvima.catalog.packs import ASSET_PACKS
 from openvima.catalog.partitions import LEVELS
 from openvima.policies.bundled import SMALL
-from openvima.render import channels_last
-from openvima.render.camera import VIEWS
-from openvima.render.rasteriser import Rasteriser
+from openvima.render.rasteriser import Rasteriser, front_above_top
 from openvima.studio.browser_session import YOU, BrowserSession
 from openvima.tasks import list_tasks, sample_episode, task_spec
 from openvima.tasks.seeding import MAX_SEED
@@ -102,8 +100,7 @@ class PlayPanel:
         current = self.session.current
         if current is None:
             return
-        images = Rasteriser(self.session.assets).scene(current.scene)
-        self._views.image = np.concatenate([channels_last(images[view].rgb) for view in VIEWS])
+        self._views.image = front_above_top(Rasteriser(self.session.assets).scene(current.scene))
         self._time.max = max(1, current.num_steps)
         self._time.value = current.num_steps
         self._outcome.content = current.summary()

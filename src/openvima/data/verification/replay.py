@@ -24,13 +24,12 @@ from openvima.data.verification.shards import ShardFindings
 from openvima.env.config import EnvConfig
 from openvima.errors import AssetError, OpenVimaError
 from openvima.multiprocess import imap_unordered
-from openvima.scene import COMPOSED, Episode, RenderedPrompt
+from openvima.scene import COMPOSED, HOST_TASK, Episode, RenderedPrompt
 
 if TYPE_CHECKING:  # comes with the simulator
     from openvima.env import TabletopEnv
 
 _REMEDY = "The files are intact, but another machine or other code wrote them. Generate them again."
-_HOST_TASK = "visual_manipulation"  # whose environment plays composed episodes
 _IRRELEVANT = "pyarrow"  # its version decides bytes of files, not of episodes
 
 
@@ -258,4 +257,4 @@ def _setup(task: ReplayTask) -> EnvConfig:
 
 @lru_cache(maxsize=4)
 def _env(task: str, level: str, domain: str, env_config: EnvConfig) -> "TabletopEnv":
-    return env_config.make(_HOST_TASK if task == COMPOSED else task, level, domain=domain)
+    return env_config.make(HOST_TASK if task == COMPOSED else task, level, domain=domain)
