@@ -37,7 +37,7 @@ from openvima.policies.pointer.geometry import (
     rotated,
     yaw_to_bin,
 )
-from openvima.policies.pointer.grounding import TextGrounding, attention
+from openvima.policies.pointer.grounding import TextGrounding, attention_scores
 from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt, at, mask_scores
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
 
@@ -58,8 +58,8 @@ class CandidatePointerHead(nn.Module):
     offset. The grasp and the rotation then determine the pose of the tool, so that a wrong rotation does not
     move the object.
 
-    Rotations are copied as well, where the model estimates those between prompt images in as many bins as the
-    head has.
+    Rotations are copied as well, where the model estimates them in as many bins as the head has: those between
+    prompt images, and the one that turns the picked object as the prompt shows it.
     """
 
     score = "accuracy"
@@ -69,7 +69,9 @@ class CandidatePointerHead(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        self.rotation_copy = RotationCopy(width) if rotation_bins == config.num_yaw_bins else None
+        self.rotation_copy: RotationCopy | None = None
+        if rotation_bins == config.num_yaw_bins:
+            self.rotation_copy = RotationCopy(width, config.hidden_width)
         self.pick = PickPointer(config, width, has_attributes=has_attributes)
         self.place = PlacePointer(config, width)
         self.grid = GridCandidates(width)
@@ -183,7 +185,7 @@ class CandidatePointerHead(nn.Module):
         hidden = torch.relu(self.relation(torch.cat([*tokens, metric], dim=-1)))
         yaw_logits = self.yaw(hidden)
         if self.rotation_copy is not None:
-            yaw_logits = yaw_logits + self.rotation_copy(inputs.query_BTD, candidates.prompt)
+            yaw_logits = yaw_logits + self.rotation_copy(inputs, pick_BT, hidden)
         return self.offset(hidden) * OFFSET_UNIT_M, yaw_logits
 
     def _goal(self, inputs: HeadInputs, targets: ActionTargets, pick_BT: torch.Tensor) -> torch.Tensor:
@@ -257,21 +259,30 @@ class PickPointer(ObjectPointer):
 
 
 class RotationCopy(nn.Module):
-    """Logits of the rotations that objects make between images of the prompt."""
+    """Logits of the rotations that objects make between images of the prompt, and from the view to it.
 
-    def __init__(self, width: int) -> None:
+    Args:
+        width: Width of tokens.
+        hidden_width: Width of what is known of pick and place.
+    """
+
+    def __init__(self, width: int, hidden_width: int) -> None:
         super().__init__()
         self.query = nn.Linear(width, width)
         self.key = nn.Linear(width, width)
         self.weight = nn.Linear(width, 1)
+        self.to_prompt_weight = nn.Linear(hidden_width, 1)
 
-    def forward(self, query_BTD: torch.Tensor, objects: ObjectSet) -> torch.Tensor:
+    def forward(self, inputs: HeadInputs, pick_BT: torch.Tensor, hidden_BTH: torch.Tensor) -> torch.Tensor:
         """Return logits of the bins, (B, T, R)."""
+        query_BTD, objects = inputs.query_BTD, inputs.prompt.objects
         scores_BTK = self.query(query_BTD) @ self.key(objects.tokens_BKD).mT * query_BTD.shape[-1] ** -0.5
         has_rotation_BK = objects.masks_BK & (objects.rotations_BKR > 0).any(dim=-1)
         weights_BTK = torch.softmax(mask_scores(scores_BTK, has_rotation_BK[:, None]), dim=-1)
         weights_BTK = weights_BTK * has_rotation_BK[:, None]
-        return F.softplus(self.weight(query_BTD)) * _ROTATION_SCALE * (weights_BTK @ objects.rotations_BKR)
+        between_BTR = F.softplus(self.weight(query_BTD)) * (weights_BTK @ objects.rotations_BKR)
+        to_prompt_BTR = F.softplus(self.to_prompt_weight(hidden_BTH)) * at(inputs.rotations_BTNR, pick_BT)
+        return _ROTATION_SCALE * (between_BTR + to_prompt_BTR)
 
 
 class PlacePointer(nn.Module):
@@ -365,4 +376,4 @@ class PlacePointer(nn.Module):
     def _prompt_attention(self, prompt: PointerPrompt, context_BTD: torch.Tensor) -> torch.Tensor:
         """Attention to the objects of the prompt, (B, T, L)."""
         query_BTD, key_BLD = self.prompt_query(context_BTD), self.prompt_key(prompt.masked_BLD)
-        return attention(query_BTD, key_BLD, prompt.object_mask_BL)
+        return torch.softmax(attention_scores(query_BTD, key_BLD, prompt.object_mask_BL), dim=-1)

@@ -64,7 +64,7 @@ class PointerPrompt(TensorRecord):
         selected_BP: Which attributes the prompt asks to compare; None without attributes.
         attributes_BLX: Projections of the objects of images, whose dot products are similarities in the
             selected attributes; zero elsewhere.
-        describes: Whether any word describes appearance; may be true without, at the cost of time.
+        describes_BL: Which words describe appearance; None if none does.
     """
 
     tokens_BLD: torch.Tensor
@@ -77,7 +77,7 @@ class PointerPrompt(TensorRecord):
     objects: ObjectSet
     selected_BP: torch.Tensor | None = None
     attributes_BLX: torch.Tensor | None = None
-    describes: bool = True
+    describes_BL: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +97,9 @@ class HeadInputs:
         steps_T: Indices of the steps, from 0.
         first_step: Objects in view at the first step of the episode.
         prompt: Encoded prompts.
+        rotations_BTNR: Probabilities of the rotation that brings each object in view to the heading in which
+            the prompt shows it, counter-clockwise; zero for those it does not show; R is 0 if rotations are
+            not estimated.
         attributes_BTNX: Projections of the objects in view, as `PointerPrompt.attributes_BLX`.
     """
 
@@ -111,6 +114,7 @@ class HeadInputs:
     steps_T: torch.Tensor
     first_step: ObjectSet
     prompt: PointerPrompt
+    rotations_BTNR: torch.Tensor
     attributes_BTNX: torch.Tensor | None = None
 
 

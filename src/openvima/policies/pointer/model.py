@@ -163,7 +163,7 @@ class Pointer(PolicyNetwork):
             replace(object_set, image_index_BK=_scene_index(objects)),
             selected_BP,
             attributes_BLX,
-            describes=self.training or bool(describes_BL.any()),
+            describes_BL if self.training or describes_BL.any() else None,
         )
 
     def init_cache(self, prompt: PointerPrompt) -> DecodingState:
@@ -223,7 +223,7 @@ class Pointer(PolicyNetwork):
         if self.attributes is not None and prompt.selected_BP is not None:
             attributes_BTNX = self.attributes.embed(objects, prompt.selected_BP)
             objects = without_crops(objects, prompt.selected_BP)
-        changes_BTND = self._changes_in_view(objects, prompt)
+        changes_BTND, rotations_BTNR = self._changes_in_view(objects, prompt)
         tokens = self._observation_tokens(history, objects.features_VNF, changes_BTND)
         previous = self._action_segment(previous_BTC, has_previous_BT, features_KF.dtype)
         outputs_BTQD, cache = decode_observations(self.decoder, state.cache, tokens, previous)
@@ -246,6 +246,7 @@ class Pointer(PolicyNetwork):
             steps_T=steps_T,
             first_step=first_step,
             prompt=prompt,
+            rotations_BTNR=rotations_BTNR,
             attributes_BTNX=attributes_BTNX,
         )
         return inputs, DecodingState(cache, state.num_steps + num_steps, first_step)
@@ -314,17 +315,25 @@ class Pointer(PolicyNetwork):
         allowed = in_earlier_image(objects) & in_same_kind_of_image(objects)
         return self.correspondence(objects, objects, allowed, self._rotation_between)
 
-    def _changes_in_view(self, objects: ObjectFeatures, prompt: PointerPrompt) -> torch.Tensor:
-        """Compare objects in view with each other and with those of the prompt, (B, T, N, D)."""
+    def _changes_in_view(
+        self, objects: ObjectFeatures, prompt: PointerPrompt
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compare objects in view with each other and with those of the prompt.
+
+        Returns:
+            Changes of tokens, (B, T, N, D), and `HeadInputs.rotations_BTNR`.
+        """
         if self.correspondence is None or self.prompt_correspondence is None:
-            return objects.appearance_NA.new_zeros(())
+            return objects.appearance_NA.new_zeros(()), objects.appearance_NA[..., :0]
         shown, rotation_between = prompt.features.at_each_step(), self._rotation_between
         allowed = in_earlier_image(objects, shown)
-        changes_BTND, _ = self.prompt_correspondence(objects, shown, allowed, rotation_between)
+        changes_BTND, since_BTNR = self.prompt_correspondence(objects, shown, allowed, rotation_between)
         if self.config.correspondence and self.config.correspondence.within_view:
             others = is_another(objects)
             changes_BTND = self.correspondence(objects, objects, others, rotation_between)[0] + changes_BTND
-        return changes_BTND
+        return changes_BTND, since_BTNR.flip(-1).roll(
+            1, dims=-1
+        )  # bin k of the inverse rotation is bin R - k
 
     @property
     def _rotation_between(self) -> RotationBetween | None:
