@@ -66,6 +66,7 @@ def drawn_inputs(batch: int = B, seed: int = 1) -> HeadInputs:
         prompt=pointer_prompt(
             prompt, prompt_appearance, torch.ones(batch, M, dtype=torch.bool), prompt_objects
         ),
+        rotations_BTNR=drawn(batch, T, N, 72).softmax(dim=-1),
     )
 
 
@@ -179,6 +180,7 @@ def test_neither_the_order_in_view_nor_that_of_candidates_changes_action_or_loss
         appearance_BTNA=inputs.appearance_BTNA[:, :, order],
         positions_BTN2=inputs.positions_BTN2[:, :, order],
         grasps_BTN2=inputs.grasps_BTN2[:, :, order],
+        rotations_BTNR=inputs.rotations_BTNR[:, :, order],
     )
     for kind, places in (("first_step", order[order < NUM_FIRST]), ("prompt", other)):
         for name in ("tokens_BKD", "masks_BK", "appearance_BKA", "positions_BK2", "image_index_BK"):
@@ -283,7 +285,7 @@ def test_a_prompt_without_objects_is_possible(head, inputs):
 
 def test_the_appearance_loss_trains_attention_and_not_the_logit_scale(head, inputs):
     words = torch.eye(A, dtype=torch.float64)[:M].expand(B, M, A)
-    inputs = with_prompt(inputs, text_appearance_BLA=words)
+    inputs = with_prompt(inputs, text_appearance_BLA=words, describes_BL=torch.ones(B, M, dtype=torch.bool))
     probabilities = torch.softmax(head.pick.appearance_scores(inputs), dim=-1)[..., 0]
     (-probabilities.log().mean()).backward()
     trained = {name for name, parameter in head.named_parameters() if parameter.grad is not None}
@@ -346,7 +348,7 @@ def test_words_may_describe_the_appearance_of_object_and_place(what, head, input
     pick = torch.zeros(B, T, dtype=torch.int64)
 
     def scores(words_BLA, is_word_BL):
-        asking = with_prompt(inputs, text_appearance_BLA=words_BLA, mask_BL=is_word_BL)
+        asking = with_prompt(inputs, text_appearance_BLA=words_BLA, describes_BL=is_word_BL)
         return head.pick(asking) if what == "pick" else head.place(asking, head.candidates(asking), pick)
 
     everywhere = inputs.appearance_BTNA[:, 0, 2][:, None].expand(B, M, A)
@@ -354,10 +356,15 @@ def test_words_may_describe_the_appearance_of_object_and_place(what, head, input
     change = (scores(everywhere, words) - scores(nothing, words))[1, 0, :N]
     assert change[:3].argmax() == 2  # the fourth does not exist
     assert change[2] > 5
-    # What is no word says nothing.
+    # What does not describe says nothing, and takes no attention from what does.
     one = words & (torch.arange(M) == 0)
     unread = everywhere * ~one[..., None]
     assert torch.equal(scores(unread, one), scores(nothing, one))
+    assert torch.equal(scores(nothing, None), scores(nothing, one))
+    attention = head.pick.grounding.attention(with_prompt(inputs, describes_BL=one).prompt, inputs.query_BTD)
+    assert (attention[..., 1:] == 0).all()
+    assert (0 < attention[..., 0]).all()
+    assert (attention[..., 0] < 1).all()  # the rest goes to no word
 
 
 def test_the_first_prompt_query_is_trained_to_attend_to_the_most_similar_object(head, inputs):
@@ -493,7 +500,16 @@ def test_rotations_shown_in_the_prompt_are_copied(inputs):
     rotations[:, 1, 66] = 1.0  # the first object has no earlier image
     shown = with_objects(inputs, "prompt", "rotations_BKR", rotations)
     expected = torch.full((B, T), math.radians(-30), dtype=torch.float64)
-    torch.testing.assert_close(relative_yaw(head.decode(shown)) - 0.0, expected)
+    none = torch.zeros_like(inputs.rotations_BTNR)
+    still = replace(shown, rotations_BTNR=none)
+    torch.testing.assert_close(relative_yaw(head.decode(still)), expected)
+    # So is that of the picked object to how the prompt shows it, and of no other object.
+    with torch.no_grad():
+        head.rotation_copy.weight.bias.fill_(-50.0)
+    head.pick.forward = lambda inputs: torch.eye(N)[torch.full((B, T), 2)]
+    turned = none.clone()
+    turned[:, :, 2, 6] = turned[:, :, 1, 12] = 1.0
+    torch.testing.assert_close(relative_yaw(head.decode(replace(shown, rotations_BTNR=turned))), -expected)
 
 
 def test_with_a_kept_place_in_the_batch_the_chosen_one_is_still_that_of_its_own_episode(head, inputs):

@@ -194,6 +194,19 @@ def test_correspondence_serves_the_object_head_as_well(demos):
     assert decided.isfinite().all()
 
 
+def test_rotations_of_objects_in_view_lead_to_how_the_prompt_shows_them(network, demos, monkeypatch):
+    """An object that was turned by 30 degrees since the prompt's image has to turn back, by 330."""
+    original = network.prompt_correspondence.forward
+
+    def turned(*given):
+        changes_BTND, rotations_BTNR = original(*given)
+        return changes_BTND, torch.eye(72)[6].expand_as(rotations_BTNR)
+
+    monkeypatch.setattr(network.prompt_correspondence, "forward", turned)
+    inputs, _ = read_whole(network, demos)
+    assert (inputs.rotations_BTNR.argmax(dim=-1) == 66).all()
+
+
 def test_prompts_say_which_image_shows_an_object_and_whether_that_is_the_table(demos):
     processor = Processor("objects")
     for demo, task in zip(demos, TASKS, strict=True):

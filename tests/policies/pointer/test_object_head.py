@@ -58,6 +58,7 @@ def inputs() -> HeadInputs:
         steps_T=torch.arange(T),
         first_step=nothing,
         prompt=pointer_prompt(prompt, prompt_appearance, prompt_masks, nothing),
+        rotations_BTNR=appearance[..., :0],
     )
 
 
