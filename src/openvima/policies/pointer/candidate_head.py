@@ -38,7 +38,7 @@ from openvima.policies.pointer.geometry import (
     yaw_to_bin,
 )
 from openvima.policies.pointer.grounding import TextGrounding, attention_scores
-from openvima.policies.pointer.inputs import HeadInputs, ObjectSet, PointerPrompt, at, mask_scores
+from openvima.policies.pointer.inputs import HeadInputs, PointerPrompt, at, mask_scores
 from openvima.policies.pointer.object_head import ObjectPointer, sum_losses
 
 _ON_TOP_M = 0.04  # scale within which an object is in or on another one
@@ -59,7 +59,7 @@ class CandidatePointerHead(nn.Module):
     move the object.
 
     Rotations are copied as well, where the model estimates them in as many bins as the head has: those between
-    prompt images, and the one that turns the picked object as the prompt shows it.
+    prompt images, and that of the picked object to how the prompt shows it.
     """
 
     score = "accuracy"
