@@ -58,8 +58,8 @@ class CandidatePointerHead(nn.Module):
     offset. The grasp and the rotation then determine the pose of the tool, so that a wrong rotation does not
     move the object.
 
-    Rotations are copied as well, where the model estimates them in as many bins as the head has: those between
-    prompt images, and that of the picked object to how the prompt shows it.
+    Rotations are copied as well, where the model estimates them in as many bins as the head has: those
+    between prompt images, and that of the picked object to how the prompt shows it.
     """
 
     score = "accuracy"
