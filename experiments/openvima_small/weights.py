@@ -111,13 +111,14 @@ def shipped(folder: Path) -> Shipped | None:
 
 def facts(found: Shipped) -> list[tuple[str, str]]:
     """Return the record as pairs of words."""
-    pretraining, cloning = (*found.steps, 0)[:2]
+    stages = ("contrastive pretraining", "behaviour cloning")[
+        -len(found.steps) :
+    ]  # --init-from skips the first
     return [
         ("parameters", f"{found.parameters:,}"),
         ("weights file", f"{found.num_bytes / 1e6:.1f} MB, float16"),
         ("demonstrations", f"{found.episodes:,}, content hash {found.data_hash}"),
-        ("contrastive pretraining", f"{pretraining:,} steps"),
-        ("behaviour cloning", f"{cloning:,} steps"),
+        *((stage, f"{steps:,} steps") for stage, steps in zip(stages, found.steps, strict=True)),
         (
             "time",
             f"{found.hours:.1f} h, {found.cpu_hours:.1f} h of CPU in the first process",
