@@ -116,8 +116,9 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
 
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
     `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
-    `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
-    0), `num_steps`, `joints` (as in observations), `task`, `level`, `domain`, `seed`, `end_effector`, and
+    `failure`, `reason` (why it failed, or empty), `progress` (`goals_met`, the fraction of the required goals,
+    and `distance_m` and `angle_rad` of the nearest goal that can be met next; NaN if goals state none),
+    `grasped` (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations), `task`, `level`, `domain`, `seed`, `end_effector`, and
     `objects` (id to the names of object and texture). The images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
@@ -410,6 +411,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "success": run.outcome.success,
             "failure": run.outcome.failure,
             "reason": run.outcome.reason,
+            "progress": goals.measure(problem, run.progress, run.world.scene),
             "grasped": run.grasped or 0,  # never None: vector environments collect numbers in arrays
             "num_steps": run.num_steps,
             "joints": self.joints,
