@@ -1,6 +1,8 @@
 """Wrappers for libraries of reinforcement learning."""
 
+import re
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -108,10 +110,19 @@ def test_too_few_rows_and_missing_images_are_named() -> None:
 
 
 def test_vectors_of_gymnasium_take_the_wrappers() -> None:
-    envs = gymnasium.make_vec(
-        "openvima/rotate-v1", 2, wrappers=[FlatAction, FlatObservation, ProgressReward]
-    )
+    envs = gymnasium.make_vec("openvima/rotate-v1", 2, wrappers=[FlatAction, FlatObservation, ProgressReward])
     observations, infos = envs.reset(seed=0)
     assert observations.shape == (2, 16 * 54 * 2 + 65)
     assert infos["progress"]["angle_rad"].shape == (2,)
     assert envs.step(envs.action_space.sample())[1].shape == (2,)
+
+
+def test_the_code_of_the_page_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+    page = Path(__file__).parents[1] / "docs" / "reinforcement_learning.md"
+    names: dict[str, object] = {}
+    for code in re.findall(
+        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        exec(compile(code, str(page), "exec"), names)
+    printed = capsys.readouterr().out
+    assert "2 objects, the leftmost" in printed and f"(4, {16 * 54 * 2 + 65})" in printed

@@ -1,4 +1,4 @@
-"""Wrappers for libraries of reinforcement learning, which want boxes: observations, actions, dense rewards."""
+"""Wrappers for libraries of reinforcement learning: vectors as observations and actions, dense rewards."""
 
 import re
 import zlib
@@ -30,7 +30,7 @@ class FlatAction(gymnasium.ActionWrapper):
     |---|---|
     | 0, 1 | x, y where to pick or to start sweeping; −1 and 1 are the bounds of actions |
     | 2, 3 | x, y where to place or to end |
-    | 4, 5 | sine and cosine of the rotation between, counter-clockwise from above, of any length; zeros: none |
+    | 4, 5 | sine and cosine of the rotation, counter-clockwise from above, of any length; zeros: none |
 
     Args:
         env: An environment of the package, wrapped or not.
@@ -56,8 +56,8 @@ class FlatAction(gymnasium.ActionWrapper):
         values = np.asarray(action)
         if values.shape != (ACTION_SIZE,) or values.dtype.kind != "f":
             raise ActionError(
-                f"the action has shape {values.shape} and dtype {values.dtype}; it must be ({ACTION_SIZE},) of "
-                "floating-point numbers. Nothing was moved."
+                f"the action has shape {values.shape} and dtype {values.dtype}; it must be "
+                f"({ACTION_SIZE},) of floating-point numbers. Nothing was moved."
             )
         if not (np.abs(values) <= 1).all():  # also without NaN
             given = ", ".join(f"{value:.4g}" for value in values)
@@ -107,8 +107,9 @@ class FlatObservation(gymnasium.Wrapper):
 
     def __init__(self, env: gymnasium.Env, *, max_objects: int = 16, max_prompt_objects: int = 16) -> None:
         super().__init__(env)
-        if not {"rgb", "segm"} <= set(env.unwrapped.modalities):  # type: ignore[attr-defined]  # of TabletopEnv
-            raise ConfigError(f"modalities are {env.unwrapped.modalities}; FlatObservation needs rgb and segm.")  # type: ignore[attr-defined]
+        self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
+        if not {"rgb", "segm"} <= set(self._base.modalities):
+            raise ConfigError(f"modalities are {self._base.modalities}; FlatObservation needs rgb and segm.")
         if min(max_objects, max_prompt_objects) < 1:
             raise ConfigError(f"rows are {max_objects} and {max_prompt_objects}; give at least one each.")
         self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
@@ -151,8 +152,7 @@ class FlatObservation(gymnasium.Wrapper):
         return objects.reshape(shape), prompt.reshape(shape), words
 
     def _encoded_prompt(self) -> np.ndarray:
-        prompt = self.env.unwrapped.prompt  # type: ignore[attr-defined]  # of TabletopEnv
-        parts = prompt.sequence()
+        parts = self._base.prompt.sequence()
         images = [part for part in parts if not isinstance(part, str)]
         seen = [(observe_prompt_image(image), image.kind == "scene") for image in images]
         rows = self._rows(seen, "max_prompt_objects")

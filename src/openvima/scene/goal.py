@@ -127,7 +127,7 @@ class AtPose:
         return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
 
     def distance(self, scene: Scene) -> tuple[float, float]:
-        """Planar distance from the target in metres, and angle from its heading in radians; 0 if any is fine."""
+        """Planar distance from the target in metres, and from its heading in radians; 0 if any is fine."""
         pose = scene[self.object_id].pose
         if self.tolerance.yaw_rad is None:
             return pose.planar_distance(self.target), 0.0

@@ -8,8 +8,8 @@ import numpy as np
 
 from openvima.scene import Condition, PhotoImage, Placement, Problem, Prompt, PromptFill, Scene, SceneImage
 from openvima.scene.goal import (
-    distance_to,
     OracleMove,
+    distance_to,
     is_condition,
     is_monitored,
     object_of,
