@@ -1,7 +1,7 @@
-"""Repositories on the Hugging Face Hub: their names, fetching and committing files. huggingface_hub does the work.
+"""Repositories on the Hugging Face Hub: their names, and fetching and committing files by huggingface_hub.
 
-A name is "owner/name", "owner/name@revision" or either with "hf://" in front; a revision is a branch, a tag or a
-commit. No request is made unless a name can only be that of a repository.
+A name is "owner/name", "owner/name@revision" or either with "hf://" in front; a revision is a branch, a tag
+or a commit. No request is made unless a name can only be that of a repository.
 """
 
 import re
@@ -42,8 +42,8 @@ class HubName:
 def hub_name(text: str | Path) -> HubName | None:
     """Read a text that can only be the name of a repository; None for any other.
 
-    Without "hf://", no local folder may be named as the owner, so that "runs/frist" beside a folder "runs" is a
-    mistyped path and causes no request.
+    Without "hf://", no local folder may be named as the owner, so that "runs/frist" beside a folder "runs" is
+    a mistyped path and causes no request.
     """
     found = _NAME.fullmatch(str(text))
     if found is None or ".." in str(text):
@@ -138,10 +138,10 @@ def _client(purpose: str) -> ModuleType:
 
 @contextmanager
 def _failures(what: str) -> Iterator[None]:
-    """Report what fails in one line; the client passes on errors of its HTTP library, which has changed before."""
+    """Report what fails in one line."""
     try:
         yield
-    except Exception as error:
+    except Exception as error:  # the client passes on those of its HTTP library, which has changed before
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = echo(lines[0]) if lines else type(error).__name__
         raise HubError(f"{what} failed: {reason}") from error

@@ -15,8 +15,8 @@ def data_folder(path: str | Path, *, shards: bool = True) -> Path:
 
     Args:
         path: A folder, or the name of a data set on the Hub such as "hf://owner/name@revision".
-        shards: Whether to fetch the shards that its manifest lists; else manifest and index only. No other file
-            of the repository is fetched.
+        shards: Whether to fetch the shards that its manifest lists; else manifest and index only. No other
+            file of the repository is fetched.
 
     Returns:
         The folder. Of one on the Hub only the manifest was checked, as readers check shards.

@@ -44,8 +44,8 @@ class TaskSummary:
         episodes: Number of episodes.
         steps: Number of steps.
         bytes: Size of their records.
-        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored, None
-            if no shard was read.
+        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored,
+            None if no shard was read.
         seeds_tried: Seeds that were tried for them.
         success_rate: Fraction of these seeds that gave an episode.
         redraws: Unlucky draws that the sampler threw away.
@@ -132,8 +132,8 @@ def summarise_folder(
     """Summarise a folder.
 
     Args:
-        folder: A data set, finished or not; or one on the Hub such as "hf://owner/name", of which without details
-            only manifest and index are fetched.
+        folder: A data set, finished or not; or one on the Hub such as "hf://owner/name", of which without
+            details only manifest and index are fetched.
         details: Also count objects, textures and prompt images, for which every shard is read.
         report: Called with shards read, shards in all, and a note.
 
@@ -155,7 +155,8 @@ def summarise_folder(
         folder,
         dataset.manifest,
         tuple(
-            _task_summary(dataset, task_of == task, task, index_only) for task in dataset.manifest["tasks"]
+            _task_summary(dataset, task, task_of == task, index_only=index_only)
+            for task in dataset.manifest["tasks"]
         ),
         tuple(histograms),
         _num_failed(folder),
@@ -177,7 +178,7 @@ def _unfinished(folder: Path) -> Unfinished:
     return Unfinished(folder, len(paths) - len(damaged), dict(sorted(episodes.items())), tuple(damaged))
 
 
-def _task_summary(dataset: Dataset, chosen: np.ndarray, task: str, index_only: bool) -> TaskSummary:
+def _task_summary(dataset: Dataset, task: str, chosen: np.ndarray, *, index_only: bool) -> TaskSummary:
     rows = np.flatnonzero(chosen)
     if not len(rows):
         raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
