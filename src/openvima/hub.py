@@ -142,6 +142,10 @@ def _failures(what: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # the client passes on those of its HTTP library, which has changed before
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        reason = echo(lines[0]) if lines else type(error).__name__
-        raise HubError(f"{what} failed: {reason}") from error
+        reasons = [_first_line(each) for each in (error, error.__cause__) if each is not None]
+        raise HubError(f"{what} failed: {'; '.join(reasons)}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}{f': {echo(lines[0])}' if lines else ''}"

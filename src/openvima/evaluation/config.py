@@ -50,7 +50,7 @@ class EvaluationConfig:
 
     Args:
         policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
-            preset, a run folder, a published file, an id on the Hugging Face Hub, "FILE.py:FUNCTION" or
+            preset, a run folder, a published file, OWNER/NAME[@REVISION] on the Hub, "FILE.py:FUNCTION" or
             "MODULE:FUNCTION"; or the address of a policy server such as "ws://127.0.0.1:8000". "name=source"
             gives a name for the results; by default it is that of the folder, file or server.
         tasks: Names of tasks, or ("all",) for every task that the level holds, with text

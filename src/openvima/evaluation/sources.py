@@ -20,7 +20,13 @@ from openvima.policies.own_code import (
     tasks_left_out,
 )
 from openvima.policies.presets import PRESETS
-from openvima.policies.sources import find_checkpoint, is_own_code, is_policy_source, unknown_policy
+from openvima.policies.sources import (
+    find_checkpoint,
+    hub_commit,
+    is_own_code,
+    is_policy_source,
+    unknown_policy,
+)
 from openvima.serving.client import describe
 from openvima.serving.protocol import check_address, is_remote
 from openvima.user_code import load_function, source_hash, without_folder
@@ -87,9 +93,10 @@ class PolicySource:
         """What the policy is.
 
         Returns:
-            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights
-            and, as its settings declare, "excluded_tasks" of its training and "held_out_data", the
-            demonstrations among its data that are held out for evaluation;
+            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights,
+            "hub" with repository and commit if it is from there, and, as its settings declare,
+            "excluded_tasks" of its training and "held_out_data", the demonstrations among its data that are
+            held out for evaluation;
             for a function its name without folders, "sha256" of its source file and, if the policy offers
             weights, "weights_sha256". Files that the source file imports are not hashed.
 
@@ -114,7 +121,8 @@ class PolicySource:
             if self.source in BUNDLED:
                 return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
             left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
-            return {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
+            what = {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
+            return what | ({"hub": resolved} if (resolved := hub_commit(self.source)) else {})
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
     def _seen(self) -> dict[str, list[str]]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, unknown_name
-from openvima.hub import fetch, hub_name
+from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import read_text
 from openvima.policies.bundled import BUNDLED, bundled_folder
 from openvima.policies.file_names import (
@@ -75,6 +75,16 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
         f"there is no checkpoint at {name}; give a folder, a .ckpt file, owner/name[@revision] or "
         f"{', '.join(BUNDLED)}."
     )
+
+
+def hub_commit(source: str) -> str | None:
+    """Return the repository and commit of a policy on the Hub, as "owner/name@commit"; None for any other.
+
+    Raises:
+        HubError: The download failed.
+    """
+    name = None if source in BUNDLED else hub_name(source)
+    return None if name is None else str(HubName(name.repo, find_checkpoint(source).name))
 
 
 def checkpoint_folder(folder: Path) -> Path:

@@ -56,7 +56,7 @@ class T5Tokenizer:
 
     Args:
         path_or_hub_id: A folder with `tokenizer.json` (or `spiece.model`, for which transformers needs the
-            packages sentencepiece and protobuf), or an id on the Hugging Face Hub such as "t5-base".
+            packages sentencepiece and protobuf), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
         CheckpointError: There is no such tokenizer, or it is not a T5 tokenizer.
@@ -153,7 +153,7 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     Args:
         network: Its text encoder must match the file in size; that of the published presets is t5-base.
         path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (loaded with
-            `weights_only`), or an id on the Hugging Face Hub such as "t5-base".
+            `weights_only`), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
         CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.

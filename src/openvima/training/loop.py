@@ -115,7 +115,7 @@ class Trainer:
     ) -> None:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
-        data = {"episodes": len(dataset), "index": index_hash(config.data), **(demonstrations or {})}
+        data = {"episodes": len(dataset), "index": index_hash(dataset.path), **(demonstrations or {})}
         self.run = RunFolder(
             config.out,
             {"training": config.identity(), "demonstrations": data, "network": learner.description()},
