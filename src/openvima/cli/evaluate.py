@@ -32,6 +32,7 @@ def main(
     compat: bool = False,
     prompts: str = "multimodal",
     task_options: str = "",
+    control: Literal["primitives", "end_effector"] = "primitives",
     ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
@@ -75,6 +76,8 @@ def main(
         task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
             num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
             all that have the option.
+        control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
+            control and the oracle. Scores of the two are never joined.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all of these. Also
             masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
@@ -120,7 +123,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        env_config=EnvConfig(assets, compat, prompts, task_options),
+        env_config=EnvConfig(assets, compat, prompts, task_options, control),
         batch=batch,
         force=force,
         device=device,
@@ -166,7 +169,8 @@ def print_results(results: "Results") -> None:
 
     policies = results.policy_names()
     means = results.means()
-    table = Table("level", title="success rates in % (95 % interval)")
+    control = f", control {results.config['control']}" if "control" in results.config else ""
+    table = Table("level", title=f"success rates in % (95 % interval){control}")
     table.add_column("task", overflow="fold", min_width=12)
     for policy in policies:
         table.add_column(policy, justify="right", no_wrap=True)

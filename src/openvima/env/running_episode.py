@@ -8,9 +8,8 @@ import numpy as np
 
 from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
-from openvima.errors import ConfigError, unknown_name
 from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
-from openvima.scene.command import CONTROLS, END_EFFECTOR, PRIMITIVES, STEPS_PER_PRIMITIVE, ToolCommand
+from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand, steps_per_primitive
 from openvima.sim.tool_path import PathFollower
 from openvima.sim.tool_world import ToolWorld
 from openvima.sim.world import World
@@ -48,7 +47,6 @@ class PrimitiveRun:
     """
 
     control: ClassVar[str] = PRIMITIVES
-    steps_per_primitive: ClassVar[int] = 1
 
     episode: Episode
     assets: Assets
@@ -78,7 +76,7 @@ class PrimitiveRun:
     @property
     def is_out_of_steps(self) -> bool:
         """Whether the step limit is reached."""
-        return self.num_steps >= self.episode.max_steps * self.steps_per_primitive
+        return self.num_steps >= self.episode.max_steps * steps_per_primitive(self.control)
 
     def checked(self, action: object) -> Any:  # Any: an action of this control
         """Validate an action.
@@ -128,7 +126,6 @@ class ToolRun(PrimitiveRun):
     """
 
     control: ClassVar[str] = END_EFFECTOR
-    steps_per_primitive: ClassVar[int] = STEPS_PER_PRIMITIVE
 
     follower: PathFollower | None = None  # of the oracle
 
@@ -186,14 +183,3 @@ class ToolRun(PrimitiveRun):
 
 
 RUNS: Mapping[str, type[PrimitiveRun]] = {run.control: run for run in (PrimitiveRun, ToolRun)}
-
-
-def checked_control(control: str) -> str:
-    """Return a control.
-
-    Raises:
-        ConfigError: There is no such control.
-    """
-    if control not in CONTROLS:
-        raise ConfigError(unknown_name("control", control, CONTROLS))
-    return control

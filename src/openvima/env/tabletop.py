@@ -19,7 +19,6 @@ from openvima.env.running_episode import (
     PrimitiveRun,
     ToolRun,
     VideoFrame,
-    checked_control,
 )
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.html import notebook_html
@@ -36,7 +35,15 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
-from openvima.scene.command import COMMAND_HIGH, COMMAND_LOW, END_EFFECTOR, PRIMITIVES, ToolCommand
+from openvima.scene.command import (
+    COMMAND_HIGH,
+    COMMAND_LOW,
+    END_EFFECTOR,
+    PRIMITIVES,
+    ToolCommand,
+    check_control,
+    steps_per_primitive,
+)
 from openvima.sim.ur5 import JOINT_LIMITS
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.goals import Progress
@@ -162,7 +169,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         self.realtime = realtime
         self.render_mode = render_mode
         self.task_options = task_options
-        self.control = checked_control(control)
+        check_control(control)
+        self.control = control
         self.modalities = modalities
         self.action_space = _action_space(control)
         self._rasteriser = Rasteriser(self.assets)
@@ -283,8 +291,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     @property
     def oracle_max_steps(self) -> int:
         """Step limit of the oracle, in steps of this control."""
-        run = self._running()
-        return run.episode.oracle_max_steps * run.steps_per_primitive
+        return self.episode.oracle_max_steps * steps_per_primitive(self.control)
 
     @property
     def modalities(self) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
+from openvima.scene.command import steps_per_primitive
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
@@ -365,7 +366,8 @@ def rows_of(
     for batch in batches:
         cell = (batch.policy, batch.ablation, batch.task, batch.level)
         joined.setdefault(cell, []).extend(outcomes[batch])
+    factor = steps_per_primitive(batches[0].env_config.control) if batches else 1
     return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), ablation)
+        Row(policy, task, level, task_spec(task).oracle_max_steps * factor, tuple(played), ablation)
         for (policy, ablation, task, level), played in joined.items()
     )

@@ -135,7 +135,7 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
             for batch in prepared.batches
             for episode in zip(batch.seeds, played[batch].actions, strict=True)
         )
-        digest = write_actions(config.out, episodes)
+        digest = write_actions(config.out, episodes, control=config.env_config.control)
         results = Results(rows, prepared.record(), prepared.versions, prepared.policies, digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)

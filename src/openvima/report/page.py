@@ -31,6 +31,7 @@ _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
     "prompts": "multimodal",
     "task_options": "",
+    "control": "primitives",
     "batch": 16,
     "boxes": "",
     "device": "cpu",

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openvima.errors import ActionError
+from openvima.errors import ActionError, ConfigError, unknown_name
 
 CONTROLS = ("primitives", "end_effector")
 PRIMITIVES, END_EFFECTOR = CONTROLS
@@ -16,6 +16,21 @@ COMMAND_HIGH = (MAX_MOVE_M, MAX_MOVE_M, MAX_MOVE_M, MAX_TURN_RAD, 1.0)
 COMMAND_LOW = (-MAX_MOVE_M, -MAX_MOVE_M, -MAX_MOVE_M, -MAX_TURN_RAD, 0.0)
 SECONDS_PER_PRIMITIVE = 10  # time limit of an episode, for each step that it has with primitives
 STEPS_PER_PRIMITIVE = CONTROL_HZ * SECONDS_PER_PRIMITIVE
+
+
+def check_control(control: str) -> None:
+    """Check the name of a control.
+
+    Raises:
+        ConfigError: There is no such control.
+    """
+    if control not in CONTROLS:
+        raise ConfigError(unknown_name("control", control, CONTROLS))
+
+
+def steps_per_primitive(control: str) -> int:
+    """Steps that a control has for each step with primitives."""
+    return STEPS_PER_PRIMITIVE if control == END_EFFECTOR else 1
 
 
 @dataclass(frozen=True, slots=True)
