@@ -1,6 +1,7 @@
 """Control "end_effector" of the environment, and its evaluation."""
 
 import copy
+import itertools
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def test_images_follow_the_body_on_the_cup_while_it_moves() -> None:
         assert len(env.frames) == 3
         if info["grasped"]:
             seen.append(observation["segm"]["front"] == info["grasped"])
-    changes = sum((one != other).any() for one, other in zip(seen, seen[1:], strict=False))
+    changes = sum((one != other).any() for one, other in itertools.pairwise(seen))
     assert changes > 5
 
 
@@ -75,7 +76,7 @@ def test_an_action_of_the_other_control_is_refused() -> None:
         other.step(STAY)
     with pytest.raises(ConfigError, match="control is 'primitives'; commands need control 'end_effector'"):
         other.oracle_command()
-    with pytest.raises(ConfigError, match="no control 'end_efector'. Did you mean 'end_effector'"):
+    with pytest.raises(ConfigError, match=r"no control 'end_efector'\. Did you mean 'end_effector'"):
         openvima.make("rotate", control="end_efector")
     with pytest.raises(ConfigError, match="vector environments have 'primitives' only"):
         openvima.make_vec("rotate", 2, control="end_effector")
@@ -149,5 +150,7 @@ def test_results_record_the_control_are_verified_and_joined_with_no_other(tmp_pa
     assert found["end_effector"].config["control"] == "end_effector"
     assert "control" not in found["primitives"].config
     assert found["end_effector"].rows[0].mean_steps > 10
-    with pytest.raises(ConfigError, match="control is primitives in .*, end_effector in .*, so steps differ"):
+    with pytest.raises(
+        ConfigError, match=r"control is primitives in .*, end_effector in .*, so steps differ"
+    ):
         merge(found)

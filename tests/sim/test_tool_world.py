@@ -1,4 +1,4 @@
-"""The tool under commands: contacts, hold, speed and joint limits, and primitives as sequences of commands."""
+"""The tool under commands: contacts, hold, limits of speed and joints; primitives as commands."""
 
 import copy
 import math
