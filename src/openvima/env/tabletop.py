@@ -45,7 +45,7 @@ from openvima.scene.command import (
     steps_per_primitive,
 )
 from openvima.sim.ur5 import JOINT_LIMITS
-from openvima.tasks import sample_episode, task_spec
+from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
 from openvima.tasks.sampling import check_text_form
