@@ -44,6 +44,7 @@ def main(
     report: bool = True,
     force: bool = False,
     trust_code: bool = False,
+    python: str | None = None,
     device: str = "cpu",
     precision: Literal["float64", "float32", "bfloat16"] | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -58,9 +59,10 @@ def main(
     Args:
         policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
             presets, folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of
-            your own, published files, OWNER/NAME[@REVISION] on the Hub and policy servers (ws://HOST:PORT,
-            see `openvima serve`), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give
-            another name.
+            your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers (ws://HOST:PORT, see
+            `openvima serve`) and LeRobot policies (lerobot:PATH or lerobot:OWNER/NAME[@REVISION], see
+            --python), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give another
+            name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
@@ -99,6 +101,7 @@ def main(
         force: Overwrite the results of another evaluation in that folder.
         trust_code: Run the code that run folders name, as those of learners of your own do. Code named on the
             command line needs no such trust.
+        python: The Python of LeRobot's own environment, which LeRobot policies run in; see docs/lerobot.md.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
             such episodes are listed as near_ties.
@@ -133,6 +136,7 @@ def main(
         engine=engine,
         address=address,
         trust_code=trust_code,
+        python=python,
     )
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:

@@ -7,6 +7,7 @@ does not change the results.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -32,6 +33,7 @@ from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
 from openvima.scene.command import steps_per_primitive
+from openvima.serving.lerobot import is_lerobot, lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
@@ -80,6 +82,8 @@ class EvaluationConfig:
         engine: "processes" of this machine, or "ray".
         address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
         trust_code: Run the code that run folders name, as those of learners of your own do.
+        python: For policies "lerobot:PATH" or "lerobot:OWNER/NAME": the Python of an environment with LeRobot
+            and the plugin `lerobot-env-openvima`, which serves them.
 
     Raises:
         ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
@@ -102,6 +106,7 @@ class EvaluationConfig:
     engine: Engine = "processes"
     address: str | None = None
     trust_code: bool = False
+    python: str | None = None
 
     __repr__ = brief_repr
 
@@ -143,6 +148,10 @@ class EvaluationConfig:
     def _contradictions(self) -> Iterator[str]:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
+        if self.python is not None and not any(
+            is_lerobot(one.source) for one in policy_sources(self.policies)
+        ):
+            yield f"python is {self.python!r}, but no policy is lerobot:PATH."
         takes_boxes = self.uses(DETECTED_BOXES)
         if takes_boxes and self.boxes is None:
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
@@ -185,6 +194,31 @@ class EvaluationConfig:
     def uses(self, ablation: str) -> bool:
         """Whether an ablation is named, alone or among others."""
         return any(ablation in _names_in(name) for name in self.ablations)
+
+    @contextmanager
+    def served(self) -> "Iterator[EvaluationConfig]":
+        """Serve the LeRobot policies while the block runs.
+
+        Yields:
+            The config with policy servers in their place.
+
+        Raises:
+            ConfigError: `python` cannot be started, or as for `policy_sources`.
+            ServerError: A policy cannot be served.
+        """
+        sources = policy_sources(self.policies) if self.python else ()
+        if not any(is_lerobot(source.source) for source in sources):
+            yield self
+            return
+        assert self.python is not None
+        with ExitStack() as stack:
+            policies = []
+            for source in sources:
+                where = source.source
+                if is_lerobot(where):
+                    where = stack.enter_context(lerobot_server(where, self.python, device=self.device))
+                policies.append(f"{source.name}={where}")
+            yield replace(self, policies=tuple(policies), python=None)
 
     @property
     def asked_ablations(self) -> tuple[str, ...]:

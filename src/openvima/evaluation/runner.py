@@ -97,9 +97,10 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         WorkerError: A worker process died; what was finished is kept.
         FolderLockedError: Another evaluation writes to `config.out`.
     """
-    prepared = prepare(config)
-    with folder_lock(config.out):
-        return evaluate_prepared(prepared, report)
+    with config.served() as served:
+        prepared = prepare(served)
+        with folder_lock(config.out):
+            return evaluate_prepared(prepared, report)
 
 
 def prepare(config: EvaluationConfig) -> PreparedEvaluation:

@@ -28,6 +28,7 @@ from openvima.policies.sources import (
     unknown_policy,
 )
 from openvima.serving.client import describe
+from openvima.serving.lerobot import SERVER_MODULE, is_lerobot, lerobot_name
 from openvima.serving.protocol import check_address, is_remote
 from openvima.user_code import load_function, source_hash, without_folder
 
@@ -55,10 +56,12 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset), "remote", "code" or "run".
+        """What it is: oracle, random, untrained (also for a preset), remote, lerobot, code or run.
 
         "code" is a function that makes a policy; "run" is all else.
         """
+        if is_lerobot(self.source):
+            return "lerobot"
         if is_remote(self.source):
             return "remote"
         if self.source in PRESETS:
@@ -77,9 +80,14 @@ class PolicySource:
 
         Raises:
             ConfigError: It looks like the address of a server and cannot be one, there is no such function,
-                or a run folder names code, which is not trusted.
+                a run folder names code, which is not trusted, or it is a LeRobot policy that is not served.
             UnknownPolicyError: There is no such path, and it is not like an id on the Hub.
         """
+        if self.kind == "lerobot":
+            raise ConfigError(
+                f"{echo(self.source)} runs in LeRobot's own environment: name its Python with `openvima "
+                f"evaluate --python`, or run PYTHON -m {SERVER_MODULE} PATH_OR_ID and give its address, ws://…."
+            )
         if self.kind == "remote":
             check_address(self.source)
         elif self.kind == "code":
@@ -180,6 +188,8 @@ def _default_name(source: str) -> str:
     if is_remote(source):
         check_address(source)
         name = urlsplit(source).netloc
+    elif is_lerobot(source):
+        name = lerobot_name(source)
     elif is_own_code(source):
         name = Path(source.rpartition(":")[0] or source).name.removesuffix(".py")
     else:

@@ -84,22 +84,23 @@ def evaluate_and_report(
     """
     require_extra()
     requested_episodes(config, videos)
-    prepared = prepare(config)
-    with folder_lock(config.out):
-        path = evaluate_prepared(prepared, progress)
-        results = Results.read(path)
-        episodes = sum(row.episodes for row in results.rows)
-        note = None if progress is None else lambda text: progress(episodes, episodes, text)
-        write_report(
-            results,
-            config.out / REPORT_NAME,
-            command=default_command(results, config.policies),
-            metrics=find_metrics(config.sources),
-            clips=_recorded(recording_jobs(config, videos, results), config, note),
-            confirmations=[
-                Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
-            ],
-        )
+    with config.served() as served:
+        prepared = prepare(served)
+        with folder_lock(config.out):
+            path = evaluate_prepared(prepared, progress)
+            results = Results.read(path)
+            episodes = sum(row.episodes for row in results.rows)
+            note = None if progress is None else lambda text: progress(episodes, episodes, text)
+            write_report(
+                results,
+                config.out / REPORT_NAME,
+                command=default_command(results, config.policies),
+                metrics=find_metrics(served.sources),
+                clips=_recorded(recording_jobs(served, videos, results), served, note),
+                confirmations=[
+                    Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
+                ],
+            )
     return path
 
 
