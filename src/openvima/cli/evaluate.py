@@ -94,7 +94,7 @@ def main(
         batch: Episodes that are run together, with batched inference.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
-        videos: Solved episodes to record, and failures, of each trained policy and task.
+        videos: Solved episodes to record, and failures, of each trained policy, task and level.
         record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
             TASK/LEVEL/SEED.
         report: Whether to record videos and write report.html.
