@@ -482,3 +482,31 @@ def test_a_video_that_two_evaluations_made_is_shown_once(results, clip, tmp_path
 )
 def test_reasons_are_plain_english(reason, plain):
     assert plain_reason(reason) == plain
+
+
+@pytest.mark.slow
+def test_a_browser_sorts_filters_and_unfolds(text, tmp_path, browser):
+    path = tmp_path / "report.html"
+    path.write_text(text, encoding="utf-8")
+    page = browser.new_page(viewport={"width": 400, "height": 800})
+    page.goto(path.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == 400
+
+    page.locator(".contents a[href='#episodes']").click()
+    page.locator("#episodes summary").click()
+    page.locator(".filters select").nth(0).select_option("mine")
+    page.locator(".filters select").nth(3).select_option("failed")
+    assert page.locator(".filters output").inner_text() == "12 of 90 episodes"
+    assert page.locator("#episodes tbody tr:visible").count() == 12
+
+    seeds = page.locator("#episodes tbody tr:visible td:nth-child(4)")
+    head = page.locator("#episodes thead button").nth(3)
+    for order in (sorted, lambda values: sorted(values, reverse=True)):
+        head.click()
+        found = [int(seed.replace("▶", "")) for seed in seeds.all_inner_texts()]
+        assert found == order(found) and len(set(found)) > 3
+
+    page.locator("#results thead button").nth(1).click()
+    names = page.locator("#results tbody").nth(0).locator("th").all_inner_texts()
+    assert [name.split()[0] for name in names] == ["L1", "stack<b>", "rotate", "mean", "mean"]
+    page.close()
