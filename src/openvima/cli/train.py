@@ -84,7 +84,10 @@ def run(words: Sequence[str]) -> int:
         joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar("training") if is_first else nullcontext() as report,
     ):
-        folder = train(config, report, _rollout(config) if config.rollout.every else None)
+        rollout = _rollout(config) if config.rollout.every else None
+        folder = train(
+            config, report, rollout, rollout.animate if rollout and config.rollout.animate else None
+        )
     if not is_first:
         return 0
     trust = " --trust-code" if ":" in config.preset else ""
