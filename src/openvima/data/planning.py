@@ -22,7 +22,6 @@ from openvima.data.schema import CODECS
 from openvima.env.config import DEFAULT_ENV_CONFIG, EnvConfig
 from openvima.errors import ConfigError, LevelError, unknown_name
 from openvima.multiprocess import MAX_WORKERS
-from openvima.scene.command import PRIMITIVES
 from openvima.tasks import list_tasks, task_spec
 from openvima.tasks.registry import named_tasks
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
@@ -114,8 +113,6 @@ class GenerateConfig:
             yield f"engine is {self.engine!r}; allowed are processes and ray."
         elif self.address is not None and self.engine != "ray":
             yield f"address is {self.address!r}, but the engine is {self.engine!r}; only 'ray' takes one."
-        if self.env_config.control != PRIMITIVES:
-            yield f"control is {self.env_config.control!r}; demonstrations are of control {PRIMITIVES!r}."
         if self.shard_range is not None:
             start, stop = self.shard_range
             if not 0 <= start < stop:

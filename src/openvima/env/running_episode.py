@@ -1,6 +1,6 @@
 """A running episode under either control: primitives, or commands of the tool."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -101,6 +101,10 @@ class PrimitiveRun:
         self.num_steps += 1
         self.judge()
 
+    def perform(self, action: Action, *, realtime: bool) -> None:
+        """Execute a primitive."""
+        self.step(action, realtime=realtime)
+
     def monitor(self, scene: Scene) -> None:
         """Check the constraints that hold during motion."""
         self.progress = goals.monitor(self.episode.problem, self.progress, scene)
@@ -161,6 +165,25 @@ class ToolRun(PrimitiveRun):
         self.num_steps += 1
         if has_ended:
             self.judge()
+
+    def commands(self, action: Action) -> Iterator[ToolCommand]:
+        """Yield the commands of a primitive until the episode is over; each is to be executed at once."""
+        tool = self.episode.problem.scene.end_effector
+        follower = PathFollower(action, tool, compat=self.compat)
+        while not (self.outcome.is_over or self.is_out_of_steps):
+            command = follower.next_command(self.tool_world)
+            if command is None:
+                return
+            yield self.checked(command)
+
+    def perform(self, action: Action, *, realtime: bool) -> None:
+        """Execute a primitive as a sequence of commands."""
+        path, frames = [self.world.joints], []
+        for command in self.commands(action):
+            self.step(command, realtime=realtime)
+            path.append(self.world.joints)
+            frames += self.frames
+        self.joint_path, self.frames = np.array(path, np.float32), frames
 
     def oracle_command(self, decide: Callable[[], Action]) -> ToolCommand:
         """Return the oracle's next command.

@@ -1,6 +1,6 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any  # observations and infos are nested dictionaries
@@ -236,10 +236,42 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             EpisodeError: No episode is running.
             ActionError: The action is invalid; nothing was moved.
         """
+        run = self._going_on()
+        run.step(run.checked(action), realtime=self.realtime)
+        return self._after_step(run)
+
+    def perform(self, action: Action) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Execute a primitive under either control: as one step, or as the commands that it consists of.
+
+        Args:
+            action: The primitive.
+
+        Returns:
+            As for `step`; `joint_path` and `frames` are those of the whole primitive.
+
+        Raises:
+            EpisodeError: No episode is running.
+        """
+        run = self._going_on()
+        run.perform(action, realtime=self.realtime)
+        return self._after_step(run)
+
+    def commands(self, action: Action) -> Iterator[ToolCommand]:
+        """Yield the commands of a primitive, each to be executed by `step` before the next; none at the end.
+
+        Raises:
+            ConfigError: The control is not "end_effector".
+            EpisodeError: No episode is running.
+        """
+        return self._tool_run().commands(action)
+
+    def _going_on(self) -> PrimitiveRun:
         run = self._running()
         if run.outcome.is_over or run.is_out_of_steps:
             raise EpisodeError(f"the episode ended after {run.num_steps} steps; reset() starts the next one.")
-        run.step(run.checked(action), realtime=self.realtime)
+        return run
+
+    def _after_step(self, run: PrimitiveRun) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         terminated = run.outcome.is_over
         truncated = run.is_out_of_steps and not terminated
         reward = 1.0 if run.outcome.success else 0.0
@@ -283,10 +315,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
             ConfigError: The control is another.
             EpisodeError, OracleError: As for `oracle_decision`.
         """
-        run = self._running()
-        if not isinstance(run, ToolRun):
-            raise ConfigError(f"control is {self.control!r}; commands need control {END_EFFECTOR!r}.")
-        return run.oracle_command(lambda: self.oracle_decision().action)
+        return self._tool_run().oracle_command(lambda: self.oracle_decision().action)
 
     @property
     def oracle_max_steps(self) -> int:
@@ -360,6 +389,12 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
         if self._run is None:
             raise EpisodeError("there is no episode yet; call reset() first.")
         return self._run
+
+    def _tool_run(self) -> ToolRun:
+        run = self._running()
+        if not isinstance(run, ToolRun):
+            raise ConfigError(f"control is {self.control!r}; commands need control {END_EFFECTOR!r}.")
+        return run
 
     def _sample(self, seed: int | None) -> Episode:
         return sample_episode(
