@@ -102,6 +102,7 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     from openvima.data.reader import Dataset
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.scene import COMPOSED
+    from openvima.scene.command import PRIMITIVES
     from openvima.tasks.registry import task_spec
 
     dataset = Dataset(config.data)
@@ -112,5 +113,5 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
             f"none of the tasks in {config.data} exists at {ONLINE_EVAL_LEVEL}; leave out rollout.every."
         )
     first = dataset.shard(dataset.shard_names()[0])  # merged folders may have others
-    env_config = replace(first.info.env_config, assets=config.assets)
+    env_config = replace(first.info.env_config, assets=config.assets, control=PRIMITIVES)
     return OnlineEval(playable, config.rollout.episodes, env_config)
