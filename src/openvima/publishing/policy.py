@@ -49,7 +49,7 @@ def push_policy(
     source: str | Path,
     name: str,
     *,
-    results: Path | None = None,
+    results: str | Path | None = None,
     licence: str = "mit",
     private: bool = False,
     message: str = "",
@@ -81,7 +81,7 @@ def push_policy(
 
 
 def policy_files(
-    source: str | Path, name: str, *, results: Path | None = None, licence: str = "mit"
+    source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
 ) -> dict[str, Path | bytes]:
     """Return what `push_policy` pushes: path in the repository to a local file or content."""
     folder = _checkpoint(source)
@@ -90,11 +90,13 @@ def policy_files(
     files |= {file: folder / file for file in (WEIGHTS_FILE, CONFIG_FILE)}
     files |= {f"{TOKENIZER_FOLDER}/{p.name}": p for p in sorted((folder / TOKENIZER_FOLDER).glob("*"))}
     if results is not None:
-        files[FILE_NAME] = results / FILE_NAME if results.is_dir() else results
+        files[FILE_NAME] = _results_file(results)
     return files
 
 
-def policy_card(source: str | Path, name: str, *, results: Path | None = None, licence: str = "mit") -> str:
+def policy_card(
+    source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
+) -> str:
     """Write the model card of a checkpoint: network, training, scores with intervals, licence.
 
     Args:
@@ -111,7 +113,8 @@ def policy_card(source: str | Path, name: str, *, results: Path | None = None, l
     """
     require_torch("reading a checkpoint")
     folder, target = _checkpoint(source), repository(name)
-    scores = None if results is None else _of_weights(results, weights_hash(folder))
+    file = None if results is None else _results_file(results)
+    scores = None if file is None else _of_weights(file, weights_hash(folder))
     metadata = {
         "license": checked_licence(licence),
         "library_name": "openvima",
@@ -119,7 +122,7 @@ def policy_card(source: str | Path, name: str, *, results: Path | None = None, l
         "tags": TAGS,
         **({} if scores is None else {"model-index": [_model_index(target, scores)]}),
     }
-    confirmed = results is not None and is_marked_verified(results if results.is_dir() else results.parent)
+    confirmed = file is not None and is_marked_verified(file.parent)
     parts = [
         front_matter(metadata),
         f"# {target.repo.partition('/')[2]}\n",
@@ -139,6 +142,10 @@ def _checkpoint(source: str | Path) -> Path:
             f"{source} is a file; convert it to a checkpoint folder first: `openvima policies convert`."
         )
     return folder
+
+
+def _results_file(path: str | Path) -> Path:
+    return Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
 
 
 def _of_weights(path: Path, sha256: str) -> Results:
@@ -201,6 +208,7 @@ def _training(folder: Path) -> str:
     left_out = _setting(recorded["training"], "loader.exclude_tasks")
     values = {
         "demonstrations": data.get("episodes"),
+        "by task": ", ".join(f"{task} {count}" for task, count in _mapping(stated.get("tasks")).items()),
         "content hash of the demonstrations": stated.get("content_hash"),
         "tasks left out": left_out,
         "held-out demonstrations among them": data.get("held_out"),
