@@ -81,7 +81,6 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
         "episodes": f"{counts['episodes']:,}",
         "steps": f"{counts['steps']:,}",
         "content hash": manifest["content_hash"],
-        "licence": manifest["licence"],
         "written by": manifest["command"],
         **{package: f"version {version}" for package, version in sorted(manifest["versions"].items())},
     }
@@ -100,6 +99,7 @@ def demonstrations_card(dataset: Dataset, name: str) -> str:
         "Settings that decide the content:\n",
         fenced(json.dumps(manifest["config"], indent=1, sort_keys=True, ensure_ascii=False), "json"),
         f"## Use\n\n{_use(target)}",
+        f"## Licence\n\n{manifest['licence']}\n",
     ]
     return "\n".join(parts)
 

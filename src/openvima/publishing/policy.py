@@ -131,6 +131,7 @@ def policy_card(
         f"## Training\n\n{_training(folder)}",
         f"## Scores\n\n{_scores(scores, target, confirmed=confirmed)}",
         f"## Use\n\n{_use(target)}",
+        f"## Licence\n\nWeights: {checked_licence(licence)}. openvima: MIT.\n",
     ]
     return "\n".join(parts)
 
