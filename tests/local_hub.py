@@ -51,6 +51,7 @@ class LocalHub:
     private: set[str] = field(default_factory=set)
     objects: dict[str, bytes] = field(default_factory=dict)
     requests: list[str] = field(default_factory=list)
+    is_down: bool = False
 
     def repository(self, name: str, kind: str = "models") -> Repository:
         """Return a repository, a new one if there is none."""
@@ -94,6 +95,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _read(self) -> None:
         path = self._path()
+        if self.hub.is_down:
+            return self._refuse(503, "", "Service Unavailable")
         if found := _FILE.fullmatch(path):
             kind = "datasets" if found[1] else "models"
             return self._file(kind, found[2], unquote(found[3]), unquote(found[4]))

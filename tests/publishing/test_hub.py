@@ -95,14 +95,12 @@ def test_a_revision_stays_what_it_was_when_the_branch_moves_on(hub: LocalHub, de
 
 
 def test_what_was_fetched_is_read_without_a_connection(hub: LocalHub, demos: Path, monkeypatch) -> None:
-    import huggingface_hub
-
     push_demonstrations(demos, "owner/demos")
     Dataset("hf://owner/demos")
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    hub.requests.clear()
+    monkeypatch.setattr(hub, "is_down", True)
     assert len(Dataset("hf://owner/demos")) == 2
-    assert not hub.requests
+    with pytest.raises(HubError, match="the download of owner/others failed"):
+        Dataset("hf://owner/others")
 
 
 def test_a_shard_that_changed_since_is_not_pushed(hub: LocalHub, demos: Path) -> None:
