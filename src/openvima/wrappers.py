@@ -127,10 +127,10 @@ class FlatObservation(gymnasium.Wrapper):
         self._prompt = self._encoded_prompt()
         return self.observation(observation), info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         """Take a step."""
-        observation, *rest = self.env.step(action)
-        return self.observation(observation), *rest
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self.observation(observation), float(reward), terminated, truncated, info
 
     def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
         """Return an observation of the running episode as a vector."""
