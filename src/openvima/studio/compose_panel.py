@@ -21,7 +21,7 @@ from openvima.scene.pose import quaternion_yaw
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of, move
 
-_GIZMO, _REFUSED = "/compose/gizmo", "/compose/refused"
+_GIZMO, _REFUSED = "/compose/gizmo", "refused"
 _GIZMO_M = 0.12
 _REFUSED_RGB = (220, 30, 30)
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
@@ -258,7 +258,7 @@ class ComposePanel:
 
     def _show_selected(self) -> None:
         """Show the selected object's fields, and the gizmo at it."""
-        self.session.client.scene.remove_by_name(_REFUSED)
+        self.session.client.scene.remove_by_name(f"{self.session.table.root}/{_REFUSED}")
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None

@@ -1,6 +1,7 @@
 """*You*: act by clicks, and record own successes as demonstrations."""
 
 import math
+from functools import partial
 
 import viser
 
@@ -13,8 +14,9 @@ from openvima.scene import Action
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of
 
-_GHOST, _START = "/you/ghost", "/you/start"
+_GHOST, _START = "you/ghost", "/you/start"
 _START_RGB, _START_M = (220, 120, 0), 0.008
+_TURN_DEG = 15  # of the key T
 _HELP = {
     "suction": "Click an **object**, then the **place** to put it, or drag it. The ghost shows its turn.",
     "spatula": "Click a **block**, or where to begin, then where the **sweep** ends; or drag a block there.",
@@ -41,6 +43,9 @@ class UserPanel:
             session.add_buttons("", {**works, "next seed": lambda: session.next_seed()})
             self._record = gui.add_markdown("")
         self._turn.on_update(session.callback(self._preview))
+        for modifier, step in ((None, _TURN_DEG), ("shift", -_TURN_DEG)):
+            command = gui.add_command(f"turn by {step}°", hotkey="T", modifier=modifier)
+            command.on_trigger(lambda _, step=step: session.interrupt(partial(self._turn_by, step)))
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._dragged)
         session.on_change(self._show)
@@ -92,6 +97,10 @@ class UserPanel:
         self._turn.value = 0
         self._own.append(action)
         self.session.step(action)
+
+    def _turn_by(self, degrees: int) -> None:
+        self._turn.value = (self._turn.value + degrees + 180) % 360 - 180
+        self._preview()
 
     def _turn_in_place(self) -> None:
         if self._first is not None:
