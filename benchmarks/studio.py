@@ -146,7 +146,7 @@ def browser_start_s() -> float | None:
         page.raw.evaluate(
             "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
         )
-        return time.perf_counter() - start
+        return round(time.perf_counter() - start, 3)
 
 
 def step_times(viewer: Viewer, rounds: int) -> dict[str, float]:

@@ -35,9 +35,12 @@ def first_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `openvima quickstart` writes, after a training of two steps."""
 
     def train_briefly(config: training.TrainingConfig, report: Any) -> Path:
-        schedule = replace(config.schedule, steps=2)
-        loader = replace(config.loader, batch_size=4)
-        return train(replace(config, schedule=schedule, loader=loader), report)
+        changes = {
+            "schedule": replace(config.schedule, steps=2),
+            "loader": replace(config.loader, batch_size=4),
+            "pretraining": replace(config.pretraining, steps=0),
+        }
+        return train(replace(config, **changes), report)
 
     out, train = tmp_path_factory.mktemp("first") / "quickstart", training.train
     with pytest.MonkeyPatch.context() as patch:
