@@ -7,7 +7,7 @@ gives every command, image and state in between.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -76,6 +76,11 @@ class DenseLayout(FrameLayout):
             "next.done": is_last,
             "next.success": success,
         }
+
+    def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
+        """Return an observation of the environment in the form in which LeRobot's environments return it."""
+        values = (*observation["joints"], *observation["tool"], observation["ee"])
+        return {**FrameLayout.frame(self, observation, prompt), "agent_pos": np.array(values, np.float32)}
 
 
 def dense_settings(dataset: Dataset) -> dict[tuple[str, str], EnvConfig]:
