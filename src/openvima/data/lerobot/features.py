@@ -177,7 +177,7 @@ def _within_bounds(values: np.ndarray) -> np.ndarray:
     if not np.isfinite(values).all():
         return values
     if len(values) == len(WORKSPACE_LOW):
-        return np.clip(values, np.float32(WORKSPACE_LOW), np.float32(WORKSPACE_HIGH))
+        return np.clip(values, *np.array([WORKSPACE_LOW, WORKSPACE_HIGH], np.float32))
     return np.clip(values / max(float(np.linalg.norm(values)), 1e-6), -1, 1).astype(np.float32)
 
 
