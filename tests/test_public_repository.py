@@ -42,7 +42,8 @@ def test_the_page_has_every_version_of_the_code() -> None:
 def test_all_files_name_the_same_version_of_the_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert project["version"] == citation["version"] == openvima.__version__
+    plugin = tomllib.loads((ROOT / "plugins/lerobot/pyproject.toml").read_text("utf-8"))["project"]
+    assert project["version"] == plugin["version"] == citation["version"] == openvima.__version__
 
 
 def test_workflows_cover_the_pythons_that_are_promised_and_store_no_token() -> None:
