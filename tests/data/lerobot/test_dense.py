@@ -9,7 +9,7 @@ import pytest
 import openvima
 from openvima.data import Dataset, GenerateConfig, generate
 from openvima.data.lerobot import LerobotConfig, export_lerobot
-from openvima.data.lerobot.dense import dense_trajectory
+from openvima.data.lerobot.dense import DenseLayout, dense_trajectory
 from openvima.data.verification.replay import first_difference
 from openvima.env import EnvConfig
 from openvima.errors import ConfigError, DatasetError
@@ -36,9 +36,10 @@ def test_the_export_has_a_frame_for_each_command_at_its_true_time(data, tmp_path
         demo.task, level="train", domain="train", control="end_effector", modalities=("rgb", "joints")
     )
     observation, _ = env.reset(seed=demo.seed)
+    layout = DenseLayout(num_prompt_images=len(demo.prompt.images), has_joints=True)
     for row in table.select(["observation.state", "action", "next.success"]).to_pylist():
-        seen = (*observation["joints"], *observation["tool"], observation["ee"])
-        assert np.array_equal(row["observation.state"], np.array(seen, np.float32))
+        frame = layout.frame(observation, env.prompt)  # as LeRobot's environments return it
+        assert np.array_equal(row["observation.state"], frame["agent_pos"])
         observation, *_, info = env.step(np.array(row["action"], np.float32))
         assert info["success"] == row["next.success"]
     assert info["success"]
