@@ -80,7 +80,7 @@ class TensorBoardTracker(Tracker):
 
     def add_animations(self, prefix: str, animations: Sequence[Animation], step: int) -> None:
         """Log rollouts as animated images."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore  # generated at run time
 
         for animation in animations:
             tag = f"{prefix}/{animation.name}"
