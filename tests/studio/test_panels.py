@@ -232,11 +232,7 @@ def test_a_failure_of_the_first_command_is_played_again_by_the_policy_trained_th
     steps = session.current.steps
     actions = [np.concatenate([*step.action.to_arrays().values()]) for step in steps]
     assert np.allclose(actions, recorded.actions, atol=1e-6)
-    session.submit(lambda: session.back(0)).result()
-    page.tab("Why")
-    page.check("show why")
-    heat_maps = {"/first/why/pose0", "/first/why/pose1"}
-    wait_until(page, lambda: heat_maps <= session.client.scene._handle_from_node_name.keys())
+    assert all(step.proposal.explanation is not None for step in steps)
 
 
 def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded: Path) -> None:
