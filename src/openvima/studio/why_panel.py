@@ -105,7 +105,7 @@ class WhyPanel:
             opacity = heat_opacity(explanation.heat_map(pose)).T  # rows are y, columns are x
             image = np.empty((*opacity.shape, 4), np.uint8)
             image[..., :3], image[..., 3] = colour, np.rint(255 * opacity)
-            at = (*(low + size / 2), height_m)
+            at = np.array([*(low + size / 2), height_m])
             name = f"{table.root}/why/{pose}"
             node = self.session.client.scene.add_image(name, image, *size, format="png", position=at)
             self._nodes.append(node)
