@@ -135,7 +135,7 @@ def running_studio() -> Iterator[tuple[subprocess.Popen, str, float]]:
 def browser_start_s() -> float | None:
     """Return seconds from the command until a page shows the first episode; None without a browser."""
     try:
-        from studio_page import Page, find_browser, launched_browser
+        from studio_page import Page, find_browser, launched_browser  # type: ignore[import]  # of tests
     except ImportError:
         return None
     if find_browser() is None:

@@ -1,7 +1,6 @@
 """*You*: act by clicks, and record own successes as demonstrations."""
 
 import math
-from functools import partial
 
 import viser
 
@@ -43,9 +42,9 @@ class UserPanel:
             session.add_buttons("", {**works, "next seed": lambda: session.next_seed()})
             self._record = gui.add_markdown("")
         self._turn.on_update(session.callback(self._preview))
-        for modifier, step in ((None, _TURN_DEG), ("shift", -_TURN_DEG)):
-            command = gui.add_command(f"turn by {step}°", hotkey="T", modifier=modifier)
-            command.on_trigger(lambda _, step=step: session.interrupt(partial(self._turn_by, step)))
+        gui.add_command(f"turn by {_TURN_DEG}°", hotkey="T").on_trigger(lambda _: self._turn_by(_TURN_DEG))
+        back = gui.add_command(f"turn by -{_TURN_DEG}°", hotkey="T", modifier="shift")
+        back.on_trigger(lambda _: self._turn_by(-_TURN_DEG))
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._dragged)
         session.on_change(self._show)
@@ -100,7 +99,7 @@ class UserPanel:
 
     def _turn_by(self, degrees: int) -> None:
         self._turn.value = (self._turn.value + degrees + 180) % 360 - 180
-        self._preview()
+        self.session.interrupt(self._preview)
 
     def _turn_in_place(self) -> None:
         if self._first is not None:
