@@ -1,6 +1,7 @@
 """Success of the oracle on the evaluation episodes of each task and level.
 
-    python benchmarks/oracle.py [--episodes N] [--workers K] [--levels L1,L2,…] [--out DIR] [--record]
+    python benchmarks/oracle.py [--episodes N] [--workers K] [--levels L1,L2,…] [--seed S]
+                                [--control end_effector] [--out DIR] [--record]
 
 Runs them with `openvima evaluate` (resumable), prints every failure with its seed and reason, and with
 `--record` writes the counts for `openvima tasks`.
@@ -11,7 +12,9 @@ import json
 from pathlib import Path
 
 from openvima.catalog import LEVELS
+from openvima.env import EnvConfig
 from openvima.evaluation import EvaluationConfig, Results, evaluate
+from openvima.scene.command import CONTROLS, PRIMITIVES
 
 RECORD = Path(__file__).parents[1] / "src/openvima/tasks/oracle_success.json"
 
@@ -33,6 +36,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--tasks", default="all")
     parser.add_argument("--levels", default=",".join(LEVELS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--control", choices=CONTROLS, default=PRIMITIVES)
     parser.add_argument("--out", type=Path, default=Path("oracle"))
     parser.add_argument("--record", action="store_true")
     options = parser.parse_args()
@@ -44,6 +49,8 @@ def main() -> None:
         workers=options.workers,
         out=options.out,
         batch=50,
+        seed=options.seed,
+        env_config=EnvConfig(control=options.control),
     )
     results = Results.read(evaluate(config))
     found = counts(results)
@@ -55,7 +62,7 @@ def main() -> None:
         for outcome in row.outcomes:
             if not outcome.success:
                 print(f"failed: {row.task} {row.level} seed {outcome.seed}: {outcome.reason}")
-    if options.record:
+    if options.record and options.control == PRIMITIVES:
         record = {
             "command": "python benchmarks/oracle.py --record",
             "versions": results.versions,

@@ -53,6 +53,11 @@ class Page:
         """Press a button."""
         self.raw.get_by_role("button", name=button, exact=True).click()
 
+    def press_at_once(self, *buttons: str) -> None:
+        """Press buttons, one directly after the other."""
+        press = "name => [...document.querySelectorAll('button')].find(b => b.textContent === name).click()"
+        self.raw.evaluate(f"names => names.forEach({press})", [*buttons])
+
     def choose(self, label: str, option: str) -> None:
         """Choose from a dropdown."""
         self.raw.get_by_label(label, exact=True).first.click()

@@ -27,6 +27,7 @@ ORDER = (
     "training",
     "evaluation",
     "report",
+    "publishing",
     "studies",
     "studio",
     "cli",

@@ -115,6 +115,10 @@ class CheckpointError(OpenVimaError, ValueError):
     """A checkpoint is damaged or does not match the model."""
 
 
+class HubError(OpenVimaError, ValueError):
+    """The Hugging Face Hub has no such repository or revision, refuses, or cannot be reached."""
+
+
 class ConfigError(OpenVimaError, ValueError):
     """An option out of range, or options that contradict each other."""
 

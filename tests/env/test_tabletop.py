@@ -318,7 +318,7 @@ def test_an_object_thrown_out_of_the_game_ends_it(monkeypatch: pytest.MonkeyPatc
     env.reset(seed=5)
     lost = Outcome(failure=True, reason="object 5 (red swirl flower) left the workspace")
     progress = env.progress
-    monkeypatch.setattr("openvima.env.tabletop.goals.advance", lambda *_: (progress, lost))
+    monkeypatch.setattr("openvima.env.running_episode.goals.advance", lambda *_: (progress, lost))
     _, reward, terminated, truncated, info = env.step(idle_action())
     assert (reward, terminated, truncated) == (0.0, True, False)
     assert info["reason"] == lost.reason

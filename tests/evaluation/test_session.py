@@ -1,13 +1,19 @@
 """Sessions: stepping, going back, errors of policies as values, and comparing two runs."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from openvima.catalog import load_assets
+from openvima.env.composition import Composition
+from openvima.env.episode_file import load_episode, save_episode
 from openvima.errors import ActionError, EpisodeError
 from openvima.evaluation.free_play import play
 from openvima.evaluation.rollout_policies import OracleRolloutPolicy, load_own_rollout_policy
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies import RandomPolicy
+from openvima.policies.bundled import SMALL
 from openvima.scene import Action
 from openvima.tasks import sample_episode
 
@@ -111,3 +117,20 @@ def test_own_policies_share_no_episodes() -> None:
     one, other = EpisodeSession(EPISODE, first), EpisodeSession(EPISODE, second)
     assert one.propose().action == other.propose().action
     assert load_own_rollout_policy("random") is not first
+
+
+def test_a_composed_scene_ends_from_its_file_as_it_did_in_its_session(tmp_path: Path) -> None:
+    assets, goals = load_assets("procedural"), (("in", "a", "b"), ("in", "c", "b"))
+    scene = Composition((), "Put the {a} and the {c} into the {b}.", goals=goals, max_steps=3)
+    for name in ("block", "container", "heart"):
+        scene = scene.added(name, "red swirl", assets)
+    episode = scene.moved("a", (0.4, 0.2), 30).changed("c", scale=0.8).episode(assets)
+    session = EpisodeSession(episode, load_own_rollout_policy(SMALL))  # as in the studio
+    outcome = session.run()
+    played = play(load_episode(save_episode(episode, tmp_path / "scene.yaml")), SMALL)  # as in `demo`
+    assert actions(session) and list(played.actions) == actions(session)
+    assert outcome is not None and (played.outcome.success, played.outcome.reason) == (
+        outcome.success,
+        outcome.reason,
+    )
+    assert played.scene == session.scene

@@ -21,7 +21,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 # another simulator.
 APART = (
     *("policy_server", "custom_learner", "own_network", "own_training_loop", "score_my_policy"),
-    "score_in_original_benchmark",
+    *("score_in_original_benchmark", "dagger"),
 )
 
 
@@ -66,6 +66,17 @@ def test_the_network_of_ones_own_is_trained_and_scored(
     trained = results.policies["own_network"]
     Path("own_network.pt").unlink()
     assert PolicySource("own", "own_network.py:make").record()["weights_sha256"] != trained["weights_sha256"]
+
+
+@pytest.mark.slow
+def test_dagger_and_behaviour_cloning_are_compared_at_equal_labels() -> None:
+    pytest.importorskip("torch")
+    words = ["--labels", "9", "--rounds", "3", "--steps", "3", "--episodes", "2"]
+    script = str(EXAMPLES[0].with_name("dagger.py"))
+    done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["behaviour cloning, 9 labels", "DAgger, 9 labels"]
+    assert all(" of 2, " in line for line in lines)
 
 
 @pytest.mark.slow

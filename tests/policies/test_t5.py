@@ -13,6 +13,7 @@ pytest.importorskip("transformers")
 
 from naive_inputs import NaiveProcessor  # noqa: E402
 from openvima.errors import CheckpointError, MissingExtraError, PolicyError, PromptError  # noqa: E402
+from openvima.hub import HubName  # noqa: E402
 from openvima.policies.build import build_network  # noqa: E402
 from openvima.policies.nn.policy_network import PolicyNetwork  # noqa: E402
 from openvima.policies.nn.text_encoder import RmsNorm, TextEncoderConfig  # noqa: E402
@@ -191,14 +192,14 @@ def test_an_invalid_id_causes_no_request_to_the_hub(name, monkeypatch) -> None:
         T5Tokenizer(name)
 
 
-@pytest.mark.parametrize("name", ["t5-base", "google-t5/t5-base"])
+@pytest.mark.parametrize("name", ["t5-base", "google-t5/t5-base", "t5-base@v2", "google-t5/t5-base@v2"])
 def test_an_id_is_fetched_from_the_hub_without_anything_that_is_not_needed(
     name, tokenizer_folder, monkeypatch
 ) -> None:
     asked = []
 
-    def download(repository: str, allow_patterns: list[str]) -> str:
-        asked.append((repository, allow_patterns))
+    def download(repository: str, *, revision: str | None, allow_patterns: list[str], **_: object) -> str:
+        asked.append((f"{repository}@{revision}" if revision else repository, allow_patterns))
         return str(tokenizer_folder)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
@@ -360,11 +361,11 @@ def test_weights_are_fetched_from_the_hub_pickled_only_if_there_are_no_others(
     asked = []
     torch.save(reference.state_dict(), tmp_path / "pytorch_model.bin")
 
-    def fetch(name: str, files: tuple[str, ...]) -> Path:
-        asked.append((name, files))
+    def fetch(name: HubName, files: tuple[str, ...]) -> Path:
+        asked.append((str(name), files))
         return weights_folder if kept == "model.safetensors" else tmp_path
 
-    monkeypatch.setattr("openvima.policies.t5.fetch_from_hub", fetch)
+    monkeypatch.setattr("openvima.policies.t5.fetch", fetch)
     loaded(small_sizes, Path("google-t5/t5-tiny"))
     files = ("model.safetensors", "pytorch_model.bin")
     assert asked == [("google-t5/t5-tiny", (file,)) for file in files[: files.index(kept) + 1]]

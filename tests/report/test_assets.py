@@ -19,6 +19,7 @@ def test_solved_episodes_are_recorded_and_failures_of_trained_policies_too(resul
     recorded = [(job.batch.policy, job.batch.task, job.batch.level, job.batch.first_seed) for job in jobs]
     assert recorded == [
         *(("mine", "rotate", "L1", seed) for seed in (0, 1, 9)),
+        *(("mine", "rotate", "L3", seed) for seed in (0, 1, 3, 4)),
         *(("mine", "stack<b>", "L1", seed) for seed in (0, 1, 6, 7)),
         *(("oracle", "rotate", "L1", seed) for seed in (0, 1)),
         *(("oracle", "stack<b>", "L1", seed) for seed in (0, 1)),

@@ -16,6 +16,7 @@ from openvima.report.curves import read_charts, read_run_charts, run_labels
 from openvima.report.figures import curve_chart
 from openvima.report.page import default_command
 from openvima.report.published import published_tasks
+from openvima.report.reasons import plain_reason
 from openvima.report.text import role
 from openvima.video.clips import load_clips, save_clips
 
@@ -89,7 +90,7 @@ def test_the_page_needs_nothing_from_elsewhere(text):
     page = Page(text)
     assert all(resource.startswith(("data:", "#")) for resource in page.resources)
     assert not re.search(r"https?://|@import|url\((?!#)", text)
-    assert "script" not in page.tags
+    assert page.tags.count("script") == 1  # of the package itself
     assert {"video", "svg", "table", "img"} <= set(page.tags)
 
 
@@ -139,12 +140,13 @@ def test_the_headline_is_that_of_the_trained_policy(text):
 def test_names_and_reasons_are_escaped(text):
     assert "stack<b>" not in text.replace("&lt;", "")
     assert "stack&lt;b&gt;" in text
-    assert "object &lt;6&gt; left" in text
+    assert "an object &lt;6&gt; left" in text
+    assert "the red &lt;swirl&gt; letter A left the workspace" in text
 
 
 def test_failure_causes_are_counted_over_tasks(text):
     rows = [[cell.strip() for cell in row] for row in Page(section(text, "failures")).tables[0]]
-    assert ["mine", "object left the workspace", "12", "40.0 %", "rotate 8, stack<b> 4"] in rows
+    assert ["mine", "an object left the workspace", "12", "40.0 %", "rotate 8, stack<b> 4"] in rows
     assert ["oracle", "every episode was solved"] in rows
 
 
@@ -426,3 +428,85 @@ def test_a_single_episode_is_counted_in_the_singular(results, tmp_path):
 def test_a_policy_is_described_with_the_tasks_that_its_training_left_out(results) -> None:
     policies = {**results.policies, "mine": {"kind": "run", "excluded_tasks": ["follow_order", "twist"]}}
     assert role(replace(results, policies=policies), "mine").endswith(" Trained without follow_order, twist.")
+
+
+def test_every_section_is_in_the_navigation_in_its_order(text):
+    navigation = re.search(r'<nav class="contents".*?</nav>', text, flags=re.DOTALL)[0]
+    assert re.findall(r'href="#(\w+)"', navigation) == re.findall(r'<section id="(\w+)"', text)
+
+
+def test_all_episodes_are_listed_failures_first_and_lead_to_their_videos(text):
+    rows = [[cell.strip() for cell in row] for row in Page(section(text, "episodes")).tables[0]]
+    assert rows[0] == ["policy", "level", "task", "seed", "outcome", "steps", "reason"]
+    assert len(rows) == 1 + 90
+    reason = "the red <swirl> letter A left the workspace"
+    assert rows[1] == ["mine", "L1", "rotate", "▶ 9", "failed", "2", reason]
+    assert rows[-1] == ["random", "L1", "stack<b>", "0", "solved", "2", ""]
+    assert 'data-value="an object left the workspace"' in section(text, "episodes")
+    assert '<a href="#video-1">' in text and 'id="video-1"' in section(text, "videos")
+
+
+def test_of_very_many_episodes_failures_alone_are_listed(results, tmp_path, monkeypatch):
+    monkeypatch.setattr("openvima.report.episodes.MOST_EPISODES", 50)
+    text = write_report(results, tmp_path / "a.html").read_text(encoding="utf-8")
+    listed = section(text, "episodes")
+    assert "41 failures of 90 episodes" in listed and ">solved<" not in listed
+
+
+def test_episodes_that_only_one_policy_solved_are_named(text):
+    tables = Page(section(text, "comparison")).tables
+    apart = next(table for table in tables if table[0][0].strip() == "task" and "level" in table[0][1])
+    stack = next(row for row in apart if "stack<b>" in row[0])
+    assert [" ".join(cell.split()) for cell in stack[1:]] == ["L1", "1, 2, 3, 4, 5", "–"]
+
+
+def test_a_video_that_two_evaluations_made_is_shown_once(results, clip, tmp_path):
+    text = write_report(results, tmp_path / "a.html", clips=[clip, clip]).read_text(encoding="utf-8")
+    assert text.count("<video") == 1
+
+
+@pytest.mark.parametrize(
+    ("reason", "plain"),
+    [
+        ("object 6 (red letter A) left the workspace", "the red letter A left the workspace"),
+        (
+            "object 6 (a b) is where distractor object 7 (c d) is",
+            "the a b was put where the c d, a distractor, lies",
+        ),
+        ("object 6 (a b) came before object 7 (c d)", "the a b was moved before the c d"),
+        ("object came before object", "an object was moved before an object"),
+        ("2 goals are met instead of 1", "too much was moved: 2 goals met instead of 1"),
+        ("not done within the step limit: 1 of 3 goals were met", "out of steps, 1 of 3 goals met"),
+        ("something of one's own", "something of one's own"),
+    ],
+)
+def test_reasons_are_plain_english(reason, plain):
+    assert plain_reason(reason) == plain
+
+
+@pytest.mark.slow
+def test_a_browser_sorts_filters_and_unfolds(text, tmp_path, browser):
+    path = tmp_path / "report.html"
+    path.write_text(text, encoding="utf-8")
+    page = browser.new_page(viewport={"width": 400, "height": 800})
+    page.goto(path.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == 400
+
+    page.locator(".contents a[href='#episodes']").click()
+    page.locator("#episodes summary").click()
+    page.locator(".filters select").nth(0).select_option("mine")
+    page.locator(".filters select").nth(3).select_option("failed")
+    assert page.locator(".filters output").inner_text() == "12 of 90 episodes"
+    assert page.locator("#episodes tbody tr:visible").count() == 12
+
+    seeds = page.locator("#episodes tbody tr:visible td:nth-child(4)")
+    head = page.locator("#episodes thead button").nth(3)
+    for order in (sorted, lambda values: sorted(values, reverse=True)):
+        head.click()
+        found = [int(seed.replace("▶", "")) for seed in seeds.all_inner_texts()]
+        assert found == order(found) and len(set(found)) > 3
+
+    page.locator("#results thead button").nth(1).click()
+    names = page.locator("#results tbody").nth(0).locator("th").all_inner_texts()
+    assert [name.split()[0] for name in names] == ["L1", "stack<b>", "rotate", "mean", "mean"]
+    page.close()

@@ -2,26 +2,53 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from openvima import training
+from openvima.cli import quickstart
 from openvima.data import Dataset
 from openvima.evaluation import EvaluationConfig, evaluate
+from openvima.evaluation.evaluated_episode import evaluated_episode
 from openvima.scene import Pose
 from openvima.tasks import sample_episode
 
 pytestmark = pytest.mark.slow
 
 TASKS = ("rotate", "visual_manipulation")
+REFUSED = "/first/refused"
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("results")
     evaluate(EvaluationConfig(("random",), TASKS, ("L1", "L2"), episodes=2, out=out))
+    return out
+
+
+@pytest.fixture(scope="module")
+def first_results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `openvima quickstart` writes, after a training of two steps."""
+
+    def train_briefly(config: training.TrainingConfig, report: Any) -> Path:
+        changes = {
+            "schedule": replace(config.schedule, steps=2),
+            "loader": replace(config.loader, batch_size=4),
+            "pretraining": replace(config.pretraining, steps=0),
+        }
+        return train(replace(config, **changes), report)
+
+    out, train = tmp_path_factory.mktemp("first") / "quickstart", training.train
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "train", train_briefly)
+        patch.setattr(quickstart, "TASKS", ("visual_manipulation",))
+        patch.setattr(quickstart, "LEVELS", ("L3",))
+        patch.setattr(quickstart, "BASELINES", ("oracle",))
+        quickstart.main(out=out, demonstrations=4, episodes=2, workers=1)
     return out
 
 
@@ -52,16 +79,31 @@ def settle(session: Any) -> None:
     session.submit(lambda: None).result()
 
 
-def click(page: Any, session: Any, position: tuple[float, float, float]) -> None:
-    """Click where a point of the world is in view."""
+def pixel_of(page: Any, session: Any, position: tuple[float, float, float]) -> tuple[float, float]:
+    """Return where a point of the world is in view."""
     camera = session.client.camera
     w, x, y, z = camera.wxyz.tolist()
     seen = (Pose(tuple(camera.position.tolist()), (x, y, z, w)).inverse() @ Pose(position)).position
     box = page.raw.locator("canvas").first.bounding_box()
     scale = box["height"] / 2 / math.tan(camera.fov / 2) / seen[2]
     left = box["x"] + box["width"] / 2 + scale * seen[0]
-    top = box["y"] + box["height"] / 2 + scale * seen[1]
-    page.raw.mouse.click(left, top)
+    return left, box["y"] + box["height"] / 2 + scale * seen[1]
+
+
+def click(page: Any, session: Any, position: tuple[float, float, float]) -> None:
+    """Click where a point of the world is in view."""
+    page.raw.mouse.click(*pixel_of(page, session, position))
+
+
+def drag(page: Any, session: Any, *points: tuple[float, float, float]) -> None:
+    """Drag from the first point of the world over the others to the last."""
+    first, *others = (pixel_of(page, session, point) for point in points)
+    page.raw.mouse.move(*first)
+    page.raw.wait_for_timeout(1000)  # until what is below the pointer is drawn as such
+    page.raw.mouse.down()
+    for each in others:
+        page.raw.mouse.move(*each, steps=4)
+    page.raw.mouse.up()
 
 
 def wait_until(page: Any, condition: Callable[[], bool]) -> None:
@@ -139,6 +181,32 @@ def test_an_impossible_move_is_refused_and_shown(page: Any, studio: Any) -> None
     assert session.current.scene.placements[0].pose == block.pose
 
 
+def test_the_gizmo_drags_objects_onto_the_table_but_not_into_others(page: Any, studio: Any) -> None:
+    session = newest(studio)
+    page.tab("Compose")
+    page.press("new scene")
+    wait_until(page, lambda: session.editing)
+    settle(session)
+    before, bowl = session.current.scene.placements
+    page.choose("selected", "a")
+    settle(session)
+    (x, y, z), arrow_m = before.pose.position, 0.1
+    away = -0.15 if bowl.pose.y > y else 0.15  # from the bowl
+    drag(page, session, (x, y + arrow_m, 0.05), (x, y + arrow_m + away, 0.05))
+    wait_until(page, lambda: session.current.scene.placements[0].pose != before.pose)
+    settle(session)
+    moved = session.current.scene.placements[0].pose
+    assert abs(moved.y - y - away) < 0.03 and abs(moved.x - x) < 0.005
+    assert moved.z == z and round(moved.y, 3) == moved.y  # at its rest height, in whole millimetres
+    centre, onto = (moved.x, moved.y, z), (bowl.pose.x, bowl.pose.y, z)
+    drag(page, session, centre, onto)  # the object itself
+    page.wait_for("overlaps object")
+    settle(session)
+    assert session.current.scene.placements[0].pose == moved
+    assert tuple(session.table.objects[before.id].position) == moved.position  # as shown
+    assert REFUSED in session.client.scene._handle_from_node_name  # where it was refused
+
+
 def test_a_failure_of_a_results_folder_is_played_again(page: Any, studio: Any) -> None:
     session = newest(studio)
     page.raw.get_by_role("button", name="L2 0", exact=True).first.click()
@@ -148,6 +216,23 @@ def test_a_failure_of_a_results_folder_is_played_again(page: Any, studio: Any) -
     episode = session.current.episode
     assert (episode.task, episode.level, episode.seed) == ("rotate", "L2", 0)
     assert not session.current.outcome.success
+
+
+def test_a_failure_of_the_first_command_is_played_again_by_the_policy_trained_there(
+    page: Any, studio: Any, first_results: Path
+) -> None:
+    session = newest(studio)
+    page.tab("Browse")
+    page.fill("folder", str(first_results))
+    page.wait_for("visual_manipulation, L3")
+    page.press("live")
+    wait_until(page, lambda: session.current.episode.domain == "eval" and session.current.outcome is not None)
+    recorded = evaluated_episode(first_results, "trained", "visual_manipulation", "L3", 0)
+    assert session.current.outcome.reason == recorded.outcome.reason and not recorded.outcome.success
+    steps = session.current.steps
+    actions = [np.concatenate([*step.action.to_arrays().values()]) for step in steps]
+    assert np.allclose(actions, recorded.actions, atol=1e-6)
+    assert all(step.proposal.explanation is not None for step in steps)
 
 
 def test_demonstrations_are_found_and_scrubbed(page: Any, studio: Any, recorded: Path) -> None:

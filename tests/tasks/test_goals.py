@@ -24,6 +24,7 @@ from openvima.scene import (
     ZoneKeptClear,
 )
 from openvima.tasks import Progress, advance, begin, monitor
+from openvima.tasks.goals import measure
 
 BASE, TARGET, DISTRACTOR, SECOND = 5, 6, 7, 8
 BASE_POSE = Pose.planar(0.5, 0.2)
@@ -306,3 +307,45 @@ def test_a_problem_without_goals_never_ends_by_itself() -> None:
 def test_constraints_hold_without_goals_too() -> None:
     problem = put_problem(goals=(), constraints=(ZoneKeptClear((TARGET,), Zone(0.5, 0.2, 0.1, 0.1)),))
     assert judged(problem, {TARGET: BASE_POSE}).failure
+
+
+def measured(problem: Problem, poses: dict[int, Pose]) -> tuple[float, ...]:
+    scene = problem.scene.with_poses(poses)
+    return tuple(measure(problem, advance(problem, begin(problem), scene)[0], scene).values())
+
+
+def test_progress_is_measured_to_the_nearest_open_goal() -> None:
+    problem = put_problem()
+    assert measured(problem, {}) == pytest.approx((0, math.hypot(0.1, 0.4), 0))
+    assert measured(problem, {TARGET: BASE_POSE.moved(dy=0.15)}) == pytest.approx((0, 0.15, 0))
+    assert measured(problem, {TARGET: BASE_POSE.moved(dy=0.05)}) == (1, 0, 0)
+    turn = rotate_problem(Pose.planar(0.4, 0.0), math.radians(60))
+    assert measured(turn, {TARGET: Pose.planar(0.4, 0.1, math.radians(30))}) == pytest.approx(
+        (0, 0.1, math.radians(30))
+    )
+
+
+def test_progress_counts_the_required_goals_only() -> None:
+    problem = sweep_problem(2)
+    met, distance_m, _ = measured(problem, in_zone(4))
+    assert met == 0.5 and distance_m > 0
+    assert measured(problem, in_zone(4, 5)) == (1, 0, 0)
+    assert measured(problem, in_zone(4, 5, 6))[0] == 1
+
+
+def test_progress_measures_goals_of_the_running_stage() -> None:
+    second = AtPose(DISTRACTOR, Pose.planar(0.6, -0.41), Tolerance(0.001))
+    problem = put_problem(constraints=())
+    problem = replace(problem, goals=(*problem.goals, second), stages=(1, 1))
+    assert measured(problem, {})[1] == pytest.approx(math.hypot(0.1, 0.4))
+    assert measured(problem, {TARGET: BASE_POSE}) == pytest.approx((0.5, 0.01, 0))
+
+
+def test_progress_without_goals_or_distances_is_zero_and_not_a_number() -> None:
+    class Anywhere:
+        def is_met(self, scene: Scene) -> bool:
+            return False
+
+    for goals in ((), (Anywhere(),)):
+        met, *distances = measured(put_problem(goals=goals, constraints=()), {})
+        assert met == 0 and all(map(math.isnan, distances))

@@ -119,15 +119,32 @@ def test_weights_that_do_not_fit_are_refused(example, tmp_path) -> None:
         learner.read(tmp_path)
 
 
-def test_rollouts_are_logged_with_their_step(settings) -> None:
-    seen = []
+def test_rollouts_are_logged_with_their_step(settings, monkeypatch) -> None:
+    seen, tracked = [], []
+
+    class Noted:
+        def add(self, prefix: str, values: dict, step: int) -> None:
+            tracked.append((prefix, step, {*values} & {"loss", "rollout_success"}))
+
+        def add_animations(self, prefix: str, animations: list, step: int) -> None:
+            ((animation,),) = (animations,)
+            assert animation.frames.shape[1:] == (128, 256, 3)
+            tracked.append((prefix, step, animation.name))
+
+        def close(self) -> None:
+            tracked.append("closed")
 
     def rollout(checkpoint: Path) -> dict[str, float]:
         seen.append(checkpoint.name)
         return OnlineEval(("rotate",), episodes=2)(checkpoint)
 
+    monkeypatch.setattr("openvima.training.loop.open_trackers", lambda *_: [Noted()])
     config = TrainingConfig.of({**settings, "rollout.every": 4})
-    train(config, rollout=rollout)
+    train(config, rollout=rollout, animate=OnlineEval(("rotate",), episodes=1).animate)
+    at = tracked.index(("2-cloning", 8, {"rollout_success"}))  # after 4 steps of pretraining
+    assert tracked[at + 1] == ("2-cloning", 8, "rotate")
+    assert ("1-pretraining", 4, {"loss"}) in tracked
+    assert tracked[-1] == "closed"
     assert seen == ["2-cloning-000004"]
     lines = [json.loads(line) for line in (config.out / "metrics.jsonl").read_text().splitlines()]
     (trial,) = [line for line in lines if "rollout_success" in line]

@@ -35,7 +35,7 @@ def main(
         level: train, L1, L2, L3 or L4; by default the task's first.
         policy: oracle, openvima-small (bundled), random, untrained, a preset, the
             folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of your own,
-            a published file, an id on the Hugging Face Hub, or a policy server (ws://HOST:PORT).
+            a published file, OWNER/NAME[@REVISION] on the Hub, or a policy server (ws://HOST:PORT).
         assets: procedural, original (see `openvima assets import`), a checkout of the original benchmark,
             or FILE.py:FUNCTION, which registers assets of your own.
         compat: Follow the original benchmark also where it is odd.

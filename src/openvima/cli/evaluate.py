@@ -32,6 +32,7 @@ def main(
     compat: bool = False,
     prompts: str = "multimodal",
     task_options: str = "",
+    control: Literal["primitives", "end_effector"] = "primitives",
     ablations: str = "",
     in_context: bool = False,
     boxes: str | None = None,
@@ -43,6 +44,7 @@ def main(
     report: bool = True,
     force: bool = False,
     trust_code: bool = False,
+    python: str | None = None,
     device: str = "cpu",
     precision: Literal["float64", "float32", "bfloat16"] | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
@@ -57,9 +59,10 @@ def main(
     Args:
         policy: One or more of openvima-small (a bundled checkpoint), oracle, random, untrained,
             presets, folders of training runs, FILE.py:FUNCTION or MODULE:FUNCTION that makes a policy of
-            your own, published files, ids on the Hugging Face Hub and policy servers (ws://HOST:PORT, see
-            `openvima serve`), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give
-            another name.
+            your own, published files, OWNER/NAME[@REVISION] on the Hub, policy servers (ws://HOST:PORT, see
+            `openvima serve`) and LeRobot policies (lerobot:PATH or lerobot:OWNER/NAME[@REVISION], see
+            --python), with commas in between; NAME=FOLDER, NAME=FILE.py:FUNCTION and so on give another
+            name.
         tasks: Names of tasks with commas in between; all; or heldout, the four tasks of L4 that training
             does not see. A level that does not hold a task leaves it out.
         levels: Levels with commas in between: train, L1, L2, L3, L4.
@@ -75,6 +78,8 @@ def main(
         task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
             num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
             all that have the option.
+        control: primitives; or end_effector, where an action moves the tool for 0.1 s, for policies of that
+            control and the oracle. Scores of the two are never joined.
         ablations: Input ablations to evaluate besides, comma-separated: no_prompt, other_prompt_images,
             scrambled_words, shuffled_objects, detected_boxes; random, oracle; or all of these. Also
             masked_words:0.2, swapped_words:0.2, gibberish_words, noisy_boxes:3, text_prompts,
@@ -89,13 +94,14 @@ def main(
         batch: Episodes that are run together, with batched inference.
         engine: processes of this machine, or ray.
         address: Ray cluster as HOST:PORT; by default Ray is started on this machine and stopped at the end.
-        videos: Solved episodes to record, and failures, of each trained policy and task.
+        videos: Solved episodes to record, and failures, of each trained policy, task and level.
         record_video: Further episodes to record, of every policy, comma-separated: TASK/SEED or
             TASK/LEVEL/SEED.
         report: Whether to record videos and write report.html.
         force: Overwrite the results of another evaluation in that folder.
         trust_code: Run the code that run folders name, as those of learners of your own do. Code named on the
             command line needs no such trust.
+        python: The Python of LeRobot's own environment, which LeRobot policies run in; see docs/lerobot.md.
         device: Where networks compute: cpu, in float64, or cuda, in float32.
         precision: Of networks: float64, float32 or bfloat16. In the last two rounding may decide an episode;
             such episodes are listed as near_ties.
@@ -120,7 +126,7 @@ def main(
         seed=seed,
         workers=workers,
         out=out,
-        env_config=EnvConfig(assets, compat, prompts, task_options),
+        env_config=EnvConfig(assets, compat, prompts, task_options, control),
         batch=batch,
         force=force,
         device=device,
@@ -130,6 +136,7 @@ def main(
         engine=engine,
         address=address,
         trust_code=trust_code,
+        python=python,
     )
     selection = VideoSelection(videos, parse_list(record_video))
     if record_video and not report:
@@ -166,7 +173,8 @@ def print_results(results: "Results") -> None:
 
     policies = results.policy_names()
     means = results.means()
-    table = Table("level", title="success rates in % (95 % interval)")
+    control = f", control {results.config['control']}" if "control" in results.config else ""
+    table = Table("level", title=f"success rates in % (95 % interval){control}")
     table.add_column("task", overflow="fold", min_width=12)
     for policy in policies:
         table.add_column(policy, justify="right", no_wrap=True)

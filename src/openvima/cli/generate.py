@@ -31,6 +31,7 @@ def main(
     compat: bool = False,
     prompts: str = "multimodal",
     task_options: str = "",
+    control: Literal["primitives", "end_effector"] = "primitives",
     force: bool = False,
 ) -> int:
     """Write demonstrations with the oracle, or those that a folder still lacks.
@@ -65,6 +66,8 @@ def main(
         task_options: Options of tasks, [TASK.]NAME=VALUE with commas between them, such as
             num_distractors=3,rotate.difficulty=hard; `openvima tasks NAME` lists them. Without a task, for
             all that have the option.
+        control: primitives; or end_effector, where the tool moves by ten commands a second: joint paths then
+            have a waypoint for each, and `openvima data export-lerobot` writes a frame for each.
         force: Delete the data set that is in the folder.
 
     Returns:
@@ -81,7 +84,7 @@ def main(
         level=level,
         start_seed=seed,
         shard_size=shard_size,
-        env_config=EnvConfig(assets, compat, prompts, task_options),
+        env_config=EnvConfig(assets, compat, prompts, task_options, control),
         compression=compression,
         images=images,
         keep_failed=keep_failed,

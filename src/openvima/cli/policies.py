@@ -1,4 +1,4 @@
-"""`openvima policies`: list networks and trained policies, show one, and convert or export checkpoints."""
+"""`openvima policies`: list networks and trained policies, show one, convert, export and push checkpoints."""
 
 import json
 import sys
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from openvima.cli.pushing import print_files
 from openvima.cli.tables import print_table, table_console
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def show(
 
     Args:
         policy: Name of a preset or of a bundled checkpoint, a run folder or checkpoint folder, a published
-            file, or an id on the Hugging Face Hub.
+            file, or OWNER/NAME[@REVISION] on the Hugging Face Hub.
         as_json: Print JSON.
 
     Returns:
@@ -153,6 +154,46 @@ def convert(
             "Stored without a tokenizer: convert again with --tokenizer, or give one whenever it is loaded."
         )
         print(hint, file=sys.stderr)
+    return 0
+
+
+def push_to_hub(
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")],
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OWNER/NAME")],
+    *,
+    results: Path | None = None,
+    licence: str = "mit",
+    private: bool = False,
+    message: str = "",
+    dry_run: bool = False,
+) -> int:
+    """Push a checkpoint to the Hugging Face Hub, with a generated model card.
+
+    The token is that of `hf auth login` or HF_TOKEN. The card says what the run recorded of data and settings
+    and, with --results, the scores of these very weights with their intervals.
+
+    Example: openvima policies push-to-hub runs/first owner/first --results scores
+
+    Args:
+        source: A run folder, of which the best checkpoint is pushed, a checkpoint folder, or a bundled
+            checkpoint.
+        name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
+        results: Folder of an evaluation of these weights.
+        licence: Identifier of the licence of the weights.
+        private: Make a new repository private.
+        message: Of the commit.
+        dry_run: Print the card and list the files; nothing is sent.
+
+    Returns:
+        Exit status.
+    """
+    from openvima.publishing.policy import policy_files, push_policy
+
+    if dry_run:
+        print_files(policy_files(source, name, results=results, licence=licence))
+    else:
+        done = push_policy(source, name, results=results, licence=licence, private=private, message=message)
+        print(done)
     return 0
 
 
@@ -249,4 +290,4 @@ def _millions(count: int) -> str:
     return f"{count / 1e6:.2f}"
 
 
-COMMANDS = {"list": list_, "show": show, "convert": convert}
+COMMANDS = {"list": list_, "show": show, "convert": convert, "push-to-hub": push_to_hub}

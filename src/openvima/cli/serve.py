@@ -34,7 +34,7 @@ def main(
 
     Args:
         policy: openvima-small (bundled), the folder of a training run, FILE.py:FUNCTION or MODULE:FUNCTION
-            that makes a policy of your own, a published file, an id on the Hugging Face Hub, a preset,
+            that makes a policy of your own, a published file, OWNER/NAME[@REVISION] on the Hub, a preset,
             random or untrained.
         port: TCP port; 0 takes a free one. The address is printed once the server answers.
         host: Interface to listen on. Any but the loopback interface needs a token.

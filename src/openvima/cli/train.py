@@ -84,7 +84,10 @@ def run(words: Sequence[str]) -> int:
         joined_by(others, ["-m", "openvima", "train", *words]) if others else nullcontext(),
         progress_bar("training") if is_first else nullcontext() as report,
     ):
-        folder = train(config, report, _rollout(config) if config.rollout.every else None)
+        rollout = _rollout(config) if config.rollout.every else None
+        folder = train(
+            config, report, rollout, rollout.animate if rollout and config.rollout.animate else None
+        )
     if not is_first:
         return 0
     trust = " --trust-code" if ":" in config.preset else ""
@@ -99,6 +102,7 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
     from openvima.data.reader import Dataset
     from openvima.evaluation.online_eval import ONLINE_EVAL_LEVEL, OnlineEval
     from openvima.scene import COMPOSED
+    from openvima.scene.command import PRIMITIVES
     from openvima.tasks.registry import task_spec
 
     dataset = Dataset(config.data)
@@ -109,5 +113,5 @@ def _rollout(config: "TrainingConfig") -> "OnlineEval":
             f"none of the tasks in {config.data} exists at {ONLINE_EVAL_LEVEL}; leave out rollout.every."
         )
     first = dataset.shard(dataset.shard_names()[0])  # merged folders may have others
-    env_config = replace(first.info.env_config, assets=config.assets)
+    env_config = replace(first.info.env_config, assets=config.assets, control=PRIMITIVES)
     return OnlineEval(playable, config.rollout.episodes, env_config)

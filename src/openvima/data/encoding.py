@@ -16,6 +16,7 @@ from openvima.data.records import Demonstration, columns_of
 from openvima.data.schema import CODECS, COLUMNS, IMAGES, NUMBERS, SCHEMA_VERSION
 from openvima.env.config import ENV_SETTINGS, EnvConfig, without_published
 from openvima.errors import ShardError, unknown_name
+from openvima.scene.command import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 from openvima.user_code import is_code
 
@@ -65,6 +66,7 @@ class ShardInfo:
         compat: Whether the original benchmark was followed also where it is odd.
         prompts: "multimodal", or what replaces object images in prompts; only then recorded.
         task_options: As in `EnvConfig`; only recorded if there are any.
+        control: As in `EnvConfig`; only recorded if it is not "primitives".
         compression: Codec of the buffers, "lz4" or "zstd".
         images: Whether images are stored; without, they are drawn anew on reading.
 
@@ -83,6 +85,7 @@ class ShardInfo:
     compat: bool = False
     prompts: str = MULTIMODAL
     task_options: str = ""
+    control: str = PRIMITIVES
     compression: str = "lz4"
     images: bool = True
 

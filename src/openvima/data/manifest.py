@@ -58,6 +58,11 @@ _SHARD_KEYS: dict[str, type] = {
     **dict.fromkeys(("episodes", "steps", "bytes", "head_bytes", "tail_bytes", "frame_crc32"), int),
     "sha256": str,
 }
+_COUNTS: dict[str, type] = dict.fromkeys(("episodes", "steps", "shards", "bytes"), int)
+_TASK_KEYS: dict[str, Any] = {  # Any: a type or a union of such
+    **dict.fromkeys(("episodes", "steps", "seeds_tried", "redraws"), int),
+    "success_rate": int | float,
+}
 _SHARD_NAME = re.compile(r"\w[\w.+-]{0,200}\.arrow")
 
 _NOT_IN_SHARDS = ("shard", "row", "offset", "num_bytes", "crc32")
@@ -297,10 +302,13 @@ def _lacking(manifest: Mapping[str, Any]) -> list[str]:  # Any: JSON
     lacking = [key for key, kind in _TYPES.items() if not isinstance(manifest.get(key), kind)]
     if lacking:
         return lacking
+    entries = [("counts", manifest["counts"], _COUNTS)]
+    entries += [(name, entry, _TASK_KEYS) for name, entry in manifest["tasks"].items()]
+    entries += [(name, entry, _SHARD_KEYS) for name, entry in manifest["shards"].items()]
     return [
         f"{key} of {name}"
-        for name, entry in manifest["shards"].items()
-        for key, kind in _SHARD_KEYS.items()
+        for name, entry, keys in entries
+        for key, kind in keys.items()
         if not isinstance(entry, dict) or not isinstance(entry.get(key), kind)
     ]
 

@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from openvima.brief import MAX_CHARACTERS, cut
 from openvima.data.checksums import Envelope, Span
+from openvima.data.hub import data_folder
 from openvima.data.manifest import (
     INDEX_NAME,
     MANIFEST_NAME,
@@ -32,12 +33,15 @@ class Dataset:
     files anew.
 
     Args:
-        path: The folder.
+        path: The folder, or a data set on the Hugging Face Hub such as "hf://owner/name@revision", which is
+            downloaded.
         tasks: Keep the episodes of these tasks only; None keeps all.
+        index_only: Read manifest and index only, which of a data set on the Hub are then all that is fetched.
 
     Raises:
         DatasetError: The folder is no finished data set, a shard is missing, or it has no such task.
         ShardError: A shard is damaged; raised when it is first read.
+        HubError: The Hub has no such data set, or cannot be reached.
 
     Example:
         >>> dataset = Dataset("demos", tasks=["rotate"])
@@ -45,8 +49,10 @@ class Dataset:
         'Rotate the {dragged_obj} 60 degrees.'
     """
 
-    def __init__(self, path: str | Path, *, tasks: Sequence[str] | None = None) -> None:
-        self.path = Path(path)
+    def __init__(
+        self, path: str | Path, *, tasks: Sequence[str] | None = None, index_only: bool = False
+    ) -> None:
+        self.path = data_folder(path, shards=not index_only)
         self.tasks = None if tasks is None else tuple(tasks)
         self.manifest = read_manifest(self.path)
         index = _read_index(self.path, self.manifest)
@@ -57,7 +63,8 @@ class Dataset:
         self._rows = self.index.column("row").to_numpy()
         self._spans = [self.index.column(name).to_numpy() for name in ("offset", "num_bytes", "crc32")]
         self._shards: dict[str, Shard] = {}
-        _check_shards(self.path, sorted(self._names))
+        if not index_only:
+            _check_shards(self.path, sorted(self._names))
 
     def __repr__(self) -> str:
         tasks = ", ".join(self.tasks or self.manifest["tasks"])

@@ -212,7 +212,7 @@ class Rollout:
 
     def step(self, action: Action) -> dict[str, Any]:  # Any: as the environment's info
         """Execute an action and return the info of the environment."""
-        observation, *_, info = self._env.step(action)
+        observation, *_, info = self._env.perform(action)
         self._actions.append(action)
         self._paths.append(self._env.joint_path)
         self._observations.append(observation)

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from openvima.data.hub import data_folder
 from openvima.data.manifest import CACHE_FOLDER, FAILED_FOLDER, INDEX_NAME, MANIFEST_NAME
 from openvima.data.reader import Dataset
 from openvima.data.schema import COLUMNS, IMAGES
 from openvima.data.shard import Shard
-from openvima.errors import ShardError
+from openvima.errors import DatasetError, ShardError, echo
+from openvima.hub import dataset_name
 
 _NUM_MEASURED = 3  # episodes of each task to measure the size of images on
 
@@ -42,7 +44,8 @@ class TaskSummary:
         episodes: Number of episodes.
         steps: Number of steps.
         bytes: Size of their records.
-        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored.
+        image_fraction: Fraction of images in these bytes, measured on a few episodes; 0 if none are stored,
+            None if no shard was read.
         seeds_tried: Seeds that were tried for them.
         success_rate: Fraction of these seeds that gave an episode.
         redraws: Unlucky draws that the sampler threw away.
@@ -52,7 +55,7 @@ class TaskSummary:
     episodes: int
     steps: int
     bytes: int
-    image_fraction: float
+    image_fraction: float | None
     seeds_tried: int
     success_rate: float
     redraws: int
@@ -81,8 +84,8 @@ class Summary:
     @property
     def file_bytes(self) -> int:
         """Size of shards, index and manifest, without failed episodes and object caches."""
-        names = [*self.manifest["shards"], INDEX_NAME, MANIFEST_NAME]
-        return sum((self.folder / name).stat().st_size for name in names)
+        shards = sum(entry["bytes"] for entry in self.manifest["shards"].values())
+        return shards + sum((self.folder / name).stat().st_size for name in (INDEX_NAME, MANIFEST_NAME))
 
     def to_record(self) -> dict[str, Any]:  # Any: JSON
         """Return everything as plain values: the entries of the manifest, and an entry "summary"."""
@@ -124,22 +127,26 @@ class Unfinished:
 
 
 def summarise_folder(
-    folder: Path, *, details: bool = False, report: Report | None = None
+    folder: str | Path, *, details: bool = False, report: Report | None = None
 ) -> Summary | Unfinished:
     """Summarise a folder.
 
     Args:
-        folder: A data set, finished or not.
+        folder: A data set, finished or not; or one on the Hub such as "hf://owner/name", of which without
+            details only manifest and index are fetched.
         details: Also count objects, textures and prompt images, for which every shard is read.
         report: Called with shards read, shards in all, and a note.
 
     Raises:
         DatasetError: There is no data set, or it is damaged.
         ShardError: A shard is damaged.
+        HubError: The Hub has no such data set, or cannot be reached.
     """
+    index_only = dataset_name(folder) is not None and not details
+    folder = data_folder(folder, shards=not index_only)
     if not (folder / MANIFEST_NAME).is_file() and any(folder.glob("*.arrow")):
         return _unfinished(folder)
-    dataset = Dataset(folder)  # which also finds missing files
+    dataset = Dataset(folder, index_only=index_only)  # which also finds missing files
     task_of = np.array(dataset.index.column("task").to_pylist(), dtype=str)
     histograms = [*_index_histograms(dataset.index)]
     if details:
@@ -147,7 +154,10 @@ def summarise_folder(
     return Summary(
         folder,
         dataset.manifest,
-        tuple(_task_summary(dataset, task_of, task) for task in dataset.manifest["tasks"]),
+        tuple(
+            _task_summary(dataset, task, task_of == task, index_only=index_only)
+            for task in dataset.manifest["tasks"]
+        ),
         tuple(histograms),
         _num_failed(folder),
         _object_caches(folder),
@@ -168,15 +178,16 @@ def _unfinished(folder: Path) -> Unfinished:
     return Unfinished(folder, len(paths) - len(damaged), dict(sorted(episodes.items())), tuple(damaged))
 
 
-def _task_summary(dataset: Dataset, task_of: np.ndarray, task: str) -> TaskSummary:
-    rows = np.flatnonzero(task_of == task)
+def _task_summary(dataset: Dataset, task: str, chosen: np.ndarray, *, index_only: bool) -> TaskSummary:
+    rows = np.flatnonzero(chosen)
+    if not len(rows):
+        raise DatasetError(f"{dataset.path} lists the task {echo(task)}, of which it holds no episode.")
     num_bytes = int(dataset.index.column("num_bytes").to_numpy()[rows].sum())
     entry = dataset.manifest["tasks"][task]
     measured = rows[np.linspace(0, len(rows) - 1, min(_NUM_MEASURED, len(rows))).astype(int)]
     counts = {name: entry[name] for name in ("episodes", "steps", "seeds_tried", "success_rate", "redraws")}
-    return TaskSummary(
-        task, bytes=num_bytes, image_fraction=_image_fraction(dataset, measured.tolist()), **counts
-    )
+    fraction = None if index_only else _image_fraction(dataset, measured.tolist())
+    return TaskSummary(task, bytes=num_bytes, image_fraction=fraction, **counts)
 
 
 def _image_fraction(dataset: Dataset, episodes: Iterable[int]) -> float:

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any  # options are of whatever type a task declares
 
 from openvima.errors import ConfigError, echo
+from openvima.scene.command import PRIMITIVES, check_control
 from openvima.tasks import sample_episode, task_spec
 from openvima.tasks.options import TaskOptions
 from openvima.tasks.prompts import MULTIMODAL, check_prompts
@@ -26,18 +27,21 @@ class EnvConfig:
         prompts: "multimodal", as for all published results, "text" or "mixed"; see `openvima.make`.
         task_options: [TASK.]NAME=VALUE,…, such as "num_distractors=3,rotate.difficulty=hard"; kept sorted.
             Without a task, an option holds for all tasks that have it.
+        control: "primitives", as for all published results, or "end_effector"; see `openvima.make`.
 
     Raises:
-        ConfigError: There is no such form of prompts, or the task options have another form.
+        ConfigError: There is no such form of prompts, no such control, or the task options have another form.
     """
 
     assets: str = "procedural"
     compat: bool = False
     prompts: str = MULTIMODAL
     task_options: str = ""
+    control: str = PRIMITIVES
 
     def __post_init__(self) -> None:
         check_prompts(self.prompts)
+        check_control(self.control)
         object.__setattr__(self, "task_options", str(TaskOptions.parse(self.task_options)))
 
     @staticmethod
@@ -76,6 +80,7 @@ class EnvConfig:
             compat=self.compat,
             prompts=self.prompts,
             realtime=realtime,
+            control=self.control,
             **self.options(task),
         )
 
@@ -102,15 +107,15 @@ class EnvConfig:
         return TaskOptions.parse(self.task_options).of(task_spec(task))
 
     def record(self) -> dict[str, str | bool]:
-        """Return the settings for a record, without paths; prompts and task options unless published."""
+        """Return the settings for a record, without paths, and those from `prompts` on unless published."""
         is_named = self.assets == "procedural" or is_code(self.assets)
         record = {**asdict(self), "assets": without_folder(self.assets) if is_named else "original"}
         return without_published(record)
 
 
 def without_published(record: dict[str, Any]) -> dict[str, Any]:  # Any: JSON
-    """Return a record without prompts and task options that are as published."""
-    published = {"prompts": MULTIMODAL, "task_options": ""}
+    """Return a record without prompts, task options and control that are as published."""
+    published = {"prompts": MULTIMODAL, "task_options": "", "control": PRIMITIVES}
     return {name: value for name, value in record.items() if value != published.get(name, ...)}
 
 

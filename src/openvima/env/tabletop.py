@@ -1,8 +1,7 @@
 """The Gymnasium environment: one task, one arm, one table."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any  # observations and infos are nested dictionaries
 
@@ -10,11 +9,17 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
 from openvima.catalog.packs import load_assets
 from openvima.env.episode_file import episode_from_values, load_episode
 from openvima.env.object_names import ObjectNames
+from openvima.env.running_episode import (
+    FRAMES_PER_SECOND,
+    RUNS,
+    PrimitiveRun,
+    ToolRun,
+    VideoFrame,
+)
 from openvima.errors import ConfigError, EpisodeError, SamplingError, unknown_name
 from openvima.html import notebook_html
 from openvima.render.camera import VIEWS, View
@@ -30,8 +35,16 @@ from openvima.scene import (
     RenderedPrompt,
     Scene,
 )
+from openvima.scene.command import (
+    COMMAND_HIGH,
+    COMMAND_LOW,
+    END_EFFECTOR,
+    PRIMITIVES,
+    ToolCommand,
+    check_control,
+    steps_per_primitive,
+)
 from openvima.sim.ur5 import JOINT_LIMITS
-from openvima.sim.world import World
 from openvima.tasks import goals, sample_episode, task_spec
 from openvima.tasks.goals import Progress
 from openvima.tasks.oracle import OracleDecision, oracle_action
@@ -41,52 +54,12 @@ from openvima.tasks.seeding import checked_seed, make_rng
 IMAGE_SHAPE = (128, 256)  # rows, columns; the cameras are tuned for this size
 MODALITIES = ("rgb", "segm", "depth", "joints")
 DEFAULT_MODALITIES = ("rgb", "segm")
-FRAMES_PER_SECOND = 30
+_TOOL_LOW = np.array([0.0, -1.0, 0.0, -4 * np.pi, 0.0], np.float32)
+_TOOL_HIGH = np.array([1.0, 1.0, 0.5, 4 * np.pi, 1.0], np.float32)
 _LARGEST_SEED = 2**31  # of the seeds that a reset without one draws
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class VideoFrame:
-    """One frame of a video, not yet rendered.
-
-    Args:
-        scene: The scene.
-        joints: Joint angles of the arm, shape (6,), radians.
-    """
-
-    scene: Scene
-    joints: np.ndarray
-
-    __repr__ = brief_repr
-
-
-@dataclass(slots=True, eq=False)
-class _Run:
-    """State of the running episode."""
-
-    episode: Episode
-    world: World
-    progress: Progress
-    oracle_rng: np.random.Generator
-    outcome: Outcome = field(default_factory=Outcome)
-    num_steps: int = 0
-    grasped: int | None = None
-    joint_path: np.ndarray = field(default_factory=lambda: np.zeros((0, 6), np.float32))
-    frames: list[VideoFrame] = field(default_factory=list)
-    prompt: RenderedPrompt | None = None
-
-    def monitor(self, scene: Scene) -> None:
-        self.progress = goals.monitor(self.episode.problem, self.progress, scene)
-
-    def record(self, scene: Scene, joints: np.ndarray) -> None:
-        self.frames.append(VideoFrame(scene, np.array(joints)))
-
-    def advance(self) -> None:
-        self.num_steps += 1
-        self.progress, self.outcome = goals.advance(self.episode.problem, self.progress, self.world.scene)
-
-
-class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
+class TabletopEnv(gymnasium.Env[dict[str, Any], Any]):
     """A UR5 arm at a table, with a multimodal prompt, two cameras, and pick-and-place or sweep actions.
 
     **Observation** — a dictionary; the cameras `front` and `top` are fixed. `ee` and what `modalities` names:
@@ -110,15 +83,20 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     yaw. With the spatula it sweeps in a straight line from pose0 to pose1. An invalid action raises
     `ActionError` and changes nothing.
 
+    With control "end_effector" a step is 0.1 s, and an action five numbers; see `control` below.
+
     **Reward** — 1.0 on the step that solves the task, else 0.0.
 
-    **End** — `terminated` on success or failure; `truncated` after `episode.max_steps` steps otherwise.
+    **End** — `terminated` on success or failure; `truncated` after `episode.max_steps` steps otherwise, with
+    control "end_effector" after 10 s for each of them.
 
     **Info** — after `reset` and `step`: `prompt` (text with a `{placeholder}` for each image),
     `prompt_ambiguous` (descriptions in it fit objects that the replaced images differ from), `success`,
-    `failure`, `reason` (why it failed, or empty), `grasped` (id of the object that the last step lifted, or
-    0), `num_steps`, `joints` (as in observations), `task`, `level`, `domain`, `seed`, `end_effector`, and
-    `objects` (id to the names of object and texture). The images of the prompt are in `prompt`, an attribute.
+    `failure`, `reason` (why it failed, or empty), `progress` (`goals_met`, a fraction of those required, and
+    `distance_m` and `angle_rad` of the nearest goal that can be met next; NaN if goals state none), `grasped`
+    (id of the object that the last step lifted, or 0), `num_steps`, `joints` (as in observations), `task`,
+    `level`, `domain`, `seed`, `end_effector`, and `objects` (id to the names of object and texture). The
+    images of the prompt are in `prompt`, an attribute.
 
     **Start** — `reset(seed=k)` starts episode k of the environment's domain, task and level: always
     the same bytes. `reset()` draws the next number from the environment's generator.
@@ -148,13 +126,16 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         realtime: Record `frames`, 30 a second, while a step runs.
         render_mode: None, or "rgb_array": `render` returns both views, front above top.
         modalities: What observations hold besides `ee`: of "rgb", "segm", "depth" and "joints".
+        control: "primitives", or "end_effector": a step is 0.1 s, an action a float32 array of five numbers,
+            dx, dy, dz in metres, dyaw in radians, and above 0.5 for suction, or the spatula's contact.
+            Observations hold `tool` too: x, y, z, yaw, and 1 while it holds; see docs/end_effector.md.
         **task_options: Arguments of the task.
 
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: The task is not defined at the level.
-        ConfigError: The domain, the prompts, the render mode, a modality or an option of the task is invalid,
-            or the task has no text form.
+        ConfigError: The domain, the prompts, the render mode, a modality, the control or an option of the
+            task is invalid, or the task has no text form.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012  as in the base
@@ -172,6 +153,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         realtime: bool = False,
         render_mode: str | None = None,
         modalities: Iterable[str] = DEFAULT_MODALITIES,
+        control: str = PRIMITIVES,
         **task_options: Any,
     ) -> None:
         _check_render_mode(render_mode)
@@ -187,10 +169,12 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         self.realtime = realtime
         self.render_mode = render_mode
         self.task_options = task_options
+        check_control(control)
+        self.control = control
         self.modalities = modalities
-        self.action_space = _action_space()
+        self.action_space = _action_space(control)
         self._rasteriser = Rasteriser(self.assets)
-        self._run: _Run | None = None
+        self._run: PrimitiveRun | None = None
         if task_options:
             with suppress(SamplingError):  # another seed may succeed
                 self._sample(0)  # the task checks its options
@@ -233,18 +217,17 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         super().reset(seed=seed)
         self._run = None  # no running episode should the rest fail
         episode = given or self._sample(seed)
-        rng = make_rng(episode.domain, episode.task, episode.level, episode.seed, purpose="oracle")
-        world = World(episode.problem.scene, self.assets, compat=self.compat)
-        self._run = _Run(episode, world, goals.begin(episode.problem), rng)
+        self._run = RUNS[self.control](episode, self.assets, self.compat)
         return self._observe(), self._info()
 
     def step(
-        self, action: Mapping[str, Any] | Action
+        self, action: Mapping[str, Any] | Action | np.ndarray | ToolCommand
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Execute one primitive and let all objects come to rest.
+        """Execute one primitive and let all objects come to rest; or follow one command for 0.1 s.
 
         Args:
-            action: The four arrays, or an `Action`.
+            action: The four arrays, or an `Action`; with control "end_effector" the five numbers, or a
+                `ToolCommand`.
 
         Returns:
             Observation, reward, terminated, truncated, info; see the class.
@@ -253,21 +236,44 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             EpisodeError: No episode is running.
             ActionError: The action is invalid; nothing was moved.
         """
+        run = self._going_on()
+        run.step(run.checked(action), realtime=self.realtime)
+        return self._after_step(run)
+
+    def perform(self, action: Action) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Execute a primitive under either control: as one step, or as the commands that it consists of.
+
+        Args:
+            action: The primitive.
+
+        Returns:
+            As for `step`; `joint_path` and `frames` are those of the whole primitive.
+
+        Raises:
+            EpisodeError: No episode is running.
+        """
+        run = self._going_on()
+        run.perform(action, realtime=self.realtime)
+        return self._after_step(run)
+
+    def commands(self, action: Action) -> Iterator[ToolCommand]:
+        """Yield the commands of a primitive, each to be executed by `step` before the next; none at the end.
+
+        Raises:
+            ConfigError: The control is not "end_effector".
+            EpisodeError: No episode is running.
+        """
+        return self._tool_run().commands(action)
+
+    def _going_on(self) -> PrimitiveRun:
         run = self._running()
-        if run.outcome.is_over or run.num_steps >= run.episode.max_steps:
+        if run.outcome.is_over or run.is_out_of_steps:
             raise EpisodeError(f"the episode ended after {run.num_steps} steps; reset() starts the next one.")
-        checked = Action.from_arrays(action.to_arrays() if isinstance(action, Action) else action)
-        run.frames = []
-        execution = run.world.execute(
-            checked,
-            monitor=run.monitor if goals.needs_monitoring(run.episode.problem) else None,
-            record=run.record if self.realtime else None,
-            frames_per_second=FRAMES_PER_SECOND,
-        )
-        run.grasped, run.joint_path = execution.grasped, execution.joint_path
-        run.advance()
+        return run
+
+    def _after_step(self, run: PrimitiveRun) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         terminated = run.outcome.is_over
-        truncated = run.num_steps >= run.episode.max_steps and not terminated
+        truncated = run.is_out_of_steps and not terminated
         reward = 1.0 if run.outcome.success else 0.0
         return self._observe(), reward, terminated, truncated, self._info()
 
@@ -302,6 +308,20 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             compat=self.compat,
         )
 
+    def oracle_command(self) -> ToolCommand:
+        """Return the oracle's next command, on the path of its primitive; for control "end_effector".
+
+        Raises:
+            ConfigError: The control is another.
+            EpisodeError, OracleError: As for `oracle_decision`.
+        """
+        return self._tool_run().oracle_command(lambda: self.oracle_decision().action)
+
+    @property
+    def oracle_max_steps(self) -> int:
+        """Step limit of the oracle, in steps of this control."""
+        return self.episode.oracle_max_steps * steps_per_primitive(self.control)
+
     @property
     def modalities(self) -> tuple[str, ...]:
         """What observations hold besides `ee`; `observation_space` follows what is assigned.
@@ -320,7 +340,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         if not names:
             raise ConfigError(f"modalities is empty; give at least one of {', '.join(MODALITIES)}.")
         self._modalities = tuple(name for name in MODALITIES if name in names)
-        self.observation_space = _observation_space(self._modalities)
+        self.observation_space = _observation_space(self._modalities, self.control)
 
     @property
     def episode(self) -> Episode:
@@ -365,10 +385,16 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         """Video frames of the last step, 30 a second; empty unless `realtime`."""
         return tuple(self._running().frames)
 
-    def _running(self) -> _Run:
+    def _running(self) -> PrimitiveRun:
         if self._run is None:
             raise EpisodeError("there is no episode yet; call reset() first.")
         return self._run
+
+    def _tool_run(self) -> ToolRun:
+        run = self._running()
+        if not isinstance(run, ToolRun):
+            raise ConfigError(f"control is {self.control!r}; commands need control {END_EFFECTOR!r}.")
+        return run
 
     def _sample(self, seed: int | None) -> Episode:
         return sample_episode(
@@ -399,7 +425,8 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             name: {view: getattr(images[view], name) for view in VIEWS} if name in seen else self.joints
             for name in self._modalities
         }
-        return {**values, "ee": END_EFFECTORS.index(self.scene.end_effector)}
+        tool = self._running().observed_tool()
+        return {**values, **tool, "ee": END_EFFECTORS.index(self.scene.end_effector)}
 
     def _info(self) -> dict[str, Any]:
         run = self._running()
@@ -410,6 +437,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
             "success": run.outcome.success,
             "failure": run.outcome.failure,
             "reason": run.outcome.reason,
+            "progress": goals.measure(problem, run.progress, run.world.scene),
             "grasped": run.grasped or 0,  # never None: vector environments collect numbers in arrays
             "num_steps": run.num_steps,
             "joints": self.joints,
@@ -422,7 +450,7 @@ class TabletopEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         }
 
 
-def _observation_space(modalities: tuple[str, ...]) -> spaces.Dict:
+def _observation_space(modalities: tuple[str, ...], control: str) -> spaces.Dict:
     images = {
         "rgb": spaces.Box(0, 255, (3, *IMAGE_SHAPE), np.uint8),
         "segm": spaces.Box(0, 255, IMAGE_SHAPE, np.uint8),
@@ -434,10 +462,13 @@ def _observation_space(modalities: tuple[str, ...]) -> spaces.Dict:
         "joints": spaces.Box(-limits, limits, dtype=np.float32),
     }
     ee = spaces.Discrete(len(END_EFFECTORS))
-    return spaces.Dict({**{name: known[name] for name in modalities}, "ee": ee})
+    tool = {"tool": spaces.Box(_TOOL_LOW, _TOOL_HIGH, dtype=np.float32)} if control == END_EFFECTOR else {}
+    return spaces.Dict({**{name: known[name] for name in modalities}, **tool, "ee": ee})
 
 
-def _action_space() -> spaces.Dict:
+def _action_space(control: str) -> spaces.Space:
+    if control == END_EFFECTOR:
+        return spaces.Box(np.array(COMMAND_LOW, np.float32), np.array(COMMAND_HIGH, np.float32))
     position = (np.array(WORKSPACE_LOW, np.float32), np.array(WORKSPACE_HIGH, np.float32))
     rotation = (np.full(4, -1, np.float32), np.full(4, 1, np.float32))
     bounds = {"position": position, "rotation": rotation}

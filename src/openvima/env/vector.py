@@ -16,6 +16,7 @@ from openvima.env.action_validation import ActionValidator
 from openvima.env.registration import make
 from openvima.env.workers import AsyncTabletopEnvs
 from openvima.errors import ConfigError, unknown_name
+from openvima.scene.command import PRIMITIVES
 from openvima.tasks.seeding import checked_seed
 
 MODES = ("sync", "async")
@@ -50,7 +51,7 @@ def make_vec(
     Raises:
         UnknownTaskError: There is no such task.
         LevelError: A task is not defined at the level.
-        ConfigError: A mode, an option or a seed is invalid.
+        ConfigError: A mode, an option or a seed is invalid, or the control is not "primitives".
         WorkerError: A worker ended while it started.
 
     Example:
@@ -66,6 +67,10 @@ def make_vec(
     if vectorization_mode not in MODES:
         raise ConfigError(unknown_name("vectorization mode", vectorization_mode, MODES))
     mode = _autoreset_mode(autoreset_mode)
+    controls = [options, *(choice for choice in choices if isinstance(choice, Mapping))]
+    for control in (given.get("control", PRIMITIVES) for given in controls):
+        if control != PRIMITIVES:
+            raise ConfigError(f"control is {control!r}; vector environments have {PRIMITIVES!r} only.")
     seed_lists = _split_seeds(seeds, num_envs)
     env_fns = [_env_factory(choices[i % len(choices)], options, seed_lists[i]) for i in range(num_envs)]
     if vectorization_mode == "sync":

@@ -14,24 +14,29 @@ from openvima.evaluation.results import Row
 from openvima.evaluation.rollout_policies import Decision, Explainer, Observation, RolloutPolicy
 from openvima.input_files import open_regular
 from openvima.scene import ACTION_SHAPES, Action
+from openvima.scene.command import COMMAND_NAMES, END_EFFECTOR, PRIMITIVES, ToolCommand
 
 ACTIONS_NAME = "actions.arrow"
-ACTION_WIDTH = sum(ACTION_SHAPES.values())  # 12 numbers, in the order of `ACTION_SHAPES`
-_SCHEMA = pa.schema([("seed", pa.int64()), ("action", pa.list_(pa.float32(), ACTION_WIDTH))])
+_WIDTHS = {PRIMITIVES: sum(ACTION_SHAPES.values()), END_EFFECTOR: len(COMMAND_NAMES)}  # in their order
+_SCHEMAS = {
+    width: pa.schema([("seed", pa.int64()), ("action", pa.list_(pa.float32(), width))])
+    for width in _WIDTHS.values()
+}
 _MAX_BYTES = 1 << 28  # five million steps
 
-Steps = list[list[float]]  # the actions of one episode, each of ACTION_WIDTH float32 numbers
+Steps = list[list[float]]  # the actions of one episode, 12 float32 numbers each, or 5 of a command
 
 
 class ActionRecorder:
     """A rollout policy that records the valid actions of another."""
 
     def __init__(self, policy: RolloutPolicy) -> None:
-        self._policy = policy
+        self._policy, self._control = policy, PRIMITIVES
         self.steps: list[Steps] = []  # of each episode
 
     def begin(self, envs: Sequence[TabletopEnv]) -> None:
         """Start a batch of episodes."""
+        self._control = envs[0].control
         self.steps = [[] for _ in envs]
         self._policy.begin(envs)
 
@@ -39,7 +44,7 @@ class ActionRecorder:
         """Pass on the decisions, and record those that are actions."""
         decisions = self._policy.decide(observations)
         for steps, observation, decision in zip(self.steps, observations, decisions, strict=False):
-            if observation is not None and (numbers := _numbers(decision)):
+            if observation is not None and (numbers := _numbers(decision, self._control)):
                 steps.append(numbers)
         return decisions
 
@@ -83,18 +88,24 @@ class ActionReplay:
         raise PolicyError("recorded actions have no explain(); run their policy.")
 
 
-def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]]) -> str:
+def write_actions(folder: Path, episodes: Iterable[tuple[int, Steps]], *, control: str = PRIMITIVES) -> str:
     """Write seed and actions of all episodes, in the order of `results.json`.
+
+    Args:
+        folder: Where to.
+        episodes: Seed and steps of each.
+        control: What a step is.
 
     Returns:
         SHA-256 of the recorded numbers, as hexadecimal text.
     """
     records = [(seed, step) for seed, steps in episodes for step in steps]
     seeds = np.array([seed for seed, _ in records], np.int64)
-    numbers = np.array([step for _, step in records], np.float32).reshape(-1, ACTION_WIDTH)
-    column = pa.FixedSizeListArray.from_arrays(pa.array(numbers.reshape(-1)), ACTION_WIDTH)
-    with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, _SCHEMA) as writer:
-        writer.write_table(pa.table([pa.array(seeds), column], schema=_SCHEMA))
+    width = _WIDTHS[control]
+    numbers = np.array([step for _, step in records], np.float32).reshape(-1, width)
+    column = pa.FixedSizeListArray.from_arrays(pa.array(numbers.reshape(-1)), width)
+    with atomic_write(folder / ACTIONS_NAME) as sink, pa.ipc.new_file(sink, _SCHEMAS[width]) as writer:
+        writer.write_table(pa.table([pa.array(seeds), column], schema=_SCHEMAS[width]))
     return _digest(seeds, numbers)
 
 
@@ -106,8 +117,8 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         rows: The rows of its `results.json`.
 
     Returns:
-        For the index of each row the actions of its episodes, shape (steps, 12), float32; and the SHA-256 of
-        the recorded numbers.
+        For the index of each row the actions of its episodes, shape (steps, 12 or 5), float32; and the
+        SHA-256 of the recorded numbers.
 
     Raises:
         DatasetError: The file is missing, damaged, too large, or has steps of other episodes than the rows.
@@ -120,7 +131,8 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
             raise DatasetError(f"{path} has more than {_MAX_BYTES} bytes, the most that is read.")
         table = pa.ipc.open_file(content).read_all()
         table.validate(full=True)
-        if not table.schema.equals(_SCHEMA) or any(column.null_count for column in table.columns):
+        width = next((width for width, schema in _SCHEMAS.items() if table.schema.equals(schema)), 0)
+        if not width or any(column.null_count for column in table.columns):
             raise ValueError("it has other columns")
         seeds = table.column(0).to_numpy()
         numbers = table.column(1).combine_chunks().flatten().to_numpy(zero_copy_only=False)
@@ -132,7 +144,7 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{path} is damaged ({str(error).splitlines()[0] or error!r}).") from None
-    numbers = numbers.reshape(-1, ACTION_WIDTH)
+    numbers = numbers.reshape(-1, width)
     counts = [outcome.steps for row in rows for outcome in row.outcomes]
     if len(numbers) != sum(counts) or min(counts, default=0) < 0:
         raise DatasetError(f"{path} has {len(numbers)} steps, but results.json counts {sum(counts)}.")
@@ -142,11 +154,14 @@ def read_actions(folder: Path, rows: Iterable[Row]) -> tuple[dict[int, list[np.n
     return {i: [next(episodes) for _ in row.outcomes] for i, row in enumerate(rows)}, _digest(seeds, numbers)
 
 
-def _numbers(decision: Decision) -> list[float]:
+def _numbers(decision: Decision, control: str) -> list[float]:
     if decision is None or isinstance(decision, OracleError):
         return []
     try:
-        action = decision if isinstance(decision, Action) else Action.from_arrays(decision)
+        if control == END_EFFECTOR:
+            given = decision.to_array() if isinstance(decision, ToolCommand) else decision
+            return ToolCommand.from_array(given).to_array().tolist()
+        action = decision if isinstance(decision, Action) else Action.from_arrays(decision)  # type: ignore[arg-type]
     except ActionError:
         return []
     return np.concatenate(list(action.to_arrays().values())).tolist()
@@ -157,8 +172,10 @@ def _next(steps: Iterator[np.ndarray]) -> Decision:
     return OracleError("no action is recorded") if step is None else action_arrays(step)
 
 
-def action_arrays(numbers: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
-    """Return a recorded step as the arrays of an action."""
+def action_arrays(numbers: Sequence[float] | np.ndarray) -> dict[str, np.ndarray] | np.ndarray:
+    """Return a recorded step as the arrays of an action, or as a command."""
+    if len(numbers) == _WIDTHS[END_EFFECTOR]:
+        return np.asarray(numbers, np.float32)
     parts = np.split(np.asarray(numbers, np.float32), np.cumsum(list(ACTION_SHAPES.values()))[:-1])
     return dict(zip(ACTION_SHAPES, parts, strict=True))
 

@@ -7,6 +7,7 @@ does not change the results.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -31,6 +32,8 @@ from openvima.evaluation.in_context import IN_CONTEXT_TASKS, no_edited_prompt
 from openvima.evaluation.results import EpisodeOutcome, Row
 from openvima.evaluation.sources import ORACLE, RANDOM, PolicySource, policy_sources
 from openvima.policies.bundled import BUNDLED
+from openvima.scene.command import steps_per_primitive
+from openvima.serving.lerobot import is_lerobot, lerobot_server
 from openvima.tasks.registry import list_tasks, named_tasks, task_spec
 from openvima.tasks.sampling import check_task_options, check_text_form, takes_prompts
 from openvima.tasks.seeding import MAX_SEED
@@ -50,7 +53,7 @@ class EvaluationConfig:
 
     Args:
         policies: Each "oracle", "random", "untrained", or what else `load_policy` takes: "openvima-small", a
-            preset, a run folder, a published file, an id on the Hugging Face Hub, "FILE.py:FUNCTION" or
+            preset, a run folder, a published file, OWNER/NAME[@REVISION] on the Hub, "FILE.py:FUNCTION" or
             "MODULE:FUNCTION"; or the address of a policy server such as "ws://127.0.0.1:8000". "name=source"
             gives a name for the results; by default it is that of the folder, file or server.
         tasks: Names of tasks, or ("all",) for every task that the level holds, with text
@@ -79,6 +82,8 @@ class EvaluationConfig:
         engine: "processes" of this machine, or "ray".
         address: Ray cluster; None starts Ray on this machine. See `openvima.ray_backend`.
         trust_code: Run the code that run folders name, as those of learners of your own do.
+        python: For policies "lerobot:PATH" or "lerobot:OWNER/NAME": the Python of an environment with LeRobot
+            and the plugin `lerobot-env-openvima`, which serves them.
 
     Raises:
         ConfigError: A number is out of its range, a name is not known, or settings contradict each other.
@@ -101,6 +106,7 @@ class EvaluationConfig:
     engine: Engine = "processes"
     address: str | None = None
     trust_code: bool = False
+    python: str | None = None
 
     __repr__ = brief_repr
 
@@ -142,6 +148,10 @@ class EvaluationConfig:
     def _contradictions(self) -> Iterator[str]:
         if self.address is not None and self.engine == "processes":
             yield f"address is {self.address!r}, but the engine is 'processes'; only 'ray' takes one."
+        if self.python is not None and not any(
+            is_lerobot(one.source) for one in policy_sources(self.policies)
+        ):
+            yield f"python is {self.python!r}, but no policy is lerobot:PATH."
         takes_boxes = self.uses(DETECTED_BOXES)
         if takes_boxes and self.boxes is None:
             yield f"ablation {DETECTED_BOXES} needs a detector; name it with boxes, such as 'detector'."
@@ -184,6 +194,31 @@ class EvaluationConfig:
     def uses(self, ablation: str) -> bool:
         """Whether an ablation is named, alone or among others."""
         return any(ablation in _names_in(name) for name in self.ablations)
+
+    @contextmanager
+    def served(self) -> "Iterator[EvaluationConfig]":
+        """Serve the LeRobot policies while the block runs.
+
+        Yields:
+            The config with policy servers in their place.
+
+        Raises:
+            ConfigError: `python` cannot be started, or as for `policy_sources`.
+            ServerError: A policy cannot be served.
+        """
+        sources = policy_sources(self.policies) if self.python else ()
+        if not any(is_lerobot(source.source) for source in sources):
+            yield self
+            return
+        assert self.python is not None
+        with ExitStack() as stack:
+            policies = []
+            for source in sources:
+                where = source.source
+                if is_lerobot(where):
+                    where = stack.enter_context(lerobot_server(where, self.python, device=self.device))
+                policies.append(f"{source.name}={where}")
+            yield replace(self, policies=tuple(policies), python=None)
 
     @property
     def asked_ablations(self) -> tuple[str, ...]:
@@ -365,7 +400,8 @@ def rows_of(
     for batch in batches:
         cell = (batch.policy, batch.ablation, batch.task, batch.level)
         joined.setdefault(cell, []).extend(outcomes[batch])
+    factor = steps_per_primitive(batches[0].env_config.control) if batches else 1
     return tuple(
-        Row(policy, task, level, task_spec(task).oracle_max_steps, tuple(played), ablation)
+        Row(policy, task, level, task_spec(task).oracle_max_steps * factor, tuple(played), ablation)
         for (policy, ablation, task, level), played in joined.items()
     )

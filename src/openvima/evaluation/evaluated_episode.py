@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from openvima.brief import brief_repr
-from openvima.errors import DatasetError, OpenVimaError, PolicyError, unknown_name
+from openvima.errors import DatasetError, OpenVimaError, PolicyError, echo, unknown_name
 from openvima.evaluation.ablations import DETECTED_BOXES, ablated_environment
 from openvima.evaluation.actions import ACTIONS_NAME, ActionReplay, read_actions
 from openvima.evaluation.config import DEFAULT_DEVICE, Batch
@@ -17,6 +17,7 @@ from openvima.evaluation.sources import PolicySource, weights_hash
 from openvima.evaluation.verification import recorded_env_config
 from openvima.policies.file_names import CHECKPOINTS_FOLDER
 from openvima.scene import Episode
+from openvima.scene.command import PRIMITIVES
 
 _SEED_DOMAIN = "eval"
 
@@ -124,6 +125,8 @@ def evaluated_episode(
     if seed not in numbers:
         raise DatasetError(f"{folder} has no seed {seed} there; it has {numbers[0]} to {numbers[-1]}.")
     place, config = numbers.index(seed), results.config
+    if config.get("control", PRIMITIVES) != PRIMITIVES:
+        raise DatasetError(f"{folder} has control {echo(str(config['control']))}; only primitives are shown.")
     batch = Batch(
         policy,
         (find_source(folder, results, policy) or "") if source is None else source,

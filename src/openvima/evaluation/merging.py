@@ -65,9 +65,10 @@ def _check_same_episodes(evaluations: Mapping[str, Results]) -> None:
         values = {label: results.config.get(key, usual) for label, results in evaluations.items()}
         if len({str(value) for value in values.values()}) > 1:
             listed = ", ".join(f"{value} in {label}" for label, value in values.items())
+            why = "steps differ" if key == "control" else "a seed is not the same episode"
             raise ConfigError(
-                f"these results cannot stand side by side: {key} is {listed}, so a seed is not the same "
-                "episode. Make one report of each."
+                f"these results cannot stand side by side: {key} is {listed}, so {why}. "
+                "Make one report of each."
             )
 
 

@@ -80,7 +80,7 @@ class EpisodeSlot:
             reason,
             kind,
             resamples=episode.num_redraws,
-            oracle_max_steps=episode.oracle_max_steps,
+            oracle_max_steps=self.env.oracle_max_steps,
             near_ties=self.near_ties,
         )
 

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Protocol
 
+import numpy as np
+
 from openvima.detector.plugins import plugged_extractor
 from openvima.env.tabletop import DEFAULT_MODALITIES, TabletopEnv
 from openvima.errors import OpenVimaError, OracleError, PolicyError, UnknownWordWarning
@@ -17,6 +19,7 @@ from openvima.policies.base import POLICIES_THAT_EXPLAIN
 from openvima.policies.own_code import checked_policy
 from openvima.policies.sources import is_own_code
 from openvima.scene import Action
+from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand
 from openvima.scene.explanation import Explanation
 from openvima.serving.client import RemotePolicy
 from openvima.serving.protocol import is_remote
@@ -25,7 +28,7 @@ from openvima.user_code import described
 _MAX_SEEDS = 16  # that an error lists
 Observation = Mapping[str, Any]  # as `TabletopEnv.step` returns it
 Explainer = Callable[[], Sequence[Explanation | None]]  # see `openvima.policies.Policy`
-Decision = Mapping[str, Any] | Action | OracleError | None
+Decision = Mapping[str, Any] | Action | np.ndarray | ToolCommand | OracleError | None
 
 
 class RolloutPolicy(Protocol):
@@ -110,8 +113,15 @@ class PromptedRolloutPolicy:
         """Reset the policy with the prompts.
 
         Raises:
-            PolicyError: The policy raised another exception than those of this package.
+            PolicyError: The policy raised another exception than those of this package, or is of another
+                control than the environments.
         """
+        own = getattr(self._policy, "control", PRIMITIVES)
+        if own != (control := envs[0].control):
+            raise PolicyError(
+                f"{self._name} is a policy of control {own!r}, but the environments have control "
+                f"{control!r}; evaluate with control {own!r}."
+            )
         self._envs = envs
         self._inputs = [ablate(env, self._ablation) for env in envs]
         with self._named_errors(envs), warnings.catch_warnings():
@@ -281,8 +291,10 @@ def _episodes(envs: Sequence[TabletopEnv]) -> str:
     return f"{envs[0].task}, {envs[0].level}, seed{'s' * (len(seeds) > 1)} {shown}"
 
 
-def _oracle(env: TabletopEnv) -> Action | OracleError:
+def _oracle(env: TabletopEnv) -> Action | ToolCommand | OracleError:
     try:
+        if env.control == END_EFFECTOR:
+            return env.oracle_command()
         return env.oracle_decision().action
     except OracleError as error:
         return error

@@ -97,9 +97,10 @@ def evaluate(config: EvaluationConfig, report: Report | None = None) -> Path:
         WorkerError: A worker process died; what was finished is kept.
         FolderLockedError: Another evaluation writes to `config.out`.
     """
-    prepared = prepare(config)
-    with folder_lock(config.out):
-        return evaluate_prepared(prepared, report)
+    with config.served() as served:
+        prepared = prepare(served)
+        with folder_lock(config.out):
+            return evaluate_prepared(prepared, report)
 
 
 def prepare(config: EvaluationConfig) -> PreparedEvaluation:
@@ -135,7 +136,7 @@ def evaluate_prepared(prepared: PreparedEvaluation, report: Report | None = None
             for batch in prepared.batches
             for episode in zip(batch.seeds, played[batch].actions, strict=True)
         )
-        digest = write_actions(config.out, episodes)
+        digest = write_actions(config.out, episodes, control=config.env_config.control)
         results = Results(rows, prepared.record(), prepared.versions, prepared.policies, digest)
         results.write(path)
         _write_log(config, results, time.perf_counter() - started)

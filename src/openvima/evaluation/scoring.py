@@ -12,6 +12,7 @@ from openvima.evaluation.rollout_policies import PromptedRolloutPolicy, load_rol
 from openvima.evaluation.versions import versions
 from openvima.policies.base import Policy
 from openvima.policies.own_code import parameters_hash
+from openvima.scene.command import PRIMITIVES
 
 
 def score(
@@ -24,6 +25,7 @@ def score(
     ablations: tuple[str, ...] = (),
     prompts: str = "multimodal",
     task_options: str = "",
+    control: str = PRIMITIVES,
 ) -> Results:
     """Evaluate policy objects on the episodes of `openvima evaluate`.
 
@@ -38,6 +40,7 @@ def score(
         prompts: "multimodal", "text" or "mixed", see `openvima.make`; such as "text" for a policy that reads
             language alone.
         task_options: As in `EnvConfig`, such as "num_distractors=3".
+        control: "primitives" or "end_effector"; that of all the policies.
 
     Returns:
         Success rates and the outcome of every episode.
@@ -59,7 +62,7 @@ def score(
         levels=levels,
         episodes=episodes,
         seed=seed,
-        env_config=EnvConfig(prompts=prompts, task_options=task_options),
+        env_config=EnvConfig(prompts=prompts, task_options=task_options, control=control),
         ablations=ablations,
     )
     if config.uses(NOISY_BOXES) and (own := [n for n, p in policies.items() if not hasattr(p, "processor")]):

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from openvima.brief import brief_repr
 from openvima.catalog.geometry import Assets
@@ -235,7 +236,8 @@ class EpisodeSession:
                 return Proposal(error=self._decision)
             assert self._decision is not None  # rollout policies have checked it
             given = self._decision
-            action = given if isinstance(given, Action) else Action.from_arrays(given)
+            arrays: Any = given  # of an action: a policy of the other control is refused
+            action = given if isinstance(given, Action) else Action.from_arrays(arrays)
             return Proposal(action, self._explanation() if explain else None)
         except OpenVimaError as error:
             return Proposal(action, error=error)

@@ -20,8 +20,15 @@ from openvima.policies.own_code import (
     tasks_left_out,
 )
 from openvima.policies.presets import PRESETS
-from openvima.policies.sources import find_checkpoint, is_own_code, is_policy_source, unknown_policy
+from openvima.policies.sources import (
+    find_checkpoint,
+    hub_commit,
+    is_own_code,
+    is_policy_source,
+    unknown_policy,
+)
 from openvima.serving.client import describe
+from openvima.serving.lerobot import SERVER_MODULE, is_lerobot, lerobot_name
 from openvima.serving.protocol import check_address, is_remote
 from openvima.user_code import load_function, source_hash, without_folder
 
@@ -49,10 +56,12 @@ class PolicySource:
 
     @property
     def kind(self) -> str:
-        """What it is: "oracle", "random", "untrained" (also for a preset), "remote", "code" or "run".
+        """What it is: oracle, random, untrained (also for a preset), remote, lerobot, code or run.
 
         "code" is a function that makes a policy; "run" is all else.
         """
+        if is_lerobot(self.source):
+            return "lerobot"
         if is_remote(self.source):
             return "remote"
         if self.source in PRESETS:
@@ -71,9 +80,14 @@ class PolicySource:
 
         Raises:
             ConfigError: It looks like the address of a server and cannot be one, there is no such function,
-                or a run folder names code, which is not trusted.
+                a run folder names code, which is not trusted, or it is a LeRobot policy that is not served.
             UnknownPolicyError: There is no such path, and it is not like an id on the Hub.
         """
+        if self.kind == "lerobot":
+            raise ConfigError(
+                f"{echo(self.source)} runs in LeRobot's own environment: name its Python with `openvima "
+                f"evaluate --python`, or run PYTHON -m {SERVER_MODULE} PATH_OR_ID and give its address, ws://…."
+            )
         if self.kind == "remote":
             check_address(self.source)
         elif self.kind == "code":
@@ -87,9 +101,10 @@ class PolicySource:
         """What the policy is.
 
         Returns:
-            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights
-            and, as its settings declare, "excluded_tasks" of its training and "held_out_data", the
-            demonstrations among its data that are held out for evaluation;
+            Plain values, "kind" first: for a remote policy what it says; for a run "sha256" of its weights,
+            "hub" with repository and commit if it is from there, and, as its settings declare,
+            "excluded_tasks" of its training and "held_out_data", the demonstrations among its data that are
+            held out for evaluation;
             for a function its name without folders, "sha256" of its source file and, if the policy offers
             weights, "weights_sha256". Files that the source file imports are not hashed.
 
@@ -114,7 +129,8 @@ class PolicySource:
             if self.source in BUNDLED:
                 return {"kind": "run", "bundled": self.source, "sha256": weights_hash(self.source)}
             left_out = {"excluded_tasks": tasks} if (tasks := tasks_left_out(self.source)) else {}
-            return {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
+            what = {"kind": "run", "sha256": weights_hash(self.source), **left_out, **self._seen()}
+            return what | ({"hub": resolved} if (resolved := hub_commit(self.source)) else {})
         return {"kind": self.kind} | ({"preset": self.source} if self.source in PRESETS else {})
 
     def _seen(self) -> dict[str, list[str]]:
@@ -172,6 +188,8 @@ def _default_name(source: str) -> str:
     if is_remote(source):
         check_address(source)
         name = urlsplit(source).netloc
+    elif is_lerobot(source):
+        name = lerobot_name(source)
     elif is_own_code(source):
         name = Path(source.rpartition(":")[0] or source).name.removesuffix(".py")
     else:

@@ -24,6 +24,9 @@ class Policy(Protocol):
     """Anything that maps prompt and history to actions, for several episodes at once.
 
     Optional: `modalities` names what observations hold, as `TabletopEnv` takes it; evaluations provide that.
+    `control` is "end_effector" where `act` returns commands of the tool, float32, shape (5,), as
+    `TabletopEnv` takes them with that control; else "primitives". Evaluations with the other control refuse
+    it.
     `explain()`, called after `act`, returns an `openvima.scene.explanation.Explanation` for each episode,
     None for those that have ended; `openvima demo --explain` draws them. Policy servers read two more:
     `new_session()` returns a policy with episodes of its own, and `prompt_limits` is its `PromptLimits`.

@@ -316,7 +316,8 @@ class NetworkPolicy(Policy):
 
         Args:
             path_or_hub_id: A checkpoint folder; a run folder, of which the best checkpoint is loaded; a
-                published `.ckpt` file; the name of a bundled checkpoint; or a Hub id such as "owner/policy".
+                published `.ckpt` file; the name of a bundled checkpoint; or a name on the Hub such as
+                "owner/policy@v1".
             tokenizer: By default the one stored with the policy.
             **options: Options of `NetworkPolicy`, such as `device`, `dtype` or `temperature`.
 

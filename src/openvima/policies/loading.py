@@ -23,7 +23,7 @@ def load_policy(
     Args:
         name_or_run: "random"; "untrained" or the name of a preset, for fresh weights; "openvima-small", the
             bundled checkpoint; a run folder of `openvima train`, of which the best checkpoint is loaded; a
-            checkpoint folder; a published `.ckpt` file; a Hub id such as "owner/policy"; or
+            checkpoint folder; a published `.ckpt` file; a name on the Hub such as "owner/policy@v1"; or
             "MODULE:FUNCTION" or "FILE.py:FUNCTION", a function without arguments that returns a policy.
         seed: Seed of the random policy and of fresh weights.
         trust_code: Whether to run the code that the run folder of a learner of your own names.

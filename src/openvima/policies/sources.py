@@ -5,6 +5,7 @@ from pathlib import Path
 
 from openvima.atomic_io import restore_folder
 from openvima.errors import CheckpointError, unknown_name
+from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import read_text
 from openvima.policies.bundled import BUNDLED, bundled_folder
 from openvima.policies.file_names import (
@@ -14,14 +15,15 @@ from openvima.policies.file_names import (
     TOKENIZER_FOLDER,
     WEIGHTS_FILE,
 )
-from openvima.policies.hub import fetch_from_hub, is_hub_id
 from openvima.policies.presets import PRESETS
 from openvima.user_code import is_code
+
+_HUB_FILES = (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*")
 
 
 def is_policy_source(text: str) -> bool:
     """Whether a text names a bundled checkpoint, an existing path or a repository on the Hub."""
-    return text in BUNDLED or Path(text).exists() or is_hub_id(text)
+    return text in BUNDLED or Path(text).exists() or hub_name(text) is not None
 
 
 def is_own_code(text: str) -> bool:
@@ -39,7 +41,8 @@ def unknown_policy(name: str, others: Sequence[str]) -> str:
     named = (*others, *BUNDLED)
     hint = (
         f"Allowed: {', '.join(named)}, a preset that `openvima policies` lists, the folder of a training "
-        "run, a published .ckpt file, an id owner/name on the Hugging Face Hub, or FILE.py:FUNCTION."
+        "run, a published .ckpt file, owner/name or owner/name@revision on the Hugging Face Hub, or "
+        "FILE.py:FUNCTION."
     )
     return unknown_name("policy", name, (*named, *PRESETS), hint)
 
@@ -49,10 +52,12 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
 
     Args:
         path_or_hub_id: A run folder, a checkpoint folder, a file, the name of a bundled checkpoint (as text;
-            a `Path` is always a local path), or a Hub id such as "owner/policy", which is downloaded.
+            a `Path` is always a local path), or the name of a repository on the Hub such as
+            "owner/policy@v1", which is downloaded.
 
     Raises:
-        CheckpointError: There is no such path, the installation lacks the weights, or the download failed.
+        CheckpointError: There is no such path, or the installation lacks the weights.
+        HubError: The download failed.
         PolicyError: A local folder has the name of a bundled checkpoint and holds a checkpoint, too.
         MissingExtraError: The Hub's client is needed and not installed.
     """
@@ -64,12 +69,22 @@ def find_checkpoint(path_or_hub_id: str | Path) -> Path:
         return checkpoint_folder(path)
     if path.exists():
         return path
-    if is_hub_id(name):
-        return fetch_from_hub(name, (WEIGHTS_FILE, CONFIG_FILE, f"{TOKENIZER_FOLDER}/*"))
+    if repository := hub_name(name):
+        return fetch(repository, _HUB_FILES)
     raise CheckpointError(
-        f"there is no checkpoint at {name}; give a folder, a .ckpt file, an id owner/name or "
+        f"there is no checkpoint at {name}; give a folder, a .ckpt file, owner/name[@revision] or "
         f"{', '.join(BUNDLED)}."
     )
+
+
+def hub_commit(source: str) -> str | None:
+    """Return the repository and commit of a policy on the Hub, as "owner/name@commit"; None for any other.
+
+    Raises:
+        HubError: The download failed.
+    """
+    name = None if source in BUNDLED else hub_name(source)
+    return None if name is None else str(HubName(name.repo, find_checkpoint(source).name))
 
 
 def checkpoint_folder(folder: Path) -> Path:

@@ -21,8 +21,8 @@ from openvima.errors import (
     echo,
 )
 from openvima.extras import import_extra
+from openvima.hub import HubName, fetch, hub_name
 from openvima.input_files import open_regular
-from openvima.policies.hub import fetch_from_hub
 from openvima.policies.nn.policy_network import PolicyNetwork
 from openvima.policies.nn.prompt_encoder import PromptEncoderConfig
 from openvima.policies.published.rules import PROMPT_RULES, T5, to_theirs
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 
 _UNKNOWN_ID = 2
 _WORD_START = "▁"  # T5 marks the beginning of a word with it
-_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")  # T5 may be named without its owner
+_OWNERLESS = re.compile(
+    r"([A-Za-z0-9][\w.-]*)(?:@([A-Za-z0-9][\w.-]*))?"
+)  # T5 may be named without its owner
 _FAST_FILE, _SENTENCEPIECE_FILE = "tokenizer.json", "spiece.model"
 _TOKENIZER_FILES = (_FAST_FILE, _SENTENCEPIECE_FILE, "tokenizer_config.json", "special_tokens_map.json")
 _SAFE_FILE, _PICKLE_FILE = "model.safetensors", "pytorch_model.bin"
@@ -54,7 +56,7 @@ class T5Tokenizer:
 
     Args:
         path_or_hub_id: A folder with `tokenizer.json` (or `spiece.model`, for which transformers needs the
-            packages sentencepiece and protobuf), or an id on the Hugging Face Hub such as "t5-base".
+            packages sentencepiece and protobuf), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
         CheckpointError: There is no such tokenizer, or it is not a T5 tokenizer.
@@ -151,14 +153,14 @@ def load_t5(network: PolicyNetwork, path_or_hub_id: str | Path) -> None:
     Args:
         network: Its text encoder must match the file in size; that of the published presets is t5-base.
         path_or_hub_id: A folder with `model.safetensors` or `pytorch_model.bin` (loaded with
-            `weights_only`), or an id on the Hugging Face Hub such as "t5-base".
+            `weights_only`), or a name on the Hugging Face Hub such as "t5-base".
 
     Raises:
         CheckpointError: There are no such weights, they are damaged, or their names or sizes differ.
         MissingExtraError: An id is given and huggingface_hub is not installed.
     """
     text = network.config.prompt.text
-    named = str(path_or_hub_id).rpartition("/")[2]
+    named = str(path_or_hub_id).partition("@")[0].rpartition("/")[2]
     if named in T5_SIZES and T5_SIZES[named] != text and not Path(path_or_hub_id).exists():
         raise CheckpointError(
             f"t5 is {path_or_hub_id}, but the network has {t5_name(text)}; give a T5 1.0 of that size."
@@ -270,9 +272,12 @@ def _folder(path_or_hub_id: str | Path, files: tuple[str, ...]) -> Path:
     folder, name = Path(path_or_hub_id), str(path_or_hub_id)
     if folder.is_dir():
         return folder
-    if folder.exists() or not _HUB_ID.fullmatch(name):
-        raise CheckpointError(f"{name} is no folder, and no id on the Hugging Face Hub such as 't5-base'.")
-    return fetch_from_hub(name, files)
+    repository = hub_name(name)
+    if repository is None and (ownerless := _OWNERLESS.fullmatch(name)):
+        repository = HubName(*ownerless.groups())
+    if folder.exists() or repository is None:
+        raise CheckpointError(f"{name} is no folder, and no name on the Hugging Face Hub such as 't5-base'.")
+    return fetch(repository, files)
 
 
 def _require(module: str, what: str, packages: str) -> ModuleType:

@@ -32,7 +32,7 @@ class VideoSelection:
     """Which episodes to record for the report.
 
     Args:
-        per_task: Solved episodes, and failures, of each trained policy and task.
+        per_task: Solved episodes, and failures, of each trained policy, task and level.
         record_video: Further episodes, of every policy: "task/seed" at the task's first level, or
             "task/level/seed".
 
@@ -84,22 +84,23 @@ def evaluate_and_report(
     """
     require_extra()
     requested_episodes(config, videos)
-    prepared = prepare(config)
-    with folder_lock(config.out):
-        path = evaluate_prepared(prepared, progress)
-        results = Results.read(path)
-        episodes = sum(row.episodes for row in results.rows)
-        note = None if progress is None else lambda text: progress(episodes, episodes, text)
-        write_report(
-            results,
-            config.out / REPORT_NAME,
-            command=default_command(results, config.policies),
-            metrics=find_metrics(config.sources),
-            clips=_recorded(recording_jobs(config, videos, results), config, note),
-            confirmations=[
-                Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
-            ],
-        )
+    with config.served() as served:
+        prepared = prepare(served)
+        with folder_lock(config.out):
+            path = evaluate_prepared(prepared, progress)
+            results = Results.read(path)
+            episodes = sum(row.episodes for row in results.rows)
+            note = None if progress is None else lambda text: progress(episodes, episodes, text)
+            write_report(
+                results,
+                config.out / REPORT_NAME,
+                command=default_command(results, config.policies),
+                metrics=find_metrics(served.sources),
+                clips=_recorded(recording_jobs(served, videos, results), served, note),
+                confirmations=[
+                    Confirmation.of(results, "DIR", confirmed=is_marked_verified(config.out)),
+                ],
+            )
     return path
 
 
@@ -149,17 +150,17 @@ def requested_episodes(config: EvaluationConfig, videos: VideoSelection) -> list
 def recording_jobs(config: EvaluationConfig, videos: VideoSelection, results: Results) -> list[Job]:
     """Choose which episodes to record.
 
-    Of each task at its first level: the first `videos.per_task` solved episodes of every trained policy and
-    of the oracle, and as many failures of trained policies. Without trained policies and oracle, of all
-    policies. Then the requested episodes, of every policy.
+    Of each task and level: the first `videos.per_task` solved episodes and failures of every trained policy.
+    Of the oracle the first solved ones of each task. Without trained policies and oracle, of all policies.
+    Then the requested episodes, of every policy.
     """
     sources, requested = config.sources, requested_episodes(config, videos)
     jobs = []
     for source in [source for source in sources if source.kind in (*TRAINED_KINDS, ORACLE)] or sources:
         for task in results.tasks():
             levels = (results.row(source.name, task, level) for level in results.levels())
-            row = next((row for row in levels if row is not None), None)
-            if row is not None:
+            rows = [row for row in levels if row is not None]
+            for row in rows[:1] if source.kind == ORACLE else rows:
                 seeds = [outcome.seed for outcome in row.outcomes if outcome.success][: videos.per_task]
                 if source.kind != ORACLE:
                     failed = (outcome.seed for outcome in row.outcomes if not outcome.success)

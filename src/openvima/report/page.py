@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML file without scripts."""
+"""The report: one self-contained HTML file, readable without its script."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from openvima.evaluation.comparison import Comparison, compare_pairs, default_pa
 from openvima.evaluation.results import Results
 from openvima.evaluation.sources import NAMED_POLICIES
 from openvima.html import render_page
-from openvima.report import figures, fragments, published, tables, text
+from openvima.report import episodes, figures, fragments, published, reasons, tables, text
 from openvima.report.ablations import ablated_policies
 from openvima.report.confirmation import Confirmation
 from openvima.report.curves import read_run_charts
@@ -26,11 +26,13 @@ _FUNCTIONS = (  # that the templates in `html/templates/report/` call
     *(tables.oracle_horizon_means, tables.failure_causes, figures.level_chart, figures.curve_chart),
     *(published.published_rate, published.published_coverage, published.published_rows),
     *(published.leading_models, fragments.rate_figure_html, fragments.table_html),
+    *(reasons.plain_reason, episodes.disagreements),
 )
 _OPTIONS = {  # settings that a command names where they are not these
     "assets": "procedural",
     "prompts": "multimodal",
     "task_options": "",
+    "control": "primitives",
     "batch": 16,
     "boxes": "",
     "device": "cpu",
@@ -77,6 +79,9 @@ def write_report(
         comparisons = compare_pairs(results, default_pairs(results))
     with_published = with_published and published.is_comparable(results)
     records = [*([metrics] if metrics else []), *runs]
+    clips = list({clip.file_name: clip for clip in clips}.values())
+    videos = episodes.video_ids(clips)
+    listed, num_episodes = episodes.listed_episodes(results, videos)
     page = render_page(
         "report",
         **{function.__name__: function for function in _FUNCTIONS},
@@ -95,6 +100,9 @@ def write_report(
         measured=text.measured(results),
         notes=notes,
         clips=clips,
+        videos=videos,
+        episodes=listed,
+        num_episodes=num_episodes,
         comparisons=comparisons,
         confirmations=confirmations,
         all_confirmed=bool(confirmations) and all(each.confirmed for each in confirmations),

@@ -7,6 +7,7 @@ from functools import cache
 from importlib import resources
 
 from openvima.evaluation.results import Results
+from openvima.scene.command import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
 # The only model whose success by task was published for all levels.
@@ -122,15 +123,18 @@ def published_rate(level: str, tasks: Sequence[str], model: PublishedModel | Non
 
 
 def is_comparable(results: Results) -> bool:
-    """Whether prompts and task options are as published; success with others is another quantity."""
+    """Whether prompts, task options and control are as published; success with others is another quantity."""
     return not unpublished_settings(results)
 
 
 def unpublished_settings(results: Results) -> str:
-    """Name the form of prompts and the task options in a sentence, unless they are as published."""
+    """Name prompts, task options and control in sentences, unless they are as published."""
     prompts, options = results.config.get("prompts", MULTIMODAL), results.config.get("task_options", "")
-    return (f" Prompts: {prompts}." if prompts != MULTIMODAL else "") + (
-        f" Task options: {options}." if options else ""
+    control = results.config.get("control", PRIMITIVES)
+    return (
+        (f" Prompts: {prompts}." if prompts != MULTIMODAL else "")
+        + (f" Task options: {options}." if options else "")
+        + (f" Control: {control}." if control != PRIMITIVES else "")
     )
 
 

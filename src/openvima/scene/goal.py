@@ -18,6 +18,7 @@ class Condition(Protocol):
     |---|---|
     | `object_id: int` | the object that a goal is about: its loss is a failure, and reasons name it |
     | `oracle_move(scene)` | an `AtPose` or `InZone` that the oracle pursues to meet the goal |
+    | `distance(scene) -> (m, rad)` | how far its object is from meeting it, for `info["progress"]` |
     | `reason(scene) -> str` | why it is not met, one sentence: the reason of a failure |
     | `monitored: bool` | of a constraint: test it during motion too, at least every 25 ticks |
     | `renumbered(new_of)` | the same condition for other object ids, which `new_of` maps from old to new |
@@ -74,6 +75,12 @@ class Zone:
         px, py, pz = point
         return abs(px - self.x) < self.size_x / 2 and abs(py - self.y) < self.size_y / 2 and pz < 0.3
 
+    def distance(self, point: tuple[float, float, float]) -> float:
+        """Planar distance of a point from the rectangle in metres; 0 inside."""
+        beside_x = max(abs(point[0] - self.x) - self.size_x / 2, 0.0)
+        beside_y = max(abs(point[1] - self.y) - self.size_y / 2, 0.0)
+        return math.hypot(beside_x, beside_y)
+
     def is_near(self, pose: Pose) -> bool:
         """Whether a small block at `pose` can have a point in the zone; cheaper than its points."""
         reach_x, reach_y = self.size_x / 2 + _BLOCK_REACH_M, self.size_y / 2 + _BLOCK_REACH_M
@@ -119,6 +126,14 @@ class AtPose:
         """Whether the object is at the target."""
         return self.tolerance.accepts(scene[self.object_id].pose, self.target, self.symmetry_rad)
 
+    def distance(self, scene: Scene) -> tuple[float, float]:
+        """Planar distance from the target in metres, and from its heading in radians; 0 if any is fine."""
+        pose = scene[self.object_id].pose
+        if self.tolerance.yaw_rad is None:
+            return pose.planar_distance(self.target), 0.0
+        angle_rad = angle_difference(pose.yaw_rad, self.target.yaw_rad, self.symmetry_rad)
+        return pose.planar_distance(self.target), angle_rad
+
     def oracle_move(self, scene: Scene) -> "AtPose":
         """Return the goal itself: one pick and place meets it."""
         return self
@@ -146,6 +161,11 @@ class InZone:
     def is_met(self, scene: Scene) -> bool:
         """Whether the block is in the zone."""
         return all(self.zone.contains(point) for point in block_points(scene[self.object_id].pose))
+
+    def distance(self, scene: Scene) -> tuple[float, float]:
+        """Distance of the block's farthest point from the zone in metres, and 0 radians."""
+        points = block_points(scene[self.object_id].pose)
+        return max(self.zone.distance(point) for point in points), 0.0
 
     def oracle_move(self, scene: Scene) -> "InZone":
         """Return the goal itself: sweeps meet it."""
@@ -185,6 +205,12 @@ def oracle_move(goal: Goal, scene: Scene) -> OracleMove | None:
     """The built-in goal that the oracle pursues to meet a goal; None if it states none."""
     move = getattr(goal, "oracle_move", None)
     return None if move is None else move(scene)
+
+
+def distance_to(goal: Goal, scene: Scene) -> tuple[float, float] | None:
+    """How far a goal's object is from meeting it, in metres and radians; None if the goal does not say."""
+    distance = getattr(goal, "distance", None)
+    return None if distance is None else distance(scene)
 
 
 def unmet_reason(condition: Condition, scene: Scene) -> str:

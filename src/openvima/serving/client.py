@@ -15,6 +15,7 @@ from openvima.serving.packing import pack, require_extra
 from openvima.serving.protocol import (
     PROTOCOL,
     TOKEN_VARIABLE,
+    check_modalities,
     check_token,
     decode_action,
     encode_observation,
@@ -56,6 +57,10 @@ class RemotePolicy(Policy):
         self.near_ties: list[bool] = []  # see `NetworkPolicy.near_ties`; empty where the server does not say
         self._connection = Connection(url, self._token, timeout_s)
         self.metadata = self._connection.metadata
+        try:
+            self.modalities = check_modalities(self.metadata.get("modalities", ("rgb", "segm")), "the policy")
+        except MessageError as error:
+            raise self._connection.broken(str(error)) from error
 
     def __enter__(self) -> "RemotePolicy":
         return self

@@ -16,6 +16,7 @@ from openvima.scene import ObjectRecord, PromptImage, RenderedPrompt
 PROTOCOL = "openvima-policy/1"
 TOKEN_VARIABLE = "OPENVIMA_SERVE_TOKEN"  # read by server and client where no token is given
 SCHEMES = ("ws://", "wss://")
+MODALITIES = ("rgb", "segm", "joints")  # that observations may hold besides `ee`
 MAX_PIXELS = 2**20  # of an image; those of the benchmark have 2**15
 
 _KINDS: tuple[Literal["object", "scene"], ...] = ("object", "scene")
@@ -84,11 +85,13 @@ def decode_prompt(message: object, where: str = "prompt") -> RenderedPrompt:
 
 
 def encode_observation(observation: Mapping | None) -> dict[str, Any] | None:  # Any: see `encode_prompt`
-    """Turn an observation (`rgb`, `segm`, `ee`) into plain values and arrays; None stays None."""
+    """Turn an observation (`rgb`, `segm`, `joints`, `ee`) into plain values and arrays; None stays None."""
     if observation is None:
         return None
-    views = {part: dict(observation[part]) for part in ("rgb", "segm") if part in observation}
-    return {**views, "ee": int(observation["ee"])}
+    parts = {part: dict(observation[part]) for part in ("rgb", "segm") if part in observation}
+    if "joints" in observation:
+        parts["joints"] = observation["joints"]
+    return {**parts, "ee": int(observation["ee"])}
 
 
 def decode_observation(message: object, where: str = "observation") -> dict[str, Any] | None:
@@ -103,8 +106,14 @@ def decode_observation(message: object, where: str = "observation") -> dict[str,
     """
     if message is None:
         return None
-    fields = _map(message, where, required=("rgb", "ee"), optional=("segm",))
+    fields = _map(message, where, required=("rgb", "ee"), optional=("segm", "joints"))
     _check_views(fields, where)
+    if "joints" in fields:
+        joints = _typed(fields["joints"], np.ndarray, f"{where}: joints")
+        if joints.shape != (6,) or joints.dtype != np.float32 or not np.isfinite(joints).all():
+            raise MessageError(
+                f"{where}: joints is {joints.dtype} {joints.shape}; it must be float32 (6,), all finite."
+            )
     if type(fields["ee"]) is not int:  # a bool is no number of a tool
         raise MessageError(f"{where}: ee is {_shown(fields['ee'])}; it must be a whole number.")
     return fields
@@ -130,6 +139,24 @@ def decode_action(message: object, where: str = "action") -> dict[str, np.ndarra
     for key, value in _typed(message, dict, where).items():
         _typed(value, np.ndarray, f"{where}: {_shown(key)}")
     return message  # type: ignore[return-value]  # checked
+
+
+def check_modalities(names: object, whose: str) -> tuple[str, ...]:
+    """Return the modalities that a policy asks for.
+
+    Args:
+        names: What it names.
+        whose: How to name the policy in the error.
+
+    Raises:
+        MessageError: It is no list of modalities that are sent, or "rgb" is not among them.
+    """
+    listed = list(names) if isinstance(names, list | tuple) else []
+    if "rgb" not in listed or any(name not in MODALITIES for name in listed):
+        raise MessageError(
+            f"{whose} has modalities {echo(repr(names))}; servers get rgb and, if asked, segm and joints."
+        )
+    return tuple(name for name in MODALITIES if name in listed)
 
 
 def read_list(

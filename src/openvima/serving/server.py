@@ -19,7 +19,7 @@ from openvima.policies.own_code import checked_policy
 from openvima.policies.prompt_limits import PromptLimits
 from openvima.serving.config import ServerConfig, server_config
 from openvima.serving.packing import pack, require_extra
-from openvima.serving.protocol import PROTOCOL
+from openvima.serving.protocol import PROTOCOL, check_modalities
 from openvima.serving.session import Session
 
 if TYPE_CHECKING:
@@ -138,11 +138,14 @@ class _PolicyServer:
         self._num_connections = 0
         limits: PromptLimits = getattr(policy, "prompt_limits", PromptLimits())
         prompt_limits = {f"prompt_{name}": number for name, number in asdict(limits).items()}
+        asked = getattr(policy, "modalities", None)
+        modalities = {} if asked is None else {"modalities": check_modalities(asked, "the policy")}
         self._metadata = pack(
             {
                 "protocol": PROTOCOL,
                 "versions": {"openvima": __version__},
                 **about,
+                **modalities,
                 "limits": {
                     "message_bytes": config.max_message_bytes,
                     "episodes": config.max_episodes,

@@ -137,7 +137,14 @@ class Bodies:
         self._positions[rows], self._velocities[rows] = before, 0.0
 
     def tick_with_spatula(
-        self, pose: Pose, velocity: Vector3, *, num_ticks: int, max_speed: float, sleeping: Iterable[int]
+        self,
+        pose: Pose,
+        velocity: Vector3,
+        *,
+        num_ticks: int,
+        max_speed: float,
+        sleeping: Iterable[int],
+        turning: float = 0.0,
     ) -> None:
         """Advance the physics while the spatula moves at constant velocity, unaffected by contacts.
 
@@ -148,8 +155,9 @@ class Bodies:
             max_speed: See `limit_speed`; applied at the end. With fixed bodies, after every tick: a body
                 squeezed between one and the spatula accelerates too fast for a later limit.
             sleeping: See `tick`.
+            turning: Angular velocity of the upright spatula, rad/s; its heading follows after the last tick.
         """
-        place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, 0.0))
+        place, speed = np.array(_numbers(pose)), np.array((*velocity, 0.0, 0.0, turning))
         stride = 1 if self._has_walls else num_ticks
         for _ in range(0, num_ticks, stride):
             self._positions[-1], self._velocities[-1] = place, speed

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openvima.scene import Action, Pose
+from openvima.scene.command import ToolPose
 from openvima.sim import end_effectors as tools
 from openvima.sim import ur5
 from openvima.sim.arm_path import reachable_joints
@@ -46,10 +47,10 @@ def pick_place(state: PrimitiveState, action: Action) -> int | None:
     if caught is None or caught not in bodies.rigid:
         path.move(hover, scene=lambda _: state.start)
         return None
-    held = _HeldBody(caught, bodies.pose(caught), action, contact_z)
+    held = HeldBody(caught, bodies.pose(caught), ToolPose(x, y, contact_z, action.yaw0_rad))
     stands_alone = _lift(state, held)
     path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
-    _set_down(state, held, stands_alone=stands_alone)
+    _set_down(state, held, action, stands_alone=stands_alone)
     return caught
 
 
@@ -104,30 +105,53 @@ def _surface_z(bodies: Bodies, index: int, x: float, y: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _HeldBody:
-    """A body on the suction cup: its pose at the grasp, the action, and the tip's height at the grasp."""
+class HeldBody:
+    """A body on the suction cup.
+
+    Args:
+        index: Its index.
+        grasped_at: Its pose at the grasp.
+        grasp: Pose of the tool at the grasp.
+    """
 
     index: int
     grasped_at: Pose
-    action: Action
-    contact_z: float
+    grasp: ToolPose
 
     def at(self, joints: np.ndarray) -> tuple[int, Pose]:
         """Index and pose for the arm at `joints`."""
-        x, y = self.action.pose0_position
-        tip = ur5.tool_pose(x, y, self.contact_z, self.action.yaw0_rad)
+        tip = ur5.tool_pose(self.grasp.x, self.grasp.y, self.grasp.z, self.grasp.yaw_rad)
         return self.index, ur5.forward(joints) @ tip.inverse() @ self.grasped_at
 
-    def target(self) -> Pose:
-        """Pose above pose1 at the height of the grasp: the grasp pose carried along with the tool."""
-        pick = Pose.planar(*self.action.pose0_position, self.action.yaw0_rad)
-        place = Pose.planar(*self.action.pose1_position, self.action.yaw1_rad)
-        return place @ pick.inverse() @ self.grasped_at
+    def carried(self, x: float, y: float, yaw_rad: float) -> Pose:
+        """Pose with the tool above a point, at the height of the grasp."""
+        pick = Pose.planar(self.grasp.x, self.grasp.y, self.grasp.yaw_rad)
+        return Pose.planar(x, y, yaw_rad) @ pick.inverse() @ self.grasped_at
+
+    def lowest(self, bodies: Bodies, x: float, y: float, yaw_rad: float) -> tuple[Pose, bool]:
+        """Pose at first contact when lowered at a point, and whether that is with bare floor.
+
+        The body is left high above; place or park it.
+        """
+        target = self.carried(x, y, yaw_rad)
+        drop, on_floor = _distance_down(bodies, self.index, target.moved(dz=_ABOVE_ALL_M))
+        return target.moved(dz=_ABOVE_ALL_M - drop), on_floor
 
 
-def _lift(state: PrimitiveState, held: _HeldBody) -> bool:
+def _lift(state: PrimitiveState, held: HeldBody) -> bool:
     """Take a body out of the physics and let others settle; return whether it touched no other."""
-    bodies = state.bodies
+    stands_alone, carries_others = take_out(state.bodies, held)
+    if carries_others:
+        state.settle((held.index, held.grasped_at.moved(dz=tools.HOVER_TIP_Z_M)))
+    return stands_alone
+
+
+def take_out(bodies: Bodies, held: HeldBody) -> tuple[bool, bool]:
+    """Take a grasped body out of the physics.
+
+    Returns:
+        Whether it lay flat on the floor and touched no other; whether it touched a free one.
+    """
     touching = [
         other
         for other in range(len(bodies.shapes))
@@ -135,21 +159,19 @@ def _lift(state: PrimitiveState, held: _HeldBody) -> bool:
     ]
     on_floor = held.grasped_at.z + bodies.lowest_z(held.index, held.grasped_at.quaternion) - FLOOR_Z_M
     bodies.park(held.index)
-    if any(other in bodies.rigid for other in touching):
-        state.settle((held.index, held.grasped_at.moved(dz=tools.HOVER_TIP_Z_M)))
-    return not touching and on_floor < RESTING_GAP_M and is_level(held.grasped_at)
+    stands_alone = not touching and on_floor < RESTING_GAP_M and is_level(held.grasped_at)
+    return stands_alone, any(other in bodies.rigid for other in touching)
 
 
-def _set_down(state: PrimitiveState, held: _HeldBody, *, stands_alone: bool) -> None:
+def _set_down(state: PrimitiveState, held: HeldBody, action: Action, *, stands_alone: bool) -> None:
     """Carry a body to pose1, lower it to first contact, release it and settle."""
     bodies, path = state.bodies, state.path
-    x, y = held.action.pose1_position
-    yaw_rad = held.action.yaw1_rad
-    target = held.target()
-    drop, on_floor = _distance_down(bodies, held.index, target.moved(dz=_ABOVE_ALL_M))
-    set_down_at = target.moved(dz=_ABOVE_ALL_M - drop)
+    x, y = action.pose1_position
+    yaw_rad = action.yaw1_rad
+    target = held.carried(x, y, yaw_rad)
+    set_down_at, on_floor = held.lowest(bodies, x, y, yaw_rad)
     hover = reachable_joints(x, y, tools.HOVER_TIP_Z_M, yaw_rad)
-    contact_z = held.contact_z + set_down_at.z - target.z
+    contact_z = held.grasp.z + set_down_at.z - target.z
     path.move(hover, scene=lambda joints: state.scene(held.at(joints)))
     path.move(reachable_joints(x, y, contact_z, yaw_rad), scene=lambda joints: state.scene(held.at(joints)))
     if on_floor and stands_alone:  # no physics needed, and its height keeps the same value
@@ -191,22 +213,50 @@ def sweep(state: PrimitiveState, action: Action, *, compat: bool = False) -> Non
         action: Start and end.
         compat: Move straight in joint space, as VIMA-Bench does, and stop 3 mm earlier.
     """
+    plan = sweep_plan(action, compat=compat)
+    if plan is None:
+        return
+    spatula = Spatula(state, plan.yaw_rad, in_joint_space=compat)
+    spatula.lower(*plan.start)
+    for x, y in plan.legs:
+        spatula.push(x, y)
+    spatula.lift()
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPlan:
+    """The spatula's way in one sweep.
+
+    Args:
+        yaw_rad: Heading.
+        start: Where the spatula is lowered, x and y in metres.
+        legs: Ends of the straight lines along which it then moves.
+    """
+
+    yaw_rad: float
+    start: tuple[float, float]
+    legs: tuple[tuple[float, float], ...]
+
+
+def sweep_plan(action: Action, *, compat: bool = False) -> SweepPlan | None:
+    """Return the way of the spatula in a sweep; None if the two points are equal.
+
+    Args:
+        action: Start and end.
+        compat: Stop 3 mm earlier.
+    """
     (x0, y0), (x1, y1) = action.pose0_position, action.pose1_position
     distance = math.hypot(x1 - x0, y1 - y0)
     if distance == 0:
-        return
+        return None
     shortfall_m = tools.SPATULA_SHORTFALL_M + (tools.COMPAT_SHORTFALL_M if compat else 0.0)
     vx, vy = (x1 - x0) / distance, (y1 - y0) / distance
     start = _within_reach(x0 - tools.SPATULA_RUN_UP_M * vx, y0 - tools.SPATULA_RUN_UP_M * vy)
     end = _within_reach(x1 - shortfall_m * vx, y1 - shortfall_m * vy)
     # A sweep shorter than run-up and shortfall overshoots, then returns, as in VIMA-Bench.
     nudge = distance + tools.SPATULA_RUN_UP_M - shortfall_m
-    legs = [end] if nudge >= 0 else [_within_reach(start[0] - nudge * vx, start[1] - nudge * vy), end]
-    spatula = Spatula(state, math.atan2(vy, vx), in_joint_space=compat)
-    spatula.lower(*start)
-    for x, y in legs:
-        spatula.push(x, y)
-    spatula.lift()
+    overshoot = () if nudge >= 0 else (_within_reach(start[0] - nudge * vx, start[1] - nudge * vy),)
+    return SweepPlan(math.atan2(vy, vx), start, (*overshoot, end))
 
 
 def _within_reach(x: float, y: float) -> tuple[float, float]:

@@ -42,16 +42,19 @@ class Spatula:
         yaw_rad: Heading of the sweep.
         in_joint_space: Move straight in joint space, as VIMA-Bench's arm does: the spatula deviates by some
             centimetres in a long sweep. Else straight down, along and up.
+        awake: Bodies are moving already.
     """
 
-    def __init__(self, state: PrimitiveState, yaw_rad: float, *, in_joint_space: bool = False) -> None:
+    def __init__(
+        self, state: PrimitiveState, yaw_rad: float, *, in_joint_space: bool = False, awake: bool = False
+    ) -> None:
         self._state = state
         self._bodies = state.bodies
         self._yaw_rad = yaw_rad
         self._in_joint_space = in_joint_space
         self._tip: Vector3 = (0.0, 0.0, tools.SWEEP_HOVER_TIP_Z_M)
         self._recent: list[tuple[np.ndarray, Vector3]] = []  # coordinates and tip before the last strides
-        self._sleeping = set(state.bodies.rigid)  # at rest, and far from all that moves
+        self._sleeping = set(() if awake else state.bodies.rigid)  # at rest, and far from all that moves
         self._pushed = tuple(geom for index in state.bodies.rigid for geom in state.bodies.geoms(index))
 
     def lower(self, x: float, y: float) -> None:
@@ -80,6 +83,30 @@ class Spatula:
             self._push_to(point)
         self._push_to((x, y, tools.SWEEP_TIP_Z_M))
         self._state.path.waypoints.append(target)
+
+    def engage(self, x: float, y: float) -> None:
+        """Press the spatula to the table where it is, displacing bodies there."""
+        self._tip = (x, y, tools.SWEEP_TIP_Z_M)
+        for index in self._bodies.rigid:
+            self._displace(index)
+
+    def slide(self, x: float, y: float, yaw_rad: float, num_ticks: int) -> None:
+        """Move the pressed spatula with physics, to a pose that it reaches after some ticks."""
+        time_s = num_ticks * TICK_S
+        dx, dy, turn = x - self._tip[0], y - self._tip[1], yaw_rad - self._yaw_rad
+        for done in range(0, num_ticks, settling.STRIDE_TICKS):
+            ticks = min(settling.STRIDE_TICKS, num_ticks - done)
+            self._run(ticks, (dx / time_s, dy / time_s, 0.0), turn / time_s)
+            share = ticks / num_ticks
+            self._tip = _moved(self._tip, (dx, dy, 0.0), share)
+            self._yaw_rad += turn * share
+        self._tip, self._yaw_rad = (x, y, self._tip[2]), yaw_rad
+
+    def release(self) -> settling.Settling:
+        """Take the spatula off the table; return the settling of the bodies that it moved."""
+        self._bodies.park_spatula()
+        self._wake(_SLIDE_M)
+        return settling.Settling(self._bodies, max_speed=MAX_SPEED, sleeping=self._sleeping)
 
     def lift(self) -> None:
         """Lift the spatula and let everything settle."""
@@ -207,10 +234,15 @@ class Spatula:
         self._run(num_ticks, _moved((0.0, 0.0, 0.0), direction, speed))
         self._tip = _moved(self._tip, direction, length)
 
-    def _run(self, num_ticks: int, velocity: Vector3) -> None:
+    def _run(self, num_ticks: int, velocity: Vector3, turning: float = 0.0) -> None:
         self._wake(_STRIDE_M)
         self._bodies.tick_with_spatula(
-            self._pose(), velocity, num_ticks=num_ticks, max_speed=MAX_SPEED, sleeping=self._sleeping
+            self._pose(),
+            velocity,
+            turning=turning,
+            num_ticks=num_ticks,
+            max_speed=MAX_SPEED,
+            sleeping=self._sleeping,
         )
         self._state.count_ticks(num_ticks)
         self._state.path.stay(num_ticks, scene=self._state.scene, joints=self._joints)

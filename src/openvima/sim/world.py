@@ -12,7 +12,7 @@ from openvima.sim.arm_path import ArmPath, RecordFrame
 from openvima.sim.bodies import Bodies
 from openvima.sim.primitive_state import PrimitiveState, is_at_rest
 
-_SEPARATION_SPEED = 0.1  # m/s, of bodies that overlap at the start, as in VIMA-Bench
+SEPARATION_SPEED = 0.1  # m/s, of bodies that overlap at the start, as in VIMA-Bench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +94,7 @@ class World:
         path = ArmPath(self._joints, record, frames_per_second)
         state = PrimitiveState(self._scene, self._bodies, path, monitor)
         if not self._is_settled:
-            state.settle(max_speed=_SEPARATION_SPEED)
+            state.settle(max_speed=SEPARATION_SPEED)
             self._is_settled = True
         grasped = self._perform(state, action)
         self._scene = state.finish()

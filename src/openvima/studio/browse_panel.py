@@ -57,14 +57,13 @@ class BrowsePanel:
         self._failures = gui.add_checkbox("failures only", True)
         self._outcome = gui.add_dropdown("episode", [_NONE])
         self._source = gui.add_text("weights", "", hint="run folder; empty: found by the hash of its weights")
-        replay = gui.add_button_group("play again", ("live", "recorded actions"))
+        works = {"live": self._replay, "recorded actions": self._replay_recorded}
+        self.session.add_buttons("play again", works)
         self._reason = gui.add_markdown("")
         for choice in (self._policy, self._ablation):
             choice.on_update(self.session.callback(self._show_matrix))
         self._failures.on_update(self.session.callback(self._show_cell))
         self._outcome.on_update(self.session.callback(self._replay))
-        works = {"live": self._replay, "recorded actions": self._replay_recorded}
-        replay.on_click(self.session.callback(lambda: works[replay.value]()))
 
     def _add_data_fields(self, gui: viser.GuiApi) -> None:
         self._task = gui.add_dropdown("task", [_ALL])
@@ -119,16 +118,14 @@ class BrowsePanel:
         self._rows = []
         with self._matrix:
             for task, by_level in rates.items():
-                levels = {f"{level} {100 * rate:.0f}": level for level, rate in by_level.items()}
-                group = self.session.gui.add_button_group(task.replace("_", " "), [*levels])
-                group.on_click(self.session.callback(partial(self._choose_cell, task, levels, group)))
-                self._rows.append(group)
+                cells = {
+                    f"{level} {100 * rate:.0f}": partial(self._show_cell, task, level)
+                    for level, rate in by_level.items()
+                }
+                self._rows.append(self.session.add_buttons(task.replace("_", " "), cells))
         if rates:
             task = next(iter(rates))
             self._show_cell(task, next(iter(rates[task])))
-
-    def _choose_cell(self, task: str, levels: dict[str, str], group: viser.GuiButtonGroupHandle) -> None:
-        self._show_cell(task, levels[group.value])
 
     def _show_cell(self, task: str = "", level: str = "") -> None:
         """List the episodes of a cell; by default of that in view."""

@@ -2,11 +2,12 @@
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any  # of coroutines
 
 import numpy as np
 import viser
@@ -78,6 +79,7 @@ class BrowserSession:
         self._running = self._newest = threading.Event()  # set to end the work submitted with it
         self.editing = False  # whether clicks select objects to edit, instead of acting
         self.prompt_weights: list[tuple[Colour, np.ndarray]] = []  # attention to draw below the prompt
+        self.next_seed: Callable[[], None] = lambda: None  # set by *Play*
         self._other_policy: RolloutPolicy | None = None
         self._other_table: Table | None = None
         self._compat = config.env_config.compat
@@ -117,14 +119,26 @@ class BrowserSession:
         self.pause()
         return self.submit(work)
 
-    def callback(self, work: Callable[[], object]) -> Callable[[viser.GuiEvent], None]:
+    def callback(self, work: Callable[[], object]) -> Callable[[viser.GuiEvent], Coroutine[Any, Any, None]]:
         """Return a callback for a field of viser: it interrupts, unless code has changed the field."""
 
-        def called(event: viser.GuiEvent) -> None:
+        async def called(event: viser.GuiEvent) -> None:  # asynchronous ones are called in order
             if event.client is not None:
                 self.interrupt(work)
 
         return called
+
+    def add_buttons(
+        self, label: str, actions: Mapping[str, Callable[[], object]]
+    ) -> viser.GuiButtonGroupHandle:
+        """Add a group of buttons by name; each interrupts, and then does its work."""
+        group = self.gui.add_button_group(label, [*actions])
+
+        @group.on_click
+        async def _(_: viser.GuiEvent) -> None:  # before the next press changes the value
+            self.interrupt(actions[group.value])
+
+        return group
 
     def pause(self) -> None:
         """End the animation or run that is going on."""

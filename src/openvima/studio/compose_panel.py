@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from openvima.scene.pose import quaternion_yaw
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of, move
 
-_GIZMO, _REFUSED = "/compose/gizmo", "/compose/refused"
+_GIZMO, _REFUSED = "/compose/gizmo", "refused"
 _GIZMO_M = 0.12
 _REFUSED_RGB = (220, 30, 30)
 _FIRST = Composition((), "Put the {a} into the {b}.", goals=(("in", "a", "b"),))
@@ -41,7 +41,7 @@ class ComposePanel:
         gui = session.gui
         with session.tabs.add_tab("Compose", viser.Icon.CUBE_PLUS):
             actions = {"edit this episode": self._take_over, "new scene": self._begin, "play": self._play}
-            self._add_buttons("", actions)
+            session.add_buttons("", actions)
             self._edits = gui.add_checkbox("clicks select objects", True, hint="else they act, as in You")
             self._edits.on_update(session.callback(self._follow))
             with gui.add_folder("Object"):
@@ -53,24 +53,19 @@ class ComposePanel:
                 self._add_picture_fields(gui)
             with gui.add_folder("File", expand_by_default=False):
                 self._path = gui.add_text("file", "scene.yaml")
-                self._add_buttons("", {"save": self._save, "load": self._load})
+                session.add_buttons("", {"save": self._save, "load": self._load})
                 written = {"Python": python_code, "command": shell_command}
-                self._add_buttons(
-                    "copy as", {kind: partial(self._copy, code) for kind, code in written.items()}
-                )
+                works = {kind: partial(self._copy, code) for kind, code in written.items()}
+                session.add_buttons("copy as", works)
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._object_dragged)
         session.on_change(self._follow)
-
-    def _add_buttons(self, label: str, actions: Mapping[str, Callable[[], object]]) -> None:
-        group = self.session.gui.add_button_group(label, [*actions])
-        group.on_click(self.session.callback(lambda: actions[group.value]()))
 
     def _add_object_fields(self, gui: viser.GuiApi) -> None:
         self._object = gui.add_dropdown("shape", [*OBJECTS], initial_value="heart")
         self._texture = gui.add_dropdown("texture", [*TEXTURES], initial_value="red swirl")
         changes = {"add": self._add, "replace": self._replace, "remove": self._remove}
-        self._add_buttons("", changes)
+        self.session.add_buttons("", changes)
         self._selected = gui.add_dropdown("selected", [_NONE])
         self._pose = gui.add_vector3("x, y (m), turn (°)", (0.5, 0.0, 0.0), step=0.005)
         self._scale = gui.add_slider("size", 0.5, 2.0, 0.05, 1.0)
@@ -90,7 +85,7 @@ class ComposePanel:
         self._slot = gui.add_text("placeholder", "c", hint="a name for the picture, without braces")
         shape = lambda: self._insert((self._object.value, self._texture.value))  # noqa: E731
         scene = lambda: self._insert(self._present().scene_image())  # noqa: E731
-        self._add_buttons("shows", {"shape above": shape, "scene as it is": scene})
+        self.session.add_buttons("shows", {"shape above": shape, "scene as it is": scene})
         upload = gui.add_upload_button("PNG file …", mime_type="image/png")
         upload.on_upload(self.session.callback(lambda: self._insert(photo_from_bytes(upload.value.content))))
 
@@ -263,7 +258,7 @@ class ComposePanel:
 
     def _show_selected(self) -> None:
         """Show the selected object's fields, and the gizmo at it."""
-        self.session.client.scene.remove_by_name(_REFUSED)
+        self.session.client.scene.remove_by_name(f"{self.session.table.root}/{_REFUSED}")
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None

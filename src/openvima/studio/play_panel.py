@@ -40,7 +40,7 @@ class PlayPanel:
         hint = "run folder, FILE.py:FUNCTION, ws://HOST:PORT, id on the Hub"
         self._source = gui.add_text("source", "", hint=hint, visible=False)
         for choice, work in (
-            (self._task, self._choose_task),
+            (self._task, self._open),
             (self._level, self._open),
             (self._seed, self._open),
             (self._assets, self._open),
@@ -51,22 +51,13 @@ class PlayPanel:
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
         session = self.session
-        self._buttons = gui.add_button_group("", ("step", "play", "pause", "next seed"))
+        works = {"step": session.step, "play": session.run, "pause": session.pause}
+        session.add_buttons("", {**works, "next seed": self._next_seed})
+        session.next_seed = self._next_seed
         self._time = gui.add_slider("after step", 0, 1, 1, 0)
         self._speed = gui.add_slider("speed", 0.25, 8.0, 0.25, 1.0)
-
-        works = {"step": session.step, "play": session.run, "pause": session.pause}
-        works["next seed"] = self._next_seed
-        self._buttons.on_click(session.callback(lambda: works[self._buttons.value]()))
         self._time.on_update(session.callback(lambda: session.back(self._time.value)))
         self._speed.on_update(lambda _: setattr(session, "speed", self._speed.value))
-
-    def _choose_task(self) -> None:
-        levels = task_spec(self._task.value).levels
-        level = self._level.value
-        self._level.options = levels
-        self._level.value = level if level in levels else levels[0]
-        self._open()
 
     def _choose_policy(self) -> None:
         self._source.visible = self._name.value == _OTHER
@@ -76,6 +67,9 @@ class PlayPanel:
 
     def _open(self) -> None:
         """Show the episode before the policy, which takes longer to load."""
+        levels, level = task_spec(self._task.value).levels, self._level.value
+        self._level.options = levels
+        self._level.value = level if level in levels else levels[0]
         self.session.choose_assets(self._assets.value)
         config = self.session.env_config
         episode = sample_episode(

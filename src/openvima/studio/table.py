@@ -20,6 +20,7 @@ from openvima.video.prompt_strip import Colour
 SECOND_TABLE_Y_M = 1.15  # beside the first
 VIEW = (1.24, 0.0, 0.98), (0.4, 0.0, 0.06)  # camera and where it looks at; near that of the front camera
 VIEW_OF_BOTH = (1.59, SECOND_TABLE_Y_M / 2, 1.39), (0.4, SECOND_TABLE_Y_M / 2, 0.06)
+_BENCH_RGB, _BENCH_M, _BENCH_AT_M = (228, 229, 232), (1.16, 1.12, 0.002), (0.4, 0.0, -0.0035)
 _LIGHT_M = (-50.0, 30.0, 100.0)  # direction of the light of all images
 _AMBIENT, _DIRECTIONAL = 1.2, 2.3  # such that colours are those of the front camera, by eye
 
@@ -49,6 +50,7 @@ class Table:
         self._node = scene.add_frame(root, show_axes=False, position=(0.0, offset_y_m, 0.0))
         size, position = (*SHEET_SIZE, 0.002), (0.5, 0.0, -0.0011)
         scene.add_box(f"{root}/table", SHEET_RGB, size, position=position)
+        scene.add_box(f"{root}/bench", _BENCH_RGB, _BENCH_M, position=_BENCH_AT_M)  # for arm and shelf
 
     def show(self, frame: VideoFrame) -> None:
         """Show a scene and the arm; objects that are shown already are moved only."""

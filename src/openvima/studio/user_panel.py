@@ -13,8 +13,9 @@ from openvima.scene import Action
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import hit_of
 
-_GHOST, _START = "/you/ghost", "/you/start"
+_GHOST, _START = "you/ghost", "/you/start"
 _START_RGB, _START_M = (220, 120, 0), 0.008
+_TURN_DEG = 15  # of the key T
 _HELP = {
     "suction": "Click an **object**, then the **place** to put it, or drag it. The ghost shows its turn.",
     "spatula": "Click a **block**, or where to begin, then where the **sweep** ends; or drag a block there.",
@@ -37,10 +38,13 @@ class UserPanel:
             self._help = gui.add_markdown("")
             self._acts = gui.add_checkbox("act by clicks", True)
             self._turn = gui.add_slider("turn (degrees)", -180, 180, 5, 0)
-            self._buttons = gui.add_button_group("", ("turn in place", "cancel", "undo"))
+            works = {"turn in place": self._turn_in_place, "cancel": self._forget, "undo": self._undo}
+            session.add_buttons("", {**works, "next seed": lambda: session.next_seed()})
             self._record = gui.add_markdown("")
         self._turn.on_update(session.callback(self._preview))
-        self._buttons.on_click(session.callback(self._press))
+        gui.add_command(f"turn by {_TURN_DEG}°", hotkey="T").on_trigger(lambda _: self._turn_by(_TURN_DEG))
+        back = gui.add_command(f"turn by -{_TURN_DEG}°", hotkey="T", modifier="shift")
+        back.on_trigger(lambda _: self._turn_by(-_TURN_DEG))
         session.client.scene.on_click()(self._clicked)
         session.on_drag(self._dragged)
         session.on_change(self._show)
@@ -93,14 +97,18 @@ class UserPanel:
         self._own.append(action)
         self.session.step(action)
 
-    def _press(self) -> None:
-        current, first = self.session.current, self._first
-        if self._buttons.value == "turn in place" and first is not None:
-            self._act(first, first)
-        elif self._buttons.value == "undo" and current is not None and current.num_steps:
+    def _turn_by(self, degrees: int) -> None:
+        self._turn.value = (self._turn.value + degrees + 180) % 360 - 180
+        self.session.interrupt(self._preview)
+
+    def _turn_in_place(self) -> None:
+        if self._first is not None:
+            self._act(self._first, self._first)
+
+    def _undo(self) -> None:
+        current = self.session.current
+        if current is not None and current.num_steps:
             self.session.back(current.num_steps - 1)
-        else:
-            self._forget()
 
     def _preview(self) -> None:
         """Mark the first click, and show the picked object as it will be turned."""

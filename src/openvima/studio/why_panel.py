@@ -8,17 +8,27 @@ import viser
 from openvima.env.clicks import pose_after
 from openvima.evaluation.session import EpisodeSession, first_difference
 from openvima.policies.bundled import SMALL
-from openvima.scene import Action, Pose
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action, Pose
 from openvima.scene.explanation import Explanation
 from openvima.studio.browser_session import BrowserSession
 from openvima.studio.table import Table
-from openvima.video.explanation import LEAST_SHOWN, PICK, PLACE, attention_rows, draw_panel, percent
+from openvima.video.explanation import (
+    HEAT_COLOURS,
+    LEAST_SHOWN,
+    PICK,
+    PLACE,
+    attention_rows,
+    draw_panel,
+    heat_opacity,
+    percent,
+)
 from openvima.video.prompt_strip import Colour
 
 _NOBODY = "nobody"
 _MAX_PLACES = 6  # ghosts shown at once
 _ARROW_Z_M = 0.09
 _LABEL_Z_M = 0.08
+_HEAT_Z_M = 0.002
 
 
 class WhyPanel:
@@ -70,8 +80,11 @@ class WhyPanel:
             if proposal.action is not None:
                 self._add_arrow(table, "action", proposal.action)
             if proposal.explanation is not None:
-                self._explain(table, run, proposal.explanation)
-                lines.append(self._second_choice(table, run, proposal.explanation))
+                if proposal.explanation.bins:
+                    self._add_heat_maps(table, proposal.explanation)
+                else:
+                    self._explain(table, run, proposal.explanation)
+                    lines.append(self._second_choice(table, run, proposal.explanation))
                 panels.append(draw_panel(run.scene, self.session.assets, proposal.explanation))
                 rows = attention_rows(proposal.explanation)
                 self.session.prompt_weights = self.session.prompt_weights or rows
@@ -84,6 +97,18 @@ class WhyPanel:
             image.visible = number < len(panels)
             if image.visible:
                 image.image = panels[number]
+
+    def _add_heat_maps(self, table: Table, explanation: Explanation) -> None:
+        """Tint the table by the probabilities of picking and placing at its points."""
+        low, size = np.array(WORKSPACE_LOW), np.subtract(WORKSPACE_HIGH, WORKSPACE_LOW)
+        for height_m, (pose, colour) in zip((_HEAT_Z_M, 2 * _HEAT_Z_M), HEAT_COLOURS.items(), strict=True):
+            opacity = heat_opacity(explanation.heat_map(pose)).T  # rows are y, columns are x
+            image = np.empty((*opacity.shape, 4), np.uint8)
+            image[..., :3], image[..., 3] = colour, np.rint(255 * opacity)
+            at = np.array([*(low + size / 2), height_m])
+            name = f"{table.root}/why/{pose}"
+            node = self.session.client.scene.add_image(name, image, *size, format="png", position=at)
+            self._nodes.append(node)
 
     def _explain(self, table: Table, run: EpisodeSession, explanation: Explanation) -> None:
         """Tint objects by the probability of picking them; show the picked one where it may be placed."""

@@ -1,11 +1,14 @@
 """Progress of an episode: goals met, constraints violated, success or failure with its reason."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import cast
 
 from openvima.brief import brief_repr
 from openvima.scene import Outcome, Problem, Scene, StepConstraint, StepContext, in_workspace
-from openvima.scene.goal import is_condition, is_monitored, object_of, unmet_reason
+from openvima.scene.goal import distance_to, is_condition, is_monitored, object_of, unmet_reason
+
+LEVER_M = 0.1  # m per radian, to compare moves with rotations: about the reach of an object
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,34 @@ def advance(problem: Problem, progress: Progress, scene: Scene) -> tuple[Progres
     open_before = progress.open_goals
     progress = replace(progress, open_goals=_still_open(problem, open_before, scene))
     return progress, _outcome(problem, open_before, progress, scene)
+
+
+def measure(problem: Problem, progress: Progress, scene: Scene) -> dict[str, float]:
+    """Return how near the episode is to success, as dense numbers.
+
+    Args:
+        problem: The episode's problem.
+        progress: The open goals.
+        scene: The scene at rest.
+
+    Returns:
+        `goals_met`: fraction of the required goals that are met, 0 … 1; 0 without goals. `distance_m` and
+        `angle_rad`: how far the nearest of the goals that can be met next is from its target. Both are 0 once
+        `goals_met` is 1, and NaN if no goal states a distance.
+    """
+    num_goals = len(problem.goals)
+    num_required = num_goals if problem.num_required is None else problem.num_required
+    num_met = num_goals - len(progress.open_goals)
+    goals_met = min(1.0, num_met / num_required) if num_required else 0.0
+    if goals_met == 1.0:
+        return {"goals_met": 1.0, "distance_m": 0.0, "angle_rad": 0.0}
+    stage = problem.stage_of(progress.open_goals[0]) if progress.open_goals else range(0)
+    distances = [distance_to(problem.goals[i], scene) for i in progress.open_goals if i in stage]
+    stated = [distance for distance in distances if distance is not None]
+    distance_m, angle_rad = min(
+        stated, key=lambda distance: distance[0] + LEVER_M * distance[1], default=(math.nan, math.nan)
+    )
+    return {"goals_met": goals_met, "distance_m": distance_m, "angle_rad": angle_rad}
 
 
 def _still_open(problem: Problem, open_goals: tuple[int, ...], scene: Scene) -> tuple[int, ...]:

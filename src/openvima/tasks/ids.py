@@ -9,6 +9,7 @@ import numpy as np
 from openvima.scene import Condition, PhotoImage, Placement, Problem, Prompt, PromptFill, Scene, SceneImage
 from openvima.scene.goal import (
     OracleMove,
+    distance_to,
     is_condition,
     is_monitored,
     object_of,
@@ -96,6 +97,10 @@ class RenumberedCondition:
     def reason(self, scene: Scene) -> str:
         """Why the condition is not met."""
         return unmet_reason(self.condition, self._as_made(scene))
+
+    def distance(self, scene: Scene) -> tuple[float, float] | None:
+        """Return how far its object is from meeting it, in metres and radians; None if it does not say."""
+        return distance_to(self.condition, self._as_made(scene))
 
     def oracle_move(self, scene: Scene) -> OracleMove | None:
         """Return what the oracle pursues, with the new ids."""

@@ -4,12 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from openvima.training.config import TrainingConfig
+from openvima.video.animation import Animation
 
 
 def train(
     config: TrainingConfig,
     report: Callable[[int, int, str], None] | None = None,
     rollout: Callable[[Path], dict[str, float]] | None = None,
+    animate: Callable[[Path], list[Animation]] | None = None,
 ) -> Path:
     """Train a policy on demonstrations, or resume a run; see `openvima.training.policy.train`.
 
@@ -21,7 +23,7 @@ def train(
     require_torch("training")
     from openvima.training import policy
 
-    return policy.train(config, report, rollout)
+    return policy.train(config, report, rollout, animate)
 
 
 __all__ = ["TrainingConfig", "train"]

@@ -16,7 +16,7 @@ _NOT_IDENTITY = {
     "": ("data", "out", "force", "object_cache", "t5", "rollout"),
     "loader": ("num_workers",),
     "schedule": ("checkpoint_every", "keep_every"),
-    "runtime": ("device", "compile", "sharding", "threads", "tensorboard"),
+    "runtime": ("device", "compile", "sharding", "threads", "tensorboard", "wandb"),
 }
 
 
@@ -150,10 +150,13 @@ class RolloutConfig:
     Args:
         every: Steps between them; None leaves them out.
         episodes: Episodes per task.
+        animate: Also log an animation of one episode of each task, with its prompt, to TensorBoard and
+            Weights & Biases.
     """
 
     every: Count | None = None
     episodes: Count = 10
+    animate: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +259,7 @@ class RuntimeConfig:
         sharding: Several processes replicate the network ("ddp") or shard it ("fsdp").
         threads: CPU threads; equal numbers give equal weights.
         tensorboard: Also write TensorBoard events, if it is installed.
+        wandb: Project of Weights & Biases to log to as well; empty logs nothing there.
     """
 
     device: str = "auto"
@@ -265,6 +269,7 @@ class RuntimeConfig:
     sharding: Literal["ddp", "fsdp"] = "ddp"
     threads: Annotated[int, Range(1, 1024)] = 1
     tensorboard: bool = True
+    wandb: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,13 +29,15 @@ from openvima.training.run_folder import (
     TrainedState,
 )
 from openvima.training.schedule import learning_rate_at, step_seed
-from openvima.training.tensorboard import Board
+from openvima.training.trackers import Tracker, open_trackers
+from openvima.video.animation import Animation
 
 Metrics = dict[str, float]
 # Called with steps done, steps in all, and a note.
 Report = Callable[[int, int, str], None]
 # From a checkpoint folder to metrics. It is passed in, since training does not import the simulator.
 Rollout = Callable[[Path], Metrics]
+Animate = Callable[[Path], Sequence[Animation]]
 
 LOG_EVERY = 20  # steps
 
@@ -94,6 +96,7 @@ class Trainer:
         report: Called with the progress.
         rollout: Called with checkpoints of the last stage.
         rollout_every: Steps between rollouts.
+        animate: Called with the same checkpoints, for experiment trackers.
         demonstrations: Further values that identify the data.
 
     Raises:
@@ -111,11 +114,13 @@ class Trainer:
         report: Report | None = None,
         rollout: Rollout | None = None,
         rollout_every: int | None = None,
+        animate: Animate | None = None,
         demonstrations: dict[str, Any] | None = None,  # Any: YAML
     ) -> None:
         self.config, self.dataset, self.learner, self.parallel = config, dataset, learner, parallel
         self._on_report, self._rollout, self._rollout_every = report, rollout, rollout_every
-        data = {"episodes": len(dataset), "index": index_hash(config.data), **(demonstrations or {})}
+        self._animate, self._trackers = animate, list[Tracker]()
+        data = {"episodes": len(dataset), "index": index_hash(dataset.path), **(demonstrations or {})}
         self.run = RunFolder(
             config.out,
             {"training": config.identity(), "demonstrations": data, "network": learner.description()},
@@ -137,8 +142,8 @@ class Trainer:
             ConfigError: The loss diverged.
         """
         self._stages, first = stages, self.parallel.is_first
-        self._board = Board(self.run.path, self._done() + 1, wanted=self.config.runtime.tensorboard and first)
         if first:
+            self._trackers = open_trackers(self.config, self.run.path, self._done() + 1)
             self.run.rewind_to(self.progress)
             origin = {"processes": self.parallel.num_ranks, **provenance(self.dataset)}
             self.run.append(SESSIONS_FILE, {**self._here(), **origin})
@@ -150,7 +155,8 @@ class Trainer:
                 if self.progress.step < stages[number].num_steps:
                     self._run_stage(stages[number].make(), stages[number].num_steps)
         finally:
-            self._board.close()
+            for tracker in self._trackers:
+                tracker.close()
         return self.run.path
 
     def report(self, note: str) -> None:
@@ -246,13 +252,19 @@ class Trainer:
             if self._rollout and every and is_last_stage and self.progress.step % every == 0:
                 scores = self._rollout(self.run.checkpoints / name)
                 self._write(stage, {f"rollout_{key}": value for key, value in scores.items()})
+                if self._animate and self._trackers:
+                    animations = self._animate(self.run.checkpoints / name)
+                    for tracker in self._trackers:
+                        tracker.add_animations(stage.name, animations, self._done())
         self.parallel.wait()
 
     def _write(self, stage: Stage, metrics: Metrics) -> None:
-        """Append metrics to `metrics.jsonl` and TensorBoard."""
+        """Append metrics to `metrics.jsonl`, and to the experiment trackers."""
         if metrics and self.parallel.is_first:
             self.run.append(METRICS_FILE, {**self._here(), "name": stage.name, **metrics})
-            self._board.add(stage.name, metrics, self._done())
+            numbers = {name: value for name, value in metrics.items() if isinstance(value, int | float)}
+            for tracker in self._trackers:
+                tracker.add(stage.name, numbers, self._done())
 
     def _state(self, optimizer: torch.optim.Optimizer) -> TrainedState:
         if self.parallel.is_sharded:

@@ -19,7 +19,7 @@ from openvima.training.behaviour_cloning import BehaviourCloning, freeze_crops, 
 from openvima.training.building import build_learner, resolved
 from openvima.training.config import TrainingConfig
 from openvima.training.learner import Learner, PolicyLearner
-from openvima.training.loop import PlannedStage, Report, Rollout, Stage, Trainer, num_steps
+from openvima.training.loop import Animate, PlannedStage, Report, Rollout, Stage, Trainer, num_steps
 from openvima.training.parallel import Parallel, compile_layers, joined
 from openvima.training.pretraining.pairs import SceneAugmentation, render_pairs
 from openvima.training.pretraining.stage import ContrastivePretraining, compares_rotations
@@ -36,7 +36,12 @@ from openvima.training.source import (
 from openvima.training.vocabulary import training_texts
 
 
-def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout | None = None) -> Path:
+def train(
+    config: TrainingConfig,
+    report: Report | None = None,
+    rollout: Rollout | None = None,
+    animate: Animate | None = None,
+) -> Path:
     """Train a policy on demonstrations, or resume an interrupted run.
 
     With the same settings and number of threads an interrupted run on a CPU ends with the very weights of an
@@ -46,6 +51,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
         config: All settings.
         report: Called with steps done, steps in all, and a note.
         rollout: Called with a checkpoint every `config.rollout.every` steps; returns what to log.
+        animate: Called with the same checkpoints; returns animations for TensorBoard and Weights & Biases.
 
     Returns:
         The run folder; `load_policy` takes it.
@@ -59,7 +65,8 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
             or of other sizes.
         PromptError: A prompt has a word that T5 lacks, or the prompts have too many different words.
         FolderLockedError: Another run writes to the folder.
-        MissingExtraError: The preset encodes prompts with T5, and a package for that is not installed.
+        MissingExtraError: The preset encodes prompts with T5, or `runtime.wandb` names a project, and a
+            package for that is not installed.
     """
     config = resolved(config)
     load_assets(config.assets)  # fails before there is a run folder
@@ -93,6 +100,7 @@ def train(config: TrainingConfig, report: Report | None = None, rollout: Rollout
             report=report,
             rollout=rollout,
             rollout_every=config.rollout.every,
+            animate=animate,
             demonstrations=_origin(config, dataset, boxes),
         )
         return trainer.train(_Stages(config, dataset, boxes, learner, parallel, trainer).planned())

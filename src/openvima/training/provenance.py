@@ -2,6 +2,7 @@
 
 import hashlib
 import subprocess
+from collections import Counter
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ def provenance(dataset: Dataset) -> dict[str, Any]:  # Any: JSON
             "content_hash": dataset.manifest["content_hash"],
             "manifest_sha256": hashlib.sha256(content).hexdigest(),
             "counts": dataset.manifest["counts"],
+            "tasks": dict(sorted(Counter(dataset.index.column("task").to_pylist()).items())),
         },
     }
 

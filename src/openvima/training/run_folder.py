@@ -4,7 +4,7 @@
     RUN/metrics.jsonl                                 one line of metrics every few steps
     RUN/timings_log.jsonl                             when steps were reached
     RUN/sessions_log.jsonl                            versions, git commit and data of each start
-    RUN/tensorboard_log/                              the metrics for TensorBoard, if it is installed
+    RUN/tensorboard_log/, wandb_log/                  metrics and rollouts for experiment trackers
     RUN/checkpoints/2-cloning-000400/model.safetensors, config.yaml, optimizer.safetensors, state.json
     RUN/checkpoints/best.txt                          name of the best checkpoint
 
@@ -29,7 +29,7 @@ from openvima.input_files import read_json, read_yaml
 from openvima.policies.file_names import BEST_FILE, CHECKPOINTS_FOLDER
 from openvima.policies.tensor_files import read_safetensors, write_safetensors
 from openvima.training.learner import Learner
-from openvima.training.tensorboard import BOARD_FOLDER
+from openvima.training.trackers import BOARD_FOLDER, WANDB_FOLDER
 from openvima.training.validation import flattened
 
 CONFIG_FILE = "config.yaml"
@@ -225,8 +225,8 @@ class RunFolder:
     def _clear(self) -> None:
         if not (self.path / CONFIG_FILE).is_file():
             raise ConfigError(f"{self.path} holds other files and no training run; give another --out.")
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
-        shutil.rmtree(self.path / BOARD_FOLDER, ignore_errors=True)
+        for folder in (self.checkpoints, self.path / BOARD_FOLDER, self.path / WANDB_FOLDER):
+            shutil.rmtree(folder, ignore_errors=True)
         for name in (METRICS_FILE, TIMINGS_FILE, SESSIONS_FILE, CONFIG_FILE):
             (self.path / name).unlink(missing_ok=True)
 

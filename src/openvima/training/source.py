@@ -9,6 +9,7 @@ import numpy as np
 
 from openvima.data.batching import BatchOrder
 from openvima.data.hash_split import split_hashes
+from openvima.data.hub import data_folder
 from openvima.data.object_cache.cache import ObjectCache
 from openvima.data.reader import Dataset, read_manifest
 from openvima.errors import ConfigError, DatasetError, unknown_name
@@ -148,6 +149,7 @@ def open_demonstrations(
 def _without_tasks(folder: Path, excluded: Sequence[str]) -> Dataset:
     if not excluded:
         return Dataset(folder)
+    folder = data_folder(folder)
     present = sorted(read_manifest(folder)["tasks"])
     known = {*present, *list_tasks()}
     if problems := [

@@ -21,6 +21,7 @@ WIDTH, HEIGHT = TOP.width * ENLARGE, TOP.height * ENLARGE + 160  # pixels of a p
 PICK: Colour = (214, 96, 0)
 PLACE: Colour = (0, 104, 201)
 COLOURS: dict[str, Colour] = {"pick": PICK, "place": PLACE, "decoder": (104, 64, 160)}
+HEAT_COLOURS = {"pose0": PICK, "pose1": PLACE}
 LEAST_SHOWN = 0.01  # probability below which a label would say 0 or 1 %
 _LEAST_FULL_BAR = 0.1  # a distribution without a higher peak does not fill its histogram
 _HOT = 0.02  # probability of a cell of the heat map that is drawn in full colour
@@ -86,6 +87,11 @@ def attention_rows(explanation: Explanation) -> list[tuple[Colour, np.ndarray]]:
     return [(colour, weights[:-1]) for colour, weights in rows]
 
 
+def heat_opacity(probabilities: np.ndarray) -> np.ndarray:
+    """Return how opaque cells of a heat map are drawn, from 0 to 0.8."""
+    return 0.8 * np.sqrt(np.minimum(probabilities / _HOT, 1))
+
+
 def _tint_objects(panel: np.ndarray, segm: np.ndarray, objects: Sequence[ObjectProbability]) -> None:
     """Colour objects by the probability of picking them, and outline them."""
     for each in sorted(objects, key=lambda each: each.probability):
@@ -110,7 +116,7 @@ def _box_mask(each: ObjectProbability, shape: tuple[int, ...]) -> np.ndarray:
 def _tint_heat_maps(panel: np.ndarray, explanation: Explanation) -> None:
     """Colour the table by the probabilities of both positions."""
     rows, columns = np.indices((TOP.height * ENLARGE, WIDTH))
-    for pose, colour in (("pose0", PICK), ("pose1", PLACE)):
+    for pose, colour in HEAT_COLOURS.items():
         heat = explanation.heat_map(pose)
         x = 0.25 + 0.5 * np.arange(len(heat) + 1) / len(heat)
         y = -0.5 + np.arange(heat.shape[1] + 1) / heat.shape[1]
@@ -119,7 +125,7 @@ def _tint_heat_maps(panel: np.ndarray, explanation: Explanation) -> None:
         i, j = np.searchsorted(edge_rows, rows) - 1, np.searchsorted(edge_columns, columns) - 1
         is_inside = (i >= 0) & (i < len(heat)) & (j >= 0) & (j < heat.shape[1])
         probabilities = np.where(is_inside, heat[i.clip(0, len(heat) - 1), j.clip(0, heat.shape[1] - 1)], 0)
-        _blend(panel[: len(rows)], colour, 0.8 * np.sqrt(np.minimum(probabilities / _HOT, 1)))
+        _blend(panel[: len(rows)], colour, heat_opacity(probabilities))
 
 
 def _blend(image: np.ndarray, colour: Colour, alpha: np.ndarray) -> None:

@@ -4,6 +4,7 @@ from openvima.cli.data.importing import import_published
 from openvima.cli.data.info import info
 from openvima.cli.data.lerobot import export_lerobot
 from openvima.cli.data.preprocess import preprocess
+from openvima.cli.data.pushing import push_to_hub
 from openvima.cli.data.subsets import merge, sample, split
 from openvima.cli.data.verify import verify
 
@@ -17,4 +18,5 @@ COMMANDS = {
     "import": import_published,
     "preprocess": preprocess,
     "export-lerobot": export_lerobot,
+    "push-to-hub": push_to_hub,
 }

@@ -36,7 +36,8 @@ def info(
     Example: openvima data info demos --html demos.html
 
     Args:
-        folder: Folder of a data set, finished or not.
+        folder: Folder of a data set, finished or not; or hf://OWNER/NAME[@REVISION] on the Hugging Face Hub,
+            of which without details only the index is fetched.
         details: Count objects, textures and prompt images too; reads every file.
         html: Write a self-contained page with all of this and sample episodes.
         samples: Sample episodes of each task on that page.
@@ -68,8 +69,13 @@ def info(
     elif isinstance(summary, Unfinished):
         print("\n".join(_unfinished(summary)))
     else:
-        for line in [*_summary(summary), *_hints(details or html is not None, html)]:
-            print(line) if isinstance(line, str) else print_table(line)
+        for line in [
+            *_summary(summary, _shown_name(folder, summary)),
+            *_hints(details or html is not None, html),
+        ]:
+            print(*map(_printable, line.split("\n")), sep="\n") if isinstance(line, str) else print_table(
+                line
+            )
     return 0
 
 
@@ -92,11 +98,26 @@ def _write_appearance(folder: Path, file: Path) -> None:
         print(f"{file}: everything is inside the training partition", file=sys.stderr)
 
 
-def _summary(summary: "Summary") -> "Iterator[str | Table]":
+def _shown_name(folder: Path, summary: "Summary") -> str:
+    """The folder, or the name on the Hub with the commit."""
+    from openvima.hub import dataset_name
+
+    name = dataset_name(folder)
+    return f"hf://{name.repo}@{summary.folder.name}" if name else str(folder)
+
+
+def _printable(line: str) -> str:
+    """A line whose quotes of a manifest of others cannot act on the terminal."""
+    from openvima.errors import echo
+
+    return echo(line, len(line))
+
+
+def _summary(summary: "Summary", name: str) -> "Iterator[str | Table]":
     manifest = summary.manifest
     counts, versions = manifest["counts"], manifest["versions"]
     yield (
-        f"{summary.folder}: {counts['episodes']:,} episodes, {counts['steps']:,} steps, "
+        f"{name}: {counts['episodes']:,} episodes, {counts['steps']:,} steps, "
         f"{counts['shards']:,} shards, {summary.file_bytes / 1e6:,.1f} MB"
     )
     yield f"written by {manifest['command']}{_settings(manifest['config'])}"
@@ -125,6 +146,7 @@ def _shown(value: object) -> str:
 
 
 def _task_table(summary: "Summary") -> "Table":
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table("task", box=None, pad_edge=False, header_style="")
@@ -133,11 +155,11 @@ def _task_table(summary: "Summary") -> "Table":
     table.columns[0].no_wrap = True
     for task in summary.tasks:
         table.add_row(
-            task.task,
+            escape(_printable(task.task)),
             f"{task.episodes:,}",
             f"{task.steps:,}",
             f"{task.bytes / task.episodes / 1e3:.1f}",
-            f"{task.image_fraction:.0%}",
+            "–" if task.image_fraction is None else f"{task.image_fraction:.0%}",
             f"{task.seeds_tried:,}",
             f"{task.success_rate:.1%}",
             f"{task.redraws:,}",

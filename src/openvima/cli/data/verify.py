@@ -31,7 +31,7 @@ def verify(
     Example: openvima data verify demos --workers 2
 
     Args:
-        folder: Folder of demonstrations.
+        folder: Folder of demonstrations, or hf://OWNER/NAME[@REVISION] on the Hugging Face Hub.
         replay: Episodes of each task to replay in the simulator and compare bit by bit, or "all".
         repair: Generate damaged shards again, or keep the whole records of those that cannot be generated.
         workers: Number of processes.
@@ -42,10 +42,12 @@ def verify(
     Returns:
         Exit status.
     """
+    from openvima.data.hub import data_folder
     from openvima.data.verification import VerifyConfig
     from openvima.data.verification import repair as repair_folder
     from openvima.data.verification import verify as verify_folder
 
+    folder = data_folder(folder)
     config = VerifyConfig(_number(replay), seed=seed, assets=assets, workers=workers)
     with progress_bar("repairing" if repair else "verifying") as report:
         done = repair_folder(folder, config, report) if repair else None

@@ -11,12 +11,14 @@ import pyarrow.parquet as pq
 from openvima import __version__
 from openvima.atomic_io import atomic_folder
 from openvima.data.lerobot import layout
+from openvima.data.lerobot.dense import DenseLayout, dense_settings, dense_trajectory
 from openvima.data.lerobot.features import FrameLayout
 from openvima.data.lerobot.videos import PIXEL_FORMATS, PixelFormat
 from openvima.data.lerobot.writer import LerobotWriter, write_json
 from openvima.data.reader import Dataset
 from openvima.errors import ConfigError, DatasetError
 from openvima.folder_lock import folder_lock, is_lock_file
+from openvima.scene.command import CONTROL_HZ
 from openvima.video.encoder import import_av
 
 RATES = (1, 2, 4, 8, 16, 32, 64)
@@ -33,7 +35,8 @@ class LerobotConfig:
         out: Folder of the export.
         tasks: Keep the episodes of these tasks only; None keeps all.
         fps: Frames a second, a power of two: LeRobot finds frames by float32 seconds, and only then are all
-            exact, however long a video is. A frame is a step, which has no fixed duration of its own.
+            exact, however long a video is. A frame is a step, which has no duration of its own. None is 1.
+            Demonstrations of low-level control take None alone: they have 10, a frame for each command.
         pixels: "yuv444p" keeps colours within 2 of 255 levels; "yuv420p" is what browsers and graphics cards
             play, at half the resolution of colours.
         data_file_mb: Limit of the Parquet files.
@@ -47,7 +50,7 @@ class LerobotConfig:
     data: Path
     out: Path
     tasks: tuple[str, ...] | None = None
-    fps: int = 1
+    fps: int | None = None
     pixels: PixelFormat = "yuv444p"
     data_file_mb: int = layout.DATA_FILE_MB
     video_file_mb: int = layout.VIDEO_FILE_MB
@@ -55,7 +58,7 @@ class LerobotConfig:
 
     def __post_init__(self) -> None:
         problems = []
-        if self.fps not in RATES:
+        if self.fps is not None and self.fps not in RATES:
             problems.append(f"fps is {self.fps}; allowed are {', '.join(map(str, RATES))}.")
         if self.pixels not in PIXEL_FORMATS:
             problems.append(f"pixels is {self.pixels!r}; allowed are {', '.join(PIXEL_FORMATS)}.")
@@ -91,20 +94,24 @@ def export_lerobot(config: LerobotConfig, report: Report | None = None) -> Path:
     if not len(dataset):
         raise DatasetError(f"{config.data} has no episodes to export.")
     _check_out(config)
+    settings = dense_settings(dataset)
+    if settings and config.fps is not None:
+        raise ConfigError(f"fps is {config.fps}, but a step of low-level control lasts 0.1 s; leave it out.")
+    frames, fps = survey(dataset), CONTROL_HZ if settings else config.fps or 1
     with folder_lock(config.out), atomic_folder(config.out) as folder:
         with LerobotWriter(
             folder,
-            survey(dataset),
-            fps=config.fps,
+            DenseLayout(frames.num_prompt_images, frames.has_joints) if settings else frames,
+            fps=fps,
             pixels=config.pixels,
             data_file_mb=config.data_file_mb,
             video_file_mb=config.video_file_mb,
         ) as writer:
             for number, demo in enumerate(dataset, 1):
-                writer.write(demo)
+                writer.write(dense_trajectory(demo, settings[demo.task, demo.level]) if settings else demo)
                 if report:
                     report(number, len(dataset), demo.task)
-        _write_source(folder, dataset, config)
+        _write_source(folder, dataset, config, fps)
     return config.out
 
 
@@ -146,12 +153,12 @@ def _check_out(config: LerobotConfig) -> None:
         raise DatasetError(f"{out} holds other things than an export, so --force does not replace it.")
 
 
-def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig) -> None:
+def _write_source(folder: Path, dataset: Dataset, config: LerobotConfig, fps: int) -> None:
     """Write where the episodes came from, which the format has no place for."""
     manifest = dataset.manifest
     source = {key: manifest[key] for key in ("command", "config", "content_hash", "licence", "versions")}
     versions = {"openvima": __version__, "av": import_av().__version__, "pyarrow": pa.__version__}
-    settings = {"tasks": config.tasks, "fps": config.fps, "pixels": config.pixels}
+    settings = {"tasks": config.tasks, "fps": fps, "pixels": config.pixels}
     write_json(
         folder / layout.SOURCE_PATH,
         {

@@ -1,5 +1,6 @@
 """What a frame of the export holds: one frame a step, showing what the policy saw before its action."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,10 +8,13 @@ import numpy as np
 
 from openvima.data.records import Demonstration
 from openvima.data.schema import IMAGE_SHAPE, VIEWS
-from openvima.scene import ACTION_SHAPES, END_EFFECTORS
+from openvima.errors import ActionError
+from openvima.scene import ACTION_SHAPES, END_EFFECTORS, WORKSPACE_HIGH, WORKSPACE_LOW, RenderedPrompt
 
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ACTION_NAMES = tuple(f"{key}.{axis}" for key, length in ACTION_SHAPES.items() for axis in "xyzw"[:length])
+MAX_PROMPT_IMAGES = 8  # of the benchmark's prompts: novel_adj
+IMAGE_PREFIX = "observation.images."
 
 # Columns that every LeRobot data set has, after its own.
 _COUNTERS = {
@@ -46,7 +50,7 @@ class FrameLayout:
     def video_keys(self) -> tuple[str, ...]:
         """Names of the image features: the views, then those of the first prompt image, and so on."""
         prompts = (f"prompt_{n}_{view}" for n in range(self.num_prompt_images) for view in VIEWS)
-        return tuple(f"observation.images.{name}" for name in (*VIEWS, *prompts))
+        return tuple(f"{IMAGE_PREFIX}{name}" for name in (*VIEWS, *prompts))
 
     def value_features(self) -> dict[str, Feature]:
         """Return the features that are columns of the tables, in order."""
@@ -112,10 +116,34 @@ class FrameLayout:
             Video key to uint8, shape (T or 1, 3, 128, 256); one picture stands for all T frames. Black where
             the prompt has fewer images than others.
         """
-        shown = {f"observation.images.{view}": demo.rgb[view][: demo.num_steps] for view in VIEWS}
-        for number, image in enumerate(demo.prompt.images.values()):
+        return self._pictures({view: demo.rgb[view][: demo.num_steps] for view in VIEWS}, demo.prompt)
+
+    def frame(self, observation: Mapping[str, Any], prompt: RenderedPrompt) -> dict[str, Any]:
+        """Return an observation in the form in which LeRobot's environments return it.
+
+        Args:
+            observation: Of the environment: `rgb`, `ee` and, with joints, `joints`.
+            prompt: The episode's.
+
+        Returns:
+            `pixels`, image name to uint8, shape (128, 256, 3); and `agent_pos`, float32: the numbers of
+            `observation.state`. LeRobot names the images `observation.images.{name}`.
+        """
+        pictures = self._pictures({view: observation["rgb"][view][None] for view in VIEWS}, prompt)
+        joints = observation["joints"] if self.has_joints else ()
+        return {
+            "pixels": {
+                key.removeprefix(IMAGE_PREFIX): np.moveaxis(picture[0], 0, -1)
+                for key, picture in pictures.items()
+            },
+            "agent_pos": np.array([*joints, observation["ee"]], np.float32),
+        }
+
+    def _pictures(self, views: Mapping[str, np.ndarray], prompt: RenderedPrompt) -> dict[str, np.ndarray]:
+        shown = {f"{IMAGE_PREFIX}{view}": pictures for view, pictures in views.items()}
+        for number, image in enumerate(prompt.images.values()):
             for view in VIEWS:
-                shown[f"observation.images.prompt_{number}_{view}"] = image.rgb[view][None]
+                shown[f"{IMAGE_PREFIX}prompt_{number}_{view}"] = image.rgb[view][None]
         black = np.zeros((1, 3, _HEIGHT, _WIDTH), np.uint8)
         return {key: shown.get(key, black) for key in self.video_keys}
 
@@ -124,6 +152,33 @@ class FrameLayout:
         if not self.has_joints:
             return np.full((demo.num_steps, 1), tool, np.float32)
         return np.array([(*path[0], tool) for path in demo.joint_paths], np.float32)
+
+
+def action_from_row(row: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the action that a row of `action` stands for, as the environment takes it.
+
+    A regression leaves the bounds by little: positions are clipped to the workspace, and rotations scaled to
+    unit length. What is not finite stays so, and the environment refuses it.
+
+    Args:
+        row: Shape (12,), float32; see `ACTION_NAMES`.
+
+    Raises:
+        ActionError: The row has another shape.
+    """
+    if row.shape != (len(ACTION_NAMES),):
+        raise ActionError(f"the action has shape {row.shape}; it must be ({len(ACTION_NAMES)},).")
+    ends = np.cumsum(list(ACTION_SHAPES.values()))[:-1]
+    parts = zip(ACTION_SHAPES, np.split(row.astype(np.float32), ends), strict=True)
+    return {key: _within_bounds(values) for key, values in parts}
+
+
+def _within_bounds(values: np.ndarray) -> np.ndarray:
+    if not np.isfinite(values).all():
+        return values
+    if len(values) == len(WORKSPACE_LOW):
+        return np.clip(values, *np.array([WORKSPACE_LOW, WORKSPACE_HIGH], np.float32))
+    return np.clip(values / max(float(np.linalg.norm(values)), 1e-6), -1, 1).astype(np.float32)
 
 
 def _feature(dtype: str, names: tuple[str, ...] = ()) -> Feature:

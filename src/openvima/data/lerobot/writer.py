@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from openvima.data.lerobot import layout
+from openvima.data.lerobot.dense import DenseTrajectory
 from openvima.data.lerobot.features import FrameLayout
 from openvima.data.lerobot.statistics import PixelCounts, Statistics, value_statistics
 from openvima.data.lerobot.tables import NumberedTable, write_tasks
@@ -65,13 +66,13 @@ class LerobotWriter:
             for key in frames.video_keys
         }
 
-    def write(self, demo: Demonstration) -> None:
+    def write(self, demo: Demonstration | DenseTrajectory) -> None:
         """Append an episode.
 
         Args:
             demo: At least one step, with no more prompt images than the layout has.
         """
-        values = {**self._frames.values(demo), **self._counters(demo)}
+        values = {**self._frames.values(demo), **self._counters(demo)}  # type: ignore[arg-type]  # of the layout
         number = self._data.write(_table(values, self._schema))
         places, statistics = self._write_pictures(demo)
         statistics |= {name: value_statistics(column) for name, column in values.items()}
@@ -104,7 +105,7 @@ class LerobotWriter:
         if kind is None:
             self._write_metadata()
 
-    def _counters(self, demo: Demonstration) -> dict[str, np.ndarray]:
+    def _counters(self, demo: Demonstration | DenseTrajectory) -> dict[str, np.ndarray]:
         steps = np.arange(demo.num_steps)
         task_index = self._tasks.setdefault(demo.prompt.text, len(self._tasks))
         return {
@@ -115,10 +116,12 @@ class LerobotWriter:
             "task_index": np.full_like(steps, task_index),
         }
 
-    def _write_pictures(self, demo: Demonstration) -> tuple[dict[str, Any], dict[str, Statistics]]:
+    def _write_pictures(
+        self, demo: Demonstration | DenseTrajectory
+    ) -> tuple[dict[str, Any], dict[str, Statistics]]:
         places: dict[str, Any] = {}  # Any: whole numbers and seconds
         statistics = {}
-        for key, pictures in self._frames.pictures(demo).items():
+        for key, pictures in self._frames.pictures(demo).items():  # type: ignore[arg-type]  # as above
             place = self._videos[key].write(pictures, num_frames=demo.num_steps)
             counts = PixelCounts()
             counts.add(pictures, num_frames=demo.num_steps)

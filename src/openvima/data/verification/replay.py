@@ -177,7 +177,7 @@ def first_difference(env: "TabletopEnv", demo: Demonstration) -> str:
             acted = action, demo.pick_ids[step], demo.place_ids[step]
             if (decision.action, decision.pick_id, decision.place_id) != acted:
                 return f"the oracle acts differently in step {step}"
-        observation, *_ = env.step(action)
+        observation, *_ = env.perform(action)
         if not np.array_equal(env.joint_path, demo.joint_paths[step]):
             return f"the joint path differs in step {step}"
     return "" if is_composed or env.outcome == demo.outcome else "the outcome differs"

@@ -17,6 +17,7 @@ from openvima.data.verification.episodes import faults
 from openvima.data.verification.findings import Problem, by_cause
 from openvima.env.config import ENV_SETTINGS
 from openvima.errors import OpenVimaError, ShardError
+from openvima.scene.command import PRIMITIVES
 from openvima.tasks.prompts import MULTIMODAL
 
 _KEY_COLUMNS = ("task", "level", "domain", "seed", "steps", "content_hash", "success")
@@ -152,7 +153,11 @@ def _record_faults(
 
 def _info_faults(task: ShardTask, info: ShardInfo) -> Iterator[str]:
     """Yield contradictions between a generated shard and the manifest."""
-    settings = {"prompts": MULTIMODAL, "task_options": "", **task.config} if task.config else {}
+    settings = (
+        {"prompts": MULTIMODAL, "task_options": "", "control": PRIMITIVES, **task.config}
+        if task.config
+        else {}
+    )
     for name in ("level", "domain", *ENV_SETTINGS, "compression", "images"):
         if name in settings and getattr(info, name) != settings[name]:
             there, stated = str(getattr(info, name)) or "none", str(settings[name]) or "none"

@@ -35,8 +35,10 @@ from openvima.evaluation.sources import ORACLE, RANDOM
 from openvima.tasks.options import MAX_DISTRACTORS
 from openvima.tasks.seeding import make_rng
 
-DETECTED_BOXES, NOISY_BOXES = "detected_boxes", "noisy_boxes"
-IN_CONTEXT, ORACLE_DEMONSTRATION = "in_context", "oracle_demonstration"
+DETECTED_BOXES = "detected_boxes"
+NOISY_BOXES = "noisy_boxes"
+IN_CONTEXT = "in_context"
+ORACLE_DEMONSTRATION = "oracle_demonstration"
 _MAX_TEXT = 200  # characters of a name with its rates
 
 Change = Callable[[TabletopEnv, AblatedInput, float, np.random.Generator], AblatedInput]

@@ -1,0 +1,208 @@
+"""A running episode under either control: primitives, or commands of the tool."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from openvima.brief import brief_repr
+from openvima.catalog.geometry import Assets
+from openvima.scene import Action, Episode, Outcome, RenderedPrompt, Scene
+from openvima.scene.command import END_EFFECTOR, PRIMITIVES, ToolCommand, steps_per_primitive
+from openvima.sim.tool_path import PathFollower
+from openvima.sim.tool_world import ToolWorld
+from openvima.sim.world import World
+from openvima.tasks import goals
+from openvima.tasks.goals import Progress
+from openvima.tasks.seeding import make_rng
+
+FRAMES_PER_SECOND = 30
+_STAY = ToolCommand(0.0, 0.0, 0.0, 0.0, False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VideoFrame:
+    """One frame of a video, not yet rendered.
+
+    Args:
+        scene: The scene.
+        joints: Joint angles of the arm, shape (6,), radians.
+    """
+
+    scene: Scene
+    joints: np.ndarray
+
+    __repr__ = brief_repr
+
+
+@dataclass(slots=True, eq=False)
+class PrimitiveRun:
+    """State of a running episode; a step is one primitive.
+
+    Args:
+        episode: The episode.
+        assets: Asset pack.
+        compat: Reproduce VIMA-Bench's quirks.
+    """
+
+    control: ClassVar[str] = PRIMITIVES
+
+    episode: Episode
+    assets: Assets
+    compat: bool
+    world: World | ToolWorld = field(init=False)
+    progress: Progress = field(init=False)
+    oracle_rng: np.random.Generator = field(init=False)
+    outcome: Outcome = field(default_factory=Outcome)
+    num_steps: int = 0
+    grasped: int | None = None
+    joint_path: np.ndarray = field(default_factory=lambda: np.zeros((0, 6), np.float32))
+    frames: list[VideoFrame] = field(default_factory=list)
+    prompt: RenderedPrompt | None = None
+
+    def __post_init__(self) -> None:
+        episode = self.episode
+        self.world = self.build_world()
+        self.progress = goals.begin(episode.problem)
+        self.oracle_rng = make_rng(
+            episode.domain, episode.task, episode.level, episode.seed, purpose="oracle"
+        )
+
+    def build_world(self) -> World | ToolWorld:
+        """Build the world at the start of the episode."""
+        return World(self.episode.problem.scene, self.assets, compat=self.compat)
+
+    @property
+    def is_out_of_steps(self) -> bool:
+        """Whether the step limit is reached."""
+        return self.num_steps >= self.episode.max_steps * steps_per_primitive(self.control)
+
+    def checked(self, action: object) -> Any:  # Any: an action of this control
+        """Validate an action.
+
+        Raises:
+            ActionError: It is invalid.
+        """
+        arrays: Any = action.to_arrays() if isinstance(action, Action) else action
+        return Action.from_arrays(arrays)
+
+    def step(self, action: Any, *, realtime: bool) -> None:  # Any: as `checked` returns it
+        """Execute a checked action, and evaluate the goals."""
+        self.frames = []
+        assert isinstance(self.world, World)
+        execution = self.world.execute(
+            action,
+            monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
+            record=self.record if realtime else None,
+            frames_per_second=FRAMES_PER_SECOND,
+        )
+        self.grasped, self.joint_path = execution.grasped, execution.joint_path
+        self.num_steps += 1
+        self.judge()
+
+    def perform(self, action: Action, *, realtime: bool) -> None:
+        """Execute a primitive."""
+        self.step(action, realtime=realtime)
+
+    def monitor(self, scene: Scene) -> None:
+        """Check the constraints that hold during motion."""
+        self.progress = goals.monitor(self.episode.problem, self.progress, scene)
+
+    def record(self, scene: Scene, joints: np.ndarray) -> None:
+        """Keep a video frame."""
+        self.frames.append(VideoFrame(scene, np.array(joints)))
+
+    def judge(self) -> None:
+        """Evaluate goals and constraints; everything is at rest."""
+        self.progress, self.outcome = goals.advance(self.episode.problem, self.progress, self.world.scene)
+
+    def observed_tool(self) -> dict[str, np.ndarray]:
+        """What observations hold of the tool, besides the modalities."""
+        return {}
+
+
+@dataclass(slots=True, eq=False)
+class ToolRun(PrimitiveRun):
+    """State of a running episode; a step is one command of 0.1 s.
+
+    Goals are evaluated when a manipulation has ended, as after a primitive.
+    """
+
+    control: ClassVar[str] = END_EFFECTOR
+
+    follower: PathFollower | None = None  # of the oracle
+
+    def build_world(self) -> ToolWorld:
+        """Build the world at the start of the episode."""
+        return ToolWorld(self.episode.problem.scene, self.assets)
+
+    @property
+    def tool_world(self) -> ToolWorld:
+        """The world."""
+        assert isinstance(self.world, ToolWorld)
+        return self.world
+
+    def checked(self, action: object) -> ToolCommand:
+        """Validate a command.
+
+        Raises:
+            ActionError: It is invalid.
+        """
+        return ToolCommand.from_array(action.to_array() if isinstance(action, ToolCommand) else action)
+
+    def step(self, action: ToolCommand, *, realtime: bool) -> None:
+        """Follow a checked command; evaluate the goals where a manipulation has ended."""
+        world, before = self.tool_world, self.world.joints
+        self.frames = []
+        has_ended = world.command(
+            action,
+            monitor=self.monitor if goals.needs_monitoring(self.episode.problem) else None,
+            record=self.record if realtime else None,
+        )
+        self.grasped = world.grasped
+        self.joint_path = np.array([before, world.joints], np.float32)
+        self.num_steps += 1
+        if has_ended:
+            self.judge()
+
+    def commands(self, action: Action) -> Iterator[ToolCommand]:
+        """Yield the commands of a primitive until the episode is over; each is to be executed at once."""
+        tool = self.episode.problem.scene.end_effector
+        follower = PathFollower(action, tool, compat=self.compat)
+        while not (self.outcome.is_over or self.is_out_of_steps):
+            command = follower.next_command(self.tool_world)
+            if command is None:
+                return
+            yield self.checked(command)
+
+    def perform(self, action: Action, *, realtime: bool) -> None:
+        """Execute a primitive as a sequence of commands."""
+        path, frames = [self.world.joints], []
+        for command in self.commands(action):
+            self.step(command, realtime=realtime)
+            path.append(self.world.joints)
+            frames += self.frames
+        self.joint_path, self.frames = np.array(path, np.float32), frames
+
+    def oracle_command(self, decide: Callable[[], Action]) -> ToolCommand:
+        """Return the oracle's next command.
+
+        Args:
+            decide: Gives the oracle's next primitive.
+        """
+        world = self.tool_world
+        command = self.follower and self.follower.next_command(world)
+        if command is None:
+            tool = self.episode.problem.scene.end_effector
+            self.follower = PathFollower(decide(), tool, compat=self.compat)
+            command = self.follower.next_command(world)
+        return command or _STAY
+
+    def observed_tool(self) -> dict[str, np.ndarray]:
+        """Position of the tip and heading of the tool, and whether it holds."""
+        world, pose = self.tool_world, self.tool_world.pose
+        return {"tool": np.array([pose.x, pose.y, pose.z, pose.yaw_rad, world.holds], np.float32)}
+
+
+RUNS: Mapping[str, type[PrimitiveRun]] = {run.control: run for run in (PrimitiveRun, ToolRun)}

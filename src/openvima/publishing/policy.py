@@ -1,0 +1,267 @@
+"""A checkpoint on the Hugging Face Hub, with a model card."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from openvima import __version__
+from openvima.errors import CheckpointError, ConfigError, InputFileError, OpenVimaError
+from openvima.evaluation.results import FILE_NAME, Results
+from openvima.evaluation.sources import weights_hash
+from openvima.evaluation.verification import is_marked_verified
+from openvima.hub import HubName, commit
+from openvima.input_files import read_text, read_yaml
+from openvima.policies.base import require_torch
+from openvima.policies.file_names import CHECKPOINTS_FOLDER, CONFIG_FILE, TOKENIZER_FOLDER, WEIGHTS_FILE
+from openvima.policies.sources import find_checkpoint
+from openvima.publishing.card import (
+    CARD_NAME,
+    TAGS,
+    checked_licence,
+    facts,
+    fenced,
+    front_matter,
+    repository,
+)
+from openvima.report.page import default_command
+from openvima.report.paper import paper_tables
+from openvima.report.text import role
+from openvima.report.typesetting import markdown
+
+_SESSIONS_FILE = "sessions_log.jsonl"
+_BUNDLED_RUN = "training"  # settings of the run beside a bundled checkpoint
+_MAX_LOG_BYTES = 2**20
+_SETTINGS = (
+    "preset",
+    "init_from",
+    "seed",
+    "assets",
+    "schedule.steps",
+    "loader.batch_size",
+    "optimizer.learning_rate",
+    "pretraining.steps",
+)
+
+
+def push_policy(
+    source: str | Path,
+    name: str,
+    *,
+    results: str | Path | None = None,
+    licence: str = "mit",
+    private: bool = False,
+    message: str = "",
+) -> HubName:
+    """Push a checkpoint to the Hugging Face Hub in one commit, with its tokenizer and a model card.
+
+    Args:
+        source: A run folder, of which the best checkpoint is pushed, a checkpoint folder, or the name of a
+            bundled checkpoint.
+        name: The repository, as OWNER/NAME or OWNER/NAME@BRANCH; it is created if there is none.
+        results: Folder of an evaluation of these weights, for the scores on the card; its `results.json` is
+            pushed too.
+        licence: Identifier of the licence of the weights.
+        private: Whether a new repository is private.
+        message: Of the commit.
+
+    Returns:
+        The repository at the new commit, which `load_policy` takes as text.
+
+    Raises:
+        CheckpointError: There is no such checkpoint, or it is no checkpoint folder.
+        ConfigError: The results are not of these weights, or the licence is no identifier.
+        DatasetError: There are no results, or they are damaged.
+        HubError: The Hub refuses or cannot be reached.
+        MissingExtraError: torch or `huggingface_hub` is not installed.
+    """
+    target, files = repository(name), policy_files(source, name, results=results, licence=licence)
+    return commit(target, files, message=message or f"Push with openvima {__version__}", private=private)
+
+
+def policy_files(
+    source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
+) -> dict[str, Path | bytes]:
+    """Return what `push_policy` pushes: path in the repository to a local file or content."""
+    folder = _checkpoint(source)
+    card = policy_card(source, name, results=results, licence=licence)
+    files: dict[str, Path | bytes] = {CARD_NAME: card.encode()}
+    files |= {file: folder / file for file in (WEIGHTS_FILE, CONFIG_FILE)}
+    files |= {f"{TOKENIZER_FOLDER}/{p.name}": p for p in sorted((folder / TOKENIZER_FOLDER).glob("*"))}
+    if results is not None:
+        files[FILE_NAME] = _results_file(results)
+    return files
+
+
+def policy_card(
+    source: str | Path, name: str, *, results: str | Path | None = None, licence: str = "mit"
+) -> str:
+    """Write the model card of a checkpoint: network, training, scores with intervals, licence.
+
+    Args:
+        source: As for `push_policy`.
+        name: As for `push_policy`.
+        results: As for `push_policy`.
+        licence: As for `push_policy`.
+
+    Returns:
+        Markdown with the metadata of the Hub in front.
+
+    Raises:
+        CheckpointError, ConfigError, DatasetError: As for `push_policy`.
+    """
+    require_torch("reading a checkpoint")
+    folder, target = _checkpoint(source), repository(name)
+    file = None if results is None else _results_file(results)
+    scores = None if file is None else _of_weights(file, weights_hash(folder))
+    metadata = {
+        "license": checked_licence(licence),
+        "library_name": "openvima",
+        "pipeline_tag": "robotics",
+        "tags": TAGS,
+        **({} if scores is None else {"model-index": [_model_index(target, scores)]}),
+    }
+    confirmed = file is not None and is_marked_verified(file.parent)
+    parts = [
+        front_matter(metadata),
+        f"# {target.repo.partition('/')[2]}\n",
+        "A policy for VIMA-Bench: tabletop manipulation from multimodal prompts of words and images.\n",
+        f"## Network\n\n{_network(folder)}",
+        f"## Training\n\n{_training(folder)}",
+        f"## Scores\n\n{_scores(scores, target, confirmed=confirmed)}",
+        f"## Use\n\n{_use(target)}",
+        f"## Licence\n\nWeights: {checked_licence(licence)}. openvima: MIT.\n",
+    ]
+    return "\n".join(parts)
+
+
+def _checkpoint(source: str | Path) -> Path:
+    folder = find_checkpoint(source)
+    if not folder.is_dir():
+        raise CheckpointError(
+            f"{source} is a file; convert it to a checkpoint folder first: `openvima policies convert`."
+        )
+    return folder
+
+
+def _results_file(path: str | Path) -> Path:
+    return Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
+
+
+def _of_weights(path: Path, sha256: str) -> Results:
+    """Read the results of the one policy that has these weights."""
+    results = Results.read(path)
+    named = [name for name, what in results.policies.items() if what.get("sha256") == sha256]
+    if not named:
+        raise ConfigError(
+            f"{path} has no scores of these weights, only of {', '.join(results.policy_names())}; evaluate "
+            "the checkpoint, or give the folder in which it was evaluated."
+        )
+    rows = tuple(row for row in results.rows if row.policy == named[0])
+    return replace(results, rows=rows, policies={named[0]: results.policies[named[0]]})
+
+
+def _model_index(name: HubName, scores: Results) -> dict[str, Any]:  # Any: plain values
+    """Level means as the Hub lists them."""
+    return {
+        "name": name.repo.partition("/")[2],
+        "results": [
+            {
+                "task": {"type": "robotics"},
+                "dataset": {"type": "vima-bench", "name": f"VIMA-Bench {mean.level}"},
+                "metrics": [
+                    {"type": "success_rate", "name": "success rate (%)", "value": round(100 * mean.mean, 1)}
+                ],
+            }
+            for mean in scores.level_means()
+            if not mean.ablation
+        ],
+    }
+
+
+def _network(folder: Path) -> str:
+    from openvima.policies.checkpoint import read_info
+    from openvima.policies.differences import described
+    from openvima.policies.parameter_counts import policy_size
+
+    info = read_info(folder)
+    size = policy_size(info.config)
+    values = {
+        "architecture": size.architecture,
+        "parameters": f"{size.parameters.total:,}, of which {size.parameters.trainable:,} were trained",
+        "decoder": f"{size.num_layers} layers, width {size.width}, {size.num_heads} heads",
+        "precision of the weights": described(info.dtype),
+        f"SHA-256 of {WEIGHTS_FILE}": info.digest,
+    }
+    return facts("What was pushed.", values)
+
+
+def _training(folder: Path) -> str:
+    """Say what the run recorded about data and settings."""
+    run = _run_folder(folder)
+    if run is None:
+        return "Not recorded: the checkpoint does not lie in its run folder.\n"
+    recorded = read_yaml(run / CONFIG_FILE)
+    data, session = _mapping(recorded.get("demonstrations")), _last_session(run)
+    stated, git = _mapping(session.get("data")), _mapping(session.get("git"))
+    settings = {name: _setting(recorded["training"], name) for name in _SETTINGS}
+    left_out = _setting(recorded["training"], "loader.exclude_tasks")
+    values = {
+        "demonstrations": data.get("episodes"),
+        "by task": ", ".join(f"{task} {count}" for task, count in _mapping(stated.get("tasks")).items()),
+        "content hash of the demonstrations": stated.get("content_hash"),
+        "tasks left out": left_out,
+        "held-out demonstrations among them": data.get("held_out"),
+        **settings,
+        "commit of openvima": git.get("commit"),
+        **{name: f"version {version}" for name, version in _mapping(session.get("versions")).items()},
+    }
+    return facts("What the run folder records.", values)
+
+
+def _run_folder(folder: Path) -> Path | None:
+    run = folder.absolute().parent
+    places = (run.parent if run.name == CHECKPOINTS_FOLDER else folder, folder / _BUNDLED_RUN)
+    for place in places:
+        try:
+            if isinstance(read_yaml(place / CONFIG_FILE)["training"], dict):
+                return place
+        except (OSError, OpenVimaError, LookupError, TypeError):
+            continue
+    return None
+
+
+def _last_session(run: Path) -> Mapping[str, Any]:  # Any: JSON
+    try:
+        lines = read_text(run / _SESSIONS_FILE, max_bytes=_MAX_LOG_BYTES).splitlines()
+        return _mapping(json.loads(lines[-1]))
+    except (OSError, InputFileError, LookupError, ValueError, RecursionError):
+        return {}
+
+
+def _mapping(value: object) -> Mapping[str, Any]:  # Any: plain values
+    return value if isinstance(value, dict) else {}
+
+
+def _setting(values: Mapping[str, Any], dotted: str) -> Any:  # Any: plain values
+    found: Any = values  # Any: as above
+    for name in dotted.split("."):
+        found = _mapping(found).get(name)
+    return found
+
+
+def _scores(scores: Results | None, name: HubName, *, confirmed: bool) -> str:
+    if scores is None:
+        return "None were pushed with the checkpoint.\n"
+    (policy,) = scores.policies
+    versions = ", ".join(f"{name} {version}" for name, version in sorted(scores.versions.items()))
+    tables = markdown(paper_tables(scores, published=False, confirmed=confirmed))
+    command = fenced(default_command(scores, [str(name)]), "sh")
+    return f"{role(scores, policy)} `{FILE_NAME}` holds every outcome ({versions}).\n\n{command}\n{tables}"
+
+
+def _use(name: HubName) -> str:
+    shell = f"pip install 'openvima[train,hub]'\nopenvima evaluate --policy {name} --out results"
+    python = f'from openvima.policies import load_policy\n\npolicy = load_policy("{name}")'
+    return f"{fenced(shell, 'sh')}\n{fenced(python, 'python')}"

@@ -1,0 +1,270 @@
+"""The simulated world under low-level control: one command of 0.1 s at a time."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from openvima.catalog.geometry import Assets
+from openvima.errors import ReachError
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Pose, Scene
+from openvima.scene.command import CONTROL_HZ, ToolCommand, ToolPose
+from openvima.sim import end_effectors as tools
+from openvima.sim import ur5
+from openvima.sim.arm_path import ArmPath, RecordFrame
+from openvima.sim.bodies import Bodies
+from openvima.sim.model import FLOOR_Z_M, TICK_S
+from openvima.sim.primitive_state import PrimitiveState, is_at_rest
+from openvima.sim.primitives import HeldBody, body_under_probe, take_out
+from openvima.sim.settling import STRIDE_TICKS, Settling
+from openvima.sim.spatula import SWEEP_M_S, Spatula
+from openvima.sim.world import SEPARATION_SPEED
+
+HIGHEST_TIP_Z_M = 0.35
+MAX_JOINT_SPEED = math.pi  # rad/s, of every joint, as in the UR5's data sheet
+PRESS_WITHIN_M = 0.01  # the spatula is pressed to the table from at most this height above its lowest
+_MARGIN_M = tools.SPATULA_RUN_UP_M  # by which the tool leaves the workspace
+_NUM_PARTS = 3  # of a command, in each of which contacts are tested; also the video frames of 1/30 s
+_PART_TICKS = round(1 / (CONTROL_HZ * _NUM_PARTS * TICK_S))
+_LOWEST_CUP_Z_M = FLOOR_Z_M + tools.PROBE_BELOW_TIP_M
+_TOUCH_M = 5e-4  # the cup grasps what is this near below it
+_BISECTIONS = 12
+_PART_S = _PART_TICKS * TICK_S
+
+
+class ToolWorld:
+    """The table with its objects and the robot, whose tool follows commands.
+
+    The cup and a held body stop at the first contact from above and do not enter bodies sideways; the
+    spatula moves bodies only while it is pressed to the table. What was let go moves by physics while the
+    commands go on. Deterministic, as `World`.
+
+    Args:
+        scene: The objects at the start. Those that hover or overlap settle before the first command.
+        assets: Asset pack.
+    """
+
+    def __init__(self, scene: Scene, assets: Assets) -> None:
+        self._scene = scene
+        self._bodies = Bodies(scene, assets)
+        self._is_settled = is_at_rest(self._bodies)
+        self._joints = ur5.HOME
+        tip = ur5.forward(ur5.HOME)
+        self._pose = ToolPose(tip.x, tip.y, tip.z, 0.0)
+        self._state: PrimitiveState | None = None  # since the tool last took hold, until all is at rest
+        self._settling: Settling | None = None
+        self._held: HeldBody | None = None
+        self._stands_alone = False  # whether the held body did
+        self._spatula: Spatula | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The current scene, with a held body at the tool."""
+        if self._state is None:
+            return self._scene
+        held = self._held
+        return self._state.scene(None if held is None else (held.index, self._held_pose(held)))
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Current joint angles of the arm, shape (6,), float64, radians."""
+        return self._joints.copy()
+
+    @property
+    def pose(self) -> ToolPose:
+        """Current pose of the tool."""
+        return self._pose
+
+    @property
+    def holds(self) -> bool:
+        """Whether the cup holds a body, or the spatula is pressed to the table."""
+        return self._held is not None or self._spatula is not None
+
+    @property
+    def grasped(self) -> int | None:
+        """Id of the body on the cup."""
+        return None if self._held is None else self._scene.placements[self._held.index].id
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether bodies that were let go have not come to rest."""
+        return self._settling is not None
+
+    def command(
+        self,
+        command: ToolCommand,
+        *,
+        monitor: Callable[[Scene], None] | None = None,
+        record: RecordFrame | None = None,
+    ) -> bool:
+        """Follow a command for 0.1 s.
+
+        The tool lets go before it moves and takes hold after.
+
+        Args:
+            command: The motion, and whether the tool is on.
+            monitor: As in `World.execute`.
+            record: Called with scene and joints, shape (6,), for every video frame, 30 a second.
+
+        Returns:
+            Whether a manipulation has ended: the tool has let go, and everything is at rest.
+        """
+        if not self._is_settled:
+            state = self._new_state(monitor)
+            state.settle(max_speed=SEPARATION_SPEED)
+            self._scene, self._is_settled = state.finish(), True
+        if not command.tool:
+            self._let_go()
+        for _ in range(_NUM_PARTS):
+            self._move(command)
+            self._run_physics()
+            if record is not None:
+                record(self.scene, self.joints)
+        if command.tool and not self.holds:
+            self._take_hold(monitor)
+        if self._state is None or self.holds or self.is_moving:
+            return False
+        self._scene, self._state = self._state.finish(), None
+        return True
+
+    def _new_state(self, monitor: Callable[[Scene], None] | None) -> PrimitiveState:
+        return PrimitiveState(self._scene, self._bodies, ArmPath(self._joints, None, CONTROL_HZ), monitor)
+
+    def _take_hold(self, monitor: Callable[[Scene], None] | None) -> None:
+        """Grasp the body below the cup, or press the spatula to the table, if it is near enough."""
+        pose, state = self._pose, self._state or self._new_state(monitor)
+        if self._scene.end_effector == "spatula":
+            if pose.z > tools.SWEEP_TIP_Z_M + PRESS_WITHIN_M:
+                return
+            awake = self._settling is not None
+            self._state, self._settling = state, None
+            self._go(replace(pose, z=tools.SWEEP_TIP_Z_M))
+            self._spatula = Spatula(state, pose.yaw_rad, awake=awake)
+            self._spatula.engage(pose.x, pose.y)
+            return
+        caught, surface_z = body_under_probe(self._bodies, pose.x, pose.y)
+        if caught not in self._bodies.rigid or pose.z > surface_z + tools.PROBE_BELOW_TIP_M + _TOUCH_M:
+            return
+        self._state = state
+        self._held = HeldBody(caught, self._bodies.pose(caught), pose)
+        self._stands_alone, carries_others = take_out(self._bodies, self._held)
+        if carries_others or self._settling is not None:
+            self._settling = Settling(self._bodies, apart_from=caught)
+
+    def _let_go(self) -> None:
+        """Release the body, or take the spatula off the table."""
+        if self._spatula is not None:
+            self._settling, self._spatula = self._spatula.release(), None
+        held, pose = self._held, self._pose
+        if held is None:
+            return
+        target = self._held_pose(held)
+        set_down_at, on_floor = held.lowest(self._bodies, pose.x, pose.y, pose.yaw_rad)
+        stands = on_floor and self._stands_alone and target.z - set_down_at.z < _TOUCH_M
+        if stands:  # no physics needed, and its height keeps the same value
+            target = held.carried(pose.x, pose.y, pose.yaw_rad)
+        self._bodies.place(held.index, target)
+        self._bodies.refresh()
+        self._held = None
+        if not stands or self._settling is not None:
+            self._settling = Settling(self._bodies)
+
+    def _move(self, command: ToolCommand) -> None:
+        """Move the tool by a part of a command, as far as joints and contacts let it."""
+        dx, dy, dz, turn = (d / _NUM_PARTS for d in (command.dx, command.dy, command.dz, command.dyaw))
+        if self._spatula is not None:
+            slower = min(1.0, SWEEP_M_S * _PART_S / max(math.hypot(dx, dy), 1e-12))
+            dx, dy, dz, turn = dx * slower, dy * slower, 0.0, turn * slower
+        if not any((dx, dy, dz, turn)):
+            return
+        target = self._reachable((dx, dy, dz, turn)) or self._reachable((dx, dy, dz, 0.0))
+        if target is None:
+            return
+        is_cup = self._scene.end_effector == "suction"
+        self._go(self._above_contact(target) if is_cup else target)
+
+    def _reachable(self, motion: tuple[float, float, float, float]) -> ToolPose | None:
+        """The pose after as much of a motion as the joints allow; None: nothing of it."""
+        found, low, high = None, 0.0, 1.0
+        fraction = 1.0
+        for _ in range(_BISECTIONS):
+            pose = self._after(motion, fraction)
+            if self._can_reach(pose):
+                found, low = pose, fraction
+            else:
+                high = fraction
+            if low == 1.0:
+                break
+            fraction = (low + high) / 2
+        return found
+
+    def _after(self, motion: tuple[float, float, float, float], fraction: float) -> ToolPose:
+        """The pose after a fraction of a motion; it slides along the bounds and the limit of the height."""
+        pose, (dx, dy, dz, turn) = self._pose, motion
+        x, y = (
+            min(max(at + fraction * delta, low - _MARGIN_M), high + _MARGIN_M)
+            for at, delta, low, high in zip(
+                (pose.x, pose.y), (dx, dy), WORKSPACE_LOW, WORKSPACE_HIGH, strict=True
+            )
+        )
+        highest = min(HIGHEST_TIP_Z_M, ur5.highest_tip_z(x, y) - tools.REACH_RESERVE_M)
+        lowest = tools.SWEEP_TIP_Z_M if self._scene.end_effector == "spatula" else _LOWEST_CUP_Z_M
+        return ToolPose(
+            x, y, min(max(pose.z + fraction * dz, lowest), highest), pose.yaw_rad + fraction * turn
+        )
+
+    def _can_reach(self, pose: ToolPose) -> bool:
+        try:
+            joints = self._joints_at(pose)
+        except ReachError:
+            return False
+        too_fast = np.abs(joints - self._joints) > MAX_JOINT_SPEED * _PART_S
+        return not (too_fast | (np.abs(joints) > ur5.JOINT_LIMITS)).any()
+
+    def _joints_at(self, pose: ToolPose) -> np.ndarray:
+        """Joint angles for a pose, in the turn nearest to the current ones."""
+        joints = ur5.inverse(pose.x, pose.y, pose.z, pose.yaw_rad)
+        return joints + 2 * math.pi * np.round((self._joints - joints) / (2 * math.pi))
+
+    def _go(self, pose: ToolPose) -> None:
+        self._joints = self._joints_at(pose)
+        self._pose = pose
+
+    def _above_contact(self, target: ToolPose) -> ToolPose:
+        """Stop at the first contact from above, and beside what is in the way; lifting is always free."""
+        pose, highest = self._pose, max(self._pose.z, target.z)
+        lowest = self._lowest_z(target)
+        if lowest > highest + _TOUCH_M:
+            target = replace(pose, z=target.z)
+            lowest = min(self._lowest_z(pose), pose.z)
+        return replace(target, z=max(target.z, lowest))
+
+    def _lowest_z(self, pose: ToolPose) -> float:
+        """Height of the tip at which the cup, or the held body, lowered at a pose comes into contact."""
+        held = self._held
+        if held is None:
+            return body_under_probe(self._bodies, pose.x, pose.y)[1] + tools.PROBE_BELOW_TIP_M
+        set_down_at, _ = held.lowest(self._bodies, pose.x, pose.y, pose.yaw_rad)
+        self._bodies.park(held.index)
+        return held.grasp.z + set_down_at.z - held.carried(pose.x, pose.y, pose.yaw_rad).z
+
+    def _held_pose(self, held: HeldBody) -> Pose:
+        pose = self._pose
+        return held.carried(pose.x, pose.y, pose.yaw_rad).moved(dz=pose.z - held.grasp.z)
+
+    def _run_physics(self) -> None:
+        """Run the physics of a part of a command, if anything moves."""
+        pose, state = self._pose, self._state
+        if self._spatula is not None:
+            self._spatula.slide(pose.x, pose.y, pose.yaw_rad, _PART_TICKS)
+        if self._settling is None or state is None:
+            return
+        held = None if self._held is None else (self._held.index, self._held_pose(self._held))
+        for done in range(0, _PART_TICKS, STRIDE_TICKS):
+            num_ticks = min(STRIDE_TICKS, _PART_TICKS - done)
+            self._settling.run(num_ticks)
+            state.count_ticks(num_ticks, held)
+            if self._settling.is_over:
+                self._settling = None
+                return

@@ -1,0 +1,228 @@
+"""Wrappers for libraries of reinforcement learning: vectors as observations and actions, dense rewards."""
+
+import re
+import zlib
+from collections.abc import Mapping
+from typing import Any  # observations and infos are nested dictionaries
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from openvima.errors import ActionError, ConfigError
+from openvima.perception.objects import TOP, ObjectViews, observe, observe_prompt_image
+from openvima.render.camera import CAMERAS
+from openvima.scene import WORKSPACE_HIGH, WORKSPACE_LOW, Action
+from openvima.tasks.goals import LEVER_M
+
+ACTION_SIZE = 6
+PATCHES = 4  # rows and columns of patches that a crop is averaged over
+OBJECT_SIZE = 6 + 3 * PATCHES**2
+NUM_BUCKETS = 64  # of words
+
+_LOW, _HIGH = np.array(WORKSPACE_LOW), np.array(WORKSPACE_HIGH)
+
+
+class FlatAction(gymnasium.ActionWrapper):
+    """Takes actions from a box: shape (6,), float32, each −1 … 1.
+
+    | numbers | meaning |
+    |---|---|
+    | 0, 1 | x, y where to pick or to start sweeping; −1 and 1 are the bounds of actions |
+    | 2, 3 | x, y where to place or to end |
+    | 4, 5 | sine and cosine of the rotation, counter-clockwise from above, of any length; zeros: none |
+
+    Args:
+        env: An environment of the package, wrapped or not.
+
+    Example:
+        >>> env = FlatAction(openvima.make("rotate"))  # doctest: +SKIP
+        >>> env.step(FlatAction.flatten(env.unwrapped.oracle_decision().action))  # doctest: +SKIP
+    """
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Box(-1, 1, (ACTION_SIZE,), np.float32)
+
+    def action(self, action: Any) -> dict[str, np.ndarray]:
+        """Return the action of the environment.
+
+        Args:
+            action: Shape (6,), any floating-point dtype.
+
+        Raises:
+            ActionError: The shape is another, or a value is not in −1 … 1. Nothing was moved.
+        """
+        values = np.asarray(action)
+        if values.shape != (ACTION_SIZE,) or values.dtype.kind != "f":
+            raise ActionError(
+                f"the action has shape {values.shape} and dtype {values.dtype}; it must be "
+                f"({ACTION_SIZE},) of floating-point numbers. Nothing was moved."
+            )
+        if not (np.abs(values) <= 1).all():  # also without NaN
+            given = ", ".join(f"{value:.4g}" for value in values)
+            raise ActionError(f"the action is ({given}); each value must lie in -1 … 1. Nothing was moved.")
+        pick, place = _LOW + (values.reshape(3, 2)[:2].astype(np.float64) + 1) / 2 * (_HIGH - _LOW)
+        return Action.planar(tuple(pick), tuple(place), float(np.arctan2(*values[4:]))).to_arrays()
+
+    @staticmethod
+    def flatten(action: Action | Mapping[str, Any]) -> np.ndarray:
+        """Return an action of an environment or of the oracle as six numbers, float32.
+
+        Raises:
+            ActionError: The action is invalid.
+        """
+        checked = action if isinstance(action, Action) else Action.from_arrays(action)
+        points = np.array([checked.pose0_position, checked.pose1_position])
+        scaled = np.clip(_scaled(points), -1, 1)  # float32 rounds beyond the bounds
+        angle_rad = checked.yaw1_rad - checked.yaw0_rad
+        return np.array([*scaled.flat, np.sin(angle_rad), np.cos(angle_rad)], np.float32)
+
+
+class FlatObservation(gymnasium.Wrapper):
+    """Gives observations as one vector: float32, each value −1 … 1.
+
+    It holds what policies over objects see, no state of the simulator: `max_objects` rows for objects on the
+    table, from left to right, `max_prompt_objects` rows for objects in the prompt's images, in reading order,
+    64 numbers for the words of the prompt, and the end effector. `rows` splits a vector.
+
+    | numbers of a row | meaning |
+    |---|---|
+    | 0 | 1: there is an object; else the row is zero |
+    | 1, 2 | x, y on the table; −1 and 1 are the bounds of actions. Of the prompt's object images: 0 |
+    | 3, 4 | height and width of its box in the top view, as fractions of the image's |
+    | 5 | of the prompt's objects: index of the image, divided by `max_prompt_objects` |
+    | 6 … 53 | colours of its crop in the top view, averaged over 4 × 4 patches |
+
+    A word sets one of the 64 numbers, chosen by its CRC-32, to 1. The end effector is 0 (suction cup) or 1.
+
+    Args:
+        env: An environment of the package, wrapped or not, that observes `rgb` and `segm`.
+        max_objects: Rows for objects on the table.
+        max_prompt_objects: Rows for objects in the prompt's images.
+
+    Raises:
+        ConfigError: The environment does not observe `rgb` and `segm`, or a number of rows is below 1.
+    """
+
+    def __init__(self, env: gymnasium.Env, *, max_objects: int = 16, max_prompt_objects: int = 16) -> None:
+        super().__init__(env)
+        self._base: Any = env.unwrapped  # a TabletopEnv, which importing would load MuJoCo for
+        if not {"rgb", "segm"} <= set(self._base.modalities):
+            raise ConfigError(f"modalities are {self._base.modalities}; FlatObservation needs rgb and segm.")
+        if min(max_objects, max_prompt_objects) < 1:
+            raise ConfigError(f"rows are {max_objects} and {max_prompt_objects}; give at least one each.")
+        self.max_objects, self.max_prompt_objects = max_objects, max_prompt_objects
+        size = (max_objects + max_prompt_objects) * OBJECT_SIZE + NUM_BUCKETS + 1
+        self.observation_space = spaces.Box(-1, 1, (size,), np.float32)
+        self._prompt = np.zeros(0, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        """Start an episode.
+
+        Raises:
+            ConfigError: There are more objects than rows.
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._prompt = self._encoded_prompt()
+        return self.observation(observation), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        """Take a step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self.observation(observation), float(reward), terminated, truncated, info
+
+    def observation(self, observation: Mapping[str, Any]) -> np.ndarray:
+        """Return an observation of the running episode as a vector."""
+        objects = self._rows([(observe(observation), True)], "max_objects")
+        return np.concatenate([objects.ravel(), self._prompt, [observation["ee"]]], dtype=np.float32)
+
+    def rows(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Split vectors into objects, objects of the prompt, and words with the end effector.
+
+        Args:
+            observation: Shape (..., size).
+
+        Returns:
+            Shapes (..., max_objects, 54), (..., max_prompt_objects, 54) and (..., 65).
+        """
+        ends = np.cumsum([self.max_objects, self.max_prompt_objects]) * OBJECT_SIZE
+        objects, prompt, words = np.split(observation, ends, axis=-1)
+        shape = (*observation.shape[:-1], -1, OBJECT_SIZE)
+        return objects.reshape(shape), prompt.reshape(shape), words
+
+    def _encoded_prompt(self) -> np.ndarray:
+        parts = self._base.prompt.sequence()
+        images = [part for part in parts if not isinstance(part, str)]
+        seen = [(observe_prompt_image(image), image.kind == "scene") for image in images]
+        rows = self._rows(seen, "max_prompt_objects")
+        words = np.zeros(NUM_BUCKETS, np.float32)
+        for word in re.findall(r"\w+", " ".join(part for part in parts if isinstance(part, str)).lower()):
+            words[zlib.crc32(word.encode()) % NUM_BUCKETS] = 1
+        return np.concatenate([rows.ravel(), words])
+
+    def _rows(self, images: list[tuple[ObjectViews, bool]], limit: str) -> np.ndarray:
+        """One row for each object of images, shape (limit, 54), with its position if it is on the table."""
+        num_rows = getattr(self, limit)
+        num_objects = sum(len(objects) for objects, _ in images)
+        if num_objects > num_rows:
+            raise ConfigError(f"{limit} is {num_rows}, but there are {num_objects} objects; give more rows.")
+        rows = np.zeros((num_rows, OBJECT_SIZE), np.float32)
+        start = 0
+        for index, (objects, is_on_table) in enumerate(images):
+            filled = rows[start : start + len(objects)]
+            filled[:, 0] = 1
+            if is_on_table:
+                filled[:, 1:3] = np.clip(_scaled(objects.positions()), -1, 1)
+            filled[:, 3:5] = objects.boxes[TOP][:, 2:] / (CAMERAS["top"].height, CAMERAS["top"].width)
+            filled[:, 5] = index / num_rows
+            filled[:, 6:] = _patches(objects.crops[TOP])
+            start += len(objects)
+        return rows
+
+
+class ProgressReward(gymnasium.Wrapper):
+    """Adds dense rewards, by the progress that a step makes.
+
+    The reward of a step is 1 for success plus the difference of a potential before and after it, so that the
+    best policy stays the same (Ng, Harada and Russell, 1999, without discount). The potential is `goals_met`
+    minus `distance_m` minus 0.1 × `angle_rad` of `info["progress"]`.
+
+    Args:
+        env: An environment of the package, wrapped or not.
+        weight: Factor of the potential.
+    """
+
+    def __init__(self, env: gymnasium.Env, weight: float = 1.0) -> None:
+        super().__init__(env)
+        self.weight = weight
+        self._potential = 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
+        """Start an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._potential = _potential(info["progress"])
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        """Take a step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        before, self._potential = self._potential, _potential(info["progress"])
+        gain = self.weight * (self._potential - before)
+        return observation, float(reward) + gain, terminated, truncated, info
+
+
+def _scaled(points: np.ndarray) -> np.ndarray:
+    return (points - _LOW) / (_HIGH - _LOW) * 2 - 1
+
+
+def _potential(progress: Mapping[str, float]) -> float:
+    distance = progress["distance_m"] + LEVER_M * progress["angle_rad"]
+    return progress["goals_met"] - (0.0 if np.isnan(distance) else distance)
+
+
+def _patches(crops: np.ndarray) -> np.ndarray:
+    """Average crops, shape (N, 3, 32, 32), over patches: shape (N, 48), 0 … 1."""
+    side = crops.shape[-1] // PATCHES
+    tiles = crops.reshape(len(crops), 3, PATCHES, side, PATCHES, side)
+    return tiles.mean(axis=(3, 5)).reshape(len(crops), -1) / 255

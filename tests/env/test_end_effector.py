@@ -1,0 +1,156 @@
+"""Control "end_effector" of the environment, and its evaluation."""
+
+import copy
+import itertools
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import openvima
+from openvima.env import EnvConfig
+from openvima.errors import ActionError, ConfigError, PolicyError
+from openvima.evaluation import EvaluationConfig, Results, evaluate
+from openvima.evaluation.merging import merge
+from openvima.evaluation.scoring import score
+from openvima.evaluation.verification import verify_results
+from openvima.policies import RandomPolicy
+from openvima.scene.command import COMMAND_HIGH, STEPS_PER_PRIMITIVE, ToolCommand
+
+STAY = np.zeros(5, np.float32)
+
+
+def make(task: str, **options) -> openvima.TabletopEnv:
+    options = {"level": "L1", "modalities": ("joints",), **options}
+    return openvima.make(task, control="end_effector", **options)
+
+
+@pytest.mark.parametrize("task", ["rotate", "sweep_without_exceeding", "pick_in_order_then_restore"])
+def test_the_oracle_solves_an_episode_and_success_comes_when_the_tool_has_let_go(task) -> None:
+    env = make(task)
+    observation, _ = env.reset(seed=0)
+    terminated = truncated = False
+    while not (terminated or truncated):
+        command = env.oracle_command()
+        observation, reward, terminated, truncated, info = env.step(command)
+    assert info["success"]
+    assert reward == 1.0
+    assert not command.tool
+    assert observation["tool"][4] == 0.0
+    assert info["num_steps"] < STEPS_PER_PRIMITIVE * env.episode.oracle_max_steps
+
+
+def test_the_environment_passes_the_checks_of_gymnasium() -> None:
+    check_env(make("rotate", modalities=("rgb", "segm", "joints")), skip_render_check=True)
+
+
+def test_images_follow_the_body_on_the_cup_while_it_moves() -> None:
+    env = make("rotate", modalities=("segm",), realtime=True)
+    env.reset(seed=0)
+    seen = []
+    while not env.outcome.is_over:
+        observation, *_, info = env.step(env.oracle_command())
+        assert len(env.frames) == 3
+        if info["grasped"]:
+            seen.append(observation["segm"]["front"] == info["grasped"])
+    changes = sum((one != other).any() for one, other in itertools.pairwise(seen))
+    assert changes > 5
+
+
+def test_time_is_limited() -> None:
+    env = make("rotate")
+    env.reset(seed=0)
+    limit = env.episode.max_steps * STEPS_PER_PRIMITIVE
+    for step in range(limit):
+        *_, terminated, truncated, info = env.step(STAY)
+        assert (terminated, truncated) == (False, step == limit - 1)
+    assert info["num_steps"] == limit
+
+
+def test_an_action_of_the_other_control_is_refused() -> None:
+    env, other = make("rotate"), openvima.make("rotate")
+    env.reset(seed=0), other.reset(seed=0)
+    with pytest.raises(ActionError, match="5 floating-point numbers: dx, dy, dz, dyaw, tool"):
+        env.step({"pose0_position": STAY[:2]})
+    with pytest.raises(ActionError, match="a mapping with keys pose0_position"):
+        other.step(STAY)
+    with pytest.raises(ConfigError, match="control is 'primitives'; commands need control 'end_effector'"):
+        other.oracle_command()
+    with pytest.raises(ConfigError, match=r"no control 'end_efector'\. Did you mean 'end_effector'"):
+        openvima.make("rotate", control="end_efector")
+    with pytest.raises(ConfigError, match="vector environments have 'primitives' only"):
+        openvima.make_vec("rotate", 2, control="end_effector")
+    assert env.outcome == other.outcome
+
+
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        (np.zeros(4, np.float32), r"shape \(4,\)"),
+        (np.zeros(5, np.int64), "dtype int64"),
+        ([0, 0, np.nan, 0, 0.0], "all values must be finite"),
+        (None, "a NoneType"),
+    ],
+)
+def test_malformed_commands_are_loud(command, problem) -> None:
+    with pytest.raises(ActionError, match=problem):
+        ToolCommand.from_array(command)
+
+
+def test_a_command_too_fast_keeps_its_direction() -> None:
+    command = ToolCommand.from_array(np.array([0.4, -0.2, 0.0, 0.1, 0.6], np.float32))
+    assert (command.dx, command.dy, command.dyaw) == pytest.approx((0.05, -0.025, 0.0125))
+    assert command.tool
+    fastest = np.array(COMMAND_HIGH, np.float32)
+    assert (ToolCommand.from_array(fastest).to_array() == fastest).all()
+
+
+def test_a_copy_of_the_environment_goes_on_equally() -> None:
+    env = make("rotate")
+    env.reset(seed=0)
+    for _ in range(14):
+        env.step(env.oracle_command())
+    other = copy.deepcopy(env)
+    for _ in range(5):
+        (one, *_), (two, *_) = env.step(env.oracle_command()), other.step(other.oracle_command())
+        assert one["tool"].tobytes() == two["tool"].tobytes()
+    assert env.scene == other.scene
+
+
+class Stays:
+    """Keeps the tool where it is."""
+
+    control = "end_effector"
+    modalities = ("joints",)
+
+    def reset(self, prompts):
+        pass
+
+    def act(self, observations):
+        return [None if seen is None else STAY for seen in observations]
+
+
+def test_policies_of_the_other_control_are_refused() -> None:
+    with pytest.raises(PolicyError, match="control 'end_effector', but the environments have control 'prim"):
+        score({"mine": Stays()}, tasks=("rotate",), levels=("L1",), episodes=1)
+    with pytest.raises(PolicyError, match="random is a policy of control 'primitives'"):
+        score(
+            {"random": RandomPolicy()}, tasks=("rotate",), levels=("L1",), episodes=1, control="end_effector"
+        )
+
+
+def test_results_record_the_control_are_verified_and_joined_with_no_other(tmp_path) -> None:
+    found = {}
+    for control in ("primitives", "end_effector"):
+        out, env_config = tmp_path / control, EnvConfig(control=control)
+        config = EvaluationConfig(("oracle",), ("rotate",), ("L1",), 1, out=out, env_config=env_config)
+        found[control] = Results.read(evaluate(config))
+        assert found[control].rows[0].successes == found[control].rows[0].successes_oracle_horizon == 1
+        assert verify_results(out).problems == ()
+    assert found["end_effector"].config["control"] == "end_effector"
+    assert "control" not in found["primitives"].config
+    assert found["end_effector"].rows[0].mean_steps > 10
+    with pytest.raises(
+        ConfigError, match=r"control is primitives in .*, end_effector in .*, so steps differ"
+    ):
+        merge(found)

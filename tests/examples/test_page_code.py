@@ -1,0 +1,64 @@
+"""The Python blocks of every page run, from top to bottom."""
+
+import re
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from openvima.data import GenerateConfig, generate
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^```python(.*?)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+EXAMPLES = {file.read_text(encoding="utf-8") for file in ROOT.glob("examples/*.py")}
+ELSEWHERE = {  # pages whose blocks run in tests of their own, which also check what they give
+    *("format", "midas", "policies", "reinforcement_learning", "studies"),
+}
+PAGES = [ROOT / "README.md", ROOT / "docs/site/index.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(page: Path) -> list[str]:
+    """Return the code of a page that runs as it stands; without examples that do work, which run as such."""
+    found = BLOCK.findall(page.read_text(encoding="utf-8"))
+    return [
+        code
+        for mark, code in found
+        if mark.strip() != "no-run" and (code not in EXAMPLES or "__main__" in code)
+    ]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Demonstrations of two tasks, a batch in all."""
+    out = tmp_path_factory.mktemp("data") / "demos"
+    generate(GenerateConfig(out=out, tasks=("rotate", "twist"), episodes=32, workers=1))
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.stem not in ELSEWHERE and blocks(page)],
+    ids=lambda page: page.stem,
+)
+def test_the_code_of_a_page_runs(
+    page: Path, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    Path("examples").symlink_to(ROOT / "examples")
+    if page.stem != "generating":
+        Path("demos").symlink_to(demos)
+    Image.new("RGB", (48, 48), (200, 30, 30)).save("photo.png")
+    for name, scene in re.findall(r"^```yaml\n# (\S+)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+        Path(name).write_text(scene, encoding="utf-8")
+    names: dict[str, object] = {"__name__": "page"}
+    for code in blocks(page):
+        exec(compile(code, str(page), "exec"), names)
+
+
+def test_blocks_that_do_not_run_are_few_and_begin_like_python() -> None:
+    marked = [code for page in PAGES for mark, code in BLOCK.findall(page.read_text("utf-8")) if mark.strip()]
+    assert len(marked) <= 15
+    for code in marked:
+        compile(code, "page", "exec")

@@ -1,0 +1,82 @@
+"""What a release and its readers rely on: versions on one page, workflows, container, issue templates."""
+
+import ast
+import importlib
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import openvima
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src"
+ROW = re.compile(r"^\| [^|]+ \| `([^`]+)` \| `([\w.]+)` \|", re.MULTILINE)
+PAGE = dict(reversed(pair) for pair in ROW.findall((ROOT / "docs" / "versions.md").read_text("utf-8")))
+
+
+@pytest.mark.parametrize("name", PAGE)
+def test_the_page_has_the_version_of_the_code(name: str) -> None:
+    module, _, constant = name.rpartition(".")
+    try:
+        value = getattr(importlib.import_module(module), constant)
+    except ImportError as error:
+        pytest.skip(f"{module} needs {error.name}")
+    assert PAGE[name] == str(value)
+
+
+def test_the_page_has_every_version_of_the_code() -> None:
+    found = {"openvima.__version__"}
+    for file in SOURCE.rglob("*.py"):
+        module = ".".join(file.relative_to(SOURCE).with_suffix("").parts)
+        for node in ast.parse(file.read_text("utf-8")).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+                (target,) = (t.id for t in node.targets if isinstance(t, ast.Name))
+                if re.fullmatch(r"(\w+_)?(VERSION|SCHEMA|PROTOCOL)", target):
+                    found.add(f"{module}.{target}")
+    assert found == set(PAGE)
+
+
+def test_all_files_name_the_same_version_of_the_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    plugin = tomllib.loads((ROOT / "plugins/lerobot/pyproject.toml").read_text("utf-8"))["project"]
+    assert project["version"] == plugin["version"] == citation["version"] == openvima.__version__
+
+
+def test_workflows_cover_the_pythons_that_are_promised_and_store_no_token() -> None:
+    workflows = {file.name: file.read_text("utf-8") for file in (ROOT / ".github/workflows").glob("*.yml")}
+    pythons = yaml.safe_load(workflows["ci.yml"])["jobs"]["tests"]["strategy"]["matrix"]["python"]
+    page = (ROOT / "docs" / "versions.md").read_text("utf-8")
+    assert f"**Python** {pythons[0]} to {pythons[-1]}" in page
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["requires-python"] == f">={pythons[0]}"
+    publish = yaml.safe_load(workflows["release.yml"])["jobs"]["publish"]
+    assert publish["permissions"] == {"id-token": "write"}
+    assert publish["needs"] == "build"
+    assert not any("secrets." in text for text in workflows.values())
+    scripts = {word for text in workflows.values() for word in re.findall(r"run: (\.ci/\w+)", text)}
+    assert scripts == {".ci/run", ".ci/package"}
+    assert all((ROOT / script).stat().st_mode & 0o100 for script in scripts)
+
+
+def test_the_container_follows_the_two_commands_of_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    first, second = re.search(r"```sh\n(python3 -m venv .*)\n(.*)\n```", readme).groups()
+    container = (ROOT / "Containerfile").read_text("utf-8")
+    install, _, quickstart = first.rpartition(" && ")
+    assert f"RUN {install}\n" in container
+    command = yaml.safe_load(re.search(r"^CMD (.*)$", container, re.MULTILINE)[1])
+    assert command[:-1] == quickstart.removeprefix(".venv/bin/").split()[:-1]
+    assert second.removeprefix(".venv/bin/") in container
+
+
+def test_issue_templates_are_forms() -> None:
+    forms = [f for f in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if f.name != "config.yml"]
+    assert len(forms) == 3
+    for form in forms:
+        values = yaml.safe_load(form.read_text("utf-8"))
+        assert {"name", "description", "body"} <= set(values)
+        assert all(field["attributes"]["label"] for field in values["body"])

@@ -1,0 +1,128 @@
+"""Wrappers for libraries of reinforcement learning."""
+
+import re
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import openvima
+from openvima.errors import ActionError, ConfigError
+from openvima.scene import Action
+from openvima.tasks import list_tasks, task_spec
+from openvima.wrappers import FlatAction, FlatObservation, ProgressReward
+
+
+@pytest.mark.parametrize(
+    "task", [t if t == "rotate" else pytest.param(t, marks=pytest.mark.slow) for t in list_tasks()]
+)
+def test_gymnasium_finds_nothing_to_complain_about(task: str) -> None:
+    env = openvima.make(task, level=task_spec(task).levels[-1])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*different from the unwrapped version")
+        check_env(ProgressReward(FlatObservation(FlatAction(env))), skip_render_check=True)
+
+
+@pytest.mark.parametrize("task", ["twist", "sweep_without_exceeding"])
+def test_the_oracle_solves_tasks_by_flat_actions(task: str) -> None:
+    env = ProgressReward(FlatAction(openvima.make(task)))
+    num_solved, returns = 0, []
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        first, is_over, total = info["progress"], False, 0.0
+        while not is_over:
+            action = FlatAction.flatten(env.unwrapped.oracle_decision().action)
+            *_, reward, terminated, truncated, info = env.step(action)
+            total, is_over = total + float(reward), terminated or truncated
+        num_solved += info["success"]
+        gain = 1 + first["distance_m"] + 0.1 * first["angle_rad"]
+        returns.append(total == pytest.approx(1 + gain))
+    assert num_solved == 3 and all(returns)
+
+
+def test_a_flat_action_is_the_action_that_it_was_made_of() -> None:
+    env = FlatAction(openvima.make("rotate"))
+    for action in (
+        Action.planar((0.25, -0.5), (0.75, 0.5), 2.0),
+        Action.planar((0.6, 0.1), (0.3, 0.4), -3.0),
+    ):
+        flat = FlatAction.flatten(action)
+        again = Action.from_arrays(env.action(flat))
+        assert env.action_space.contains(flat)
+        assert again.pose0_position == pytest.approx(action.pose0_position, abs=1e-6)
+        assert again.pose1_position == pytest.approx(action.pose1_position, abs=1e-6)
+        assert again.yaw1_rad == pytest.approx(action.yaw1_rad, abs=1e-6)
+    assert Action.from_arrays(env.action(np.zeros(6))).yaw1_rad == 0
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(5), r"shape \(5,\) and dtype float64; it must be \(6,\)"),
+        (np.zeros(6, int), "dtype int64"),
+        (np.full(6, np.nan), r"the action is \(nan"),
+        (np.array([0, 0, 0, 1.5, 0, 0]), r"1\.5, 0, 0\); each value must lie in -1 … 1"),
+    ],
+)
+def test_invalid_flat_actions_are_refused(action: np.ndarray, message: str) -> None:
+    env = FlatAction(openvima.make("rotate"))
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=message):
+        env.step(action)
+
+
+def test_rows_hold_what_lies_on_the_table_and_what_the_prompt_shows() -> None:
+    env = FlatObservation(openvima.make("visual_manipulation"))
+    objects, prompt, words = env.rows(env.reset(seed=3)[0])
+    scene = env.unwrapped.scene
+    places = sorted((p.pose.y, p.pose.x) for p in scene.placements)
+    assert objects[:, 0].tolist() == [1.0] * len(places) + [0.0] * (16 - len(places))
+    seen = [(y * 0.5, 0.5 + x * 0.25) for x, y in objects[: len(places), 1:3]]
+    assert np.abs(np.array(seen) - places).max() < 0.03
+    assert prompt[:3, 0].tolist() == [1, 1, 0] and not prompt[:, 1:3].any()
+    assert prompt[:2, 5].tolist() == [0, 1 / 16]
+    shown = [prompt[:, 6:] @ row[6:] / np.linalg.norm(row[6:]) for row in objects[: len(places)]]
+    assert len({int(np.argmax(each)) for each in np.transpose(shown)[:2]}) == 2
+    assert words.sum() == 3  # put, the, into
+
+
+def test_words_tell_prompts_of_one_task_apart() -> None:
+    env = FlatObservation(openvima.make("rotate"))
+    angles = {}
+    for seed in range(20):
+        observation, info = env.reset(seed=seed)
+        angles.setdefault(info["prompt"].split()[-2], set()).add(env.rows(observation)[2].tobytes())
+    assert len(angles) > 3 and all(len(words) == 1 for words in angles.values())
+    assert len(set.union(*angles.values())) == len(angles)
+
+
+def test_too_few_rows_and_missing_images_are_named() -> None:
+    env = FlatObservation(openvima.make("visual_manipulation"), max_objects=2)
+    with pytest.raises(ConfigError, match="max_objects is 2, but there are 3 objects; give more rows"):
+        env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"modalities are \('rgb',\); FlatObservation needs rgb and segm"):
+        FlatObservation(openvima.make("rotate", modalities=("rgb",)))
+    with pytest.raises(ConfigError, match="rows are 0 and 16"):
+        FlatObservation(openvima.make("rotate"), max_objects=0)
+
+
+def test_vectors_of_gymnasium_take_the_wrappers() -> None:
+    envs = gymnasium.make_vec("openvima/rotate-v1", 2, wrappers=[FlatAction, FlatObservation, ProgressReward])
+    observations, infos = envs.reset(seed=0)
+    assert observations.shape == (2, 16 * 54 * 2 + 65)
+    assert infos["progress"]["angle_rad"].shape == (2,)
+    assert envs.step(envs.action_space.sample())[1].shape == (2,)
+
+
+def test_the_code_of_the_page_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+    page = Path(__file__).parents[1] / "docs" / "reinforcement_learning.md"
+    names: dict[str, object] = {}
+    for code in re.findall(
+        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        exec(compile(code, str(page), "exec"), names)
+    printed = capsys.readouterr().out
+    assert "2 objects, the leftmost" in printed and f"(4, {16 * 54 * 2 + 65})" in printed
