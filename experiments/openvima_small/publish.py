@@ -32,7 +32,7 @@ from openvima.report.typesetting import Line, Table, markdown
 from tables import tables
 from weights import facts, settings, ship, shipped
 
-OUT = Path("results/2026-11-23_small_2")
+OUT = Path("results/2026-11-23_small_3")
 IMAGES = Path("docs/images")
 MARK = "<!-- small:{name} -->"
 END = "<!-- /small:{name} -->"
@@ -42,7 +42,7 @@ _FIGURES = {
     "failures": "Failed episodes: prompt, first picture with the actions, and why they failed",
 }
 _DRAWN_ELSEWHERE = {"animation": "openvima_small.webp"}  # by `animation.py`
-_PAGE = """# openvima-small 2
+_PAGE = """# openvima-small
 
 - Command: `{command}`
 - Machine of that command: {machine}; commit `{commit}`
